@@ -1,0 +1,51 @@
+# Every target sets up .venv by itself. Needs Python 3.11 with venv, and make.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+# The newest picture of the demo and its logs end up here.
+DEMO := build/demo
+
+.PHONY: setup demo test lint format bench lock proto clean
+
+setup: $(READY)
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: $(READY)
+	$(BIN)/python -m fixtures demo --output $(DEMO)
+
+test: $(READY)
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m "not study"
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+format: $(READY)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(READY)
+	$(BIN)/python -m tests.benchmarks
+
+# Writes requirements.lock anew: exact versions and hashes for every platform.
+lock: $(READY)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+		--extra robot --extra laptop --group dev --upgrade pyproject.toml --output-file requirements.lock \
+		--custom-compile-command "make lock"
+
+proto: $(READY)
+	$(BIN)/python -m grpc_tools.protoc --proto_path=. --python_out=. --pyi_out=. onboard/groundsbot.proto
+
+clean:
+	rm -rf build $(VENV)

@@ -1,0 +1,1 @@
+"""The ground floor: frames, cameras, wheels and the robot's file."""

@@ -1,0 +1,1 @@
+"""What runs on the laptop: run logs in, one map of all tags and trajectories out."""

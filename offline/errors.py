@@ -1,0 +1,7 @@
+"""Errors of mapping and its commands."""
+
+from calib.errors import GroundsbotError
+
+
+class OfflineError(GroundsbotError):
+    """Input that cannot become a map."""

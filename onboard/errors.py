@@ -1,0 +1,11 @@
+"""Errors of the recorder and of logs."""
+
+from calib.errors import GroundsbotError
+
+
+class OnboardError(GroundsbotError):
+    """A device, a configuration or a log that cannot be used."""
+
+
+class LogError(OnboardError):
+    """A log file that cannot be read or written."""
