@@ -1,0 +1,131 @@
+"""What mapping hands out: typed, in the map frame, in SI units.
+
+A run with unbroken odometry is one chain; where the odometry broke, a run has several chains (stretches), named
+`<run>` and `<run>_stretch2`, ... Each is placed on its own, like another run.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from calib.arrays import FloatArray, IntArray
+from calib.noise import NoiseParameters
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One chain of keyframes in its component's map frame."""
+
+    name: str  # unique: robot id and run id, and the stretch where there are several
+    run: str  # the run it belongs to: equal to name unless it is a later stretch
+    log: Path
+    robot_id: str
+    run_id: str
+    T_map_start: FloatArray  # (3,) x_m, y_m, theta_rad
+    covariance: FloatArray  # (3, 3) of the start, map frame, (x, y, theta): m^2, m rad, rad^2
+    stamps_ns: IntArray  # (K,)
+    T_map_base: FloatArray  # (K, 3)
+    distance_m: float  # driven, by the wheels
+
+    @property
+    def n_keyframes(self) -> int:
+        """How many poses the run has."""
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True)
+class TagResult:
+    """One tag in its component's map frame."""
+
+    family: str
+    tag_id: int
+    instance: str  # empty unless one id hangs in several places: a, b, ...
+    size_m: float | None  # None: imported positions
+    position_m: FloatArray  # (2,)
+    covariance: FloatArray  # (2, 2) m^2
+    n_observations: int
+    runs: tuple[str, ...]  # names of the runs that saw it
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """Transform between two local maps, from the tags they share."""
+
+    from_run: str
+    to_run: str
+    T_from_to: FloatArray  # (3,) pose of the second run's start in the first run's frame
+    n_shared: int
+    n_inliers: int
+    inlier_rmse_m: float
+    outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
+
+
+@dataclass(frozen=True)
+class StartToStart:
+    """From the start of one run to the start of another in one component."""
+
+    a: str
+    b: str
+    vector_m: FloatArray  # (2,) in the map frame
+    covariance: FloatArray  # (2, 2)
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the vector."""
+        return float((self.vector_m @ self.vector_m) ** 0.5)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the distance, first order; of the longer axis where the distance is nothing."""
+        distance_m = self.distance_m
+        if distance_m < 1e-9:
+            return float(max(self.covariance[0, 0], self.covariance[1, 1]) ** 0.5)
+        direction = self.vector_m / distance_m
+        return float((direction @ self.covariance @ direction) ** 0.5)
+
+
+@dataclass(frozen=True)
+class Component:
+    """Runs and tags in one frame: the start of `frame_run`, which has no uncertainty."""
+
+    frame_run: str
+    runs: tuple[RunResult, ...]
+    tags: tuple[TagResult, ...]
+    # (3 R + 2 T, 3 R + 2 T): starts of `runs` in order as (x, y, theta), then `tags` in order as (x, y); map frame.
+    joint_covariance: FloatArray
+    cost: float  # half the sum of squared whitened residuals
+    n_residuals: int
+    start_to_start: tuple[StartToStart, ...] = ()
+
+    @property
+    def tag_covariance(self) -> FloatArray:
+        """Joint covariance of all tags, (2 T, 2 T) in m^2."""
+        n = 3 * len(self.runs)
+        return self.joint_covariance[n:, n:]
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """One calibration number that the solve carried, as a correction to what robot.yaml says."""
+
+    owner: str  # robot id, or the printed batch of tags
+    name: str  # wheel_scale, wheel_ratio, track_scale, mount_x_m, mount_y_m, mount_yaw_rad, tag_scale
+    component: int
+    value: float
+    sigma: float
+    prior_sigma: float
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """Everything that one `map` command found."""
+
+    components: tuple[Component, ...]  # largest first
+    alignments: tuple[AlignmentResult, ...]
+    noise: NoiseParameters
+    calibration: tuple[CalibrationResult, ...] = ()
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def runs(self) -> tuple[RunResult, ...]:
+        """All runs of all components."""
+        return tuple(run for component in self.components for run in component.runs)
