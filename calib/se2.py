@@ -110,6 +110,16 @@ def right_jacobian_inverse(xi: ArrayLike) -> FloatArray:
     )
 
 
+def right_tangent_from_coordinates(T_a_b: ArrayLike) -> FloatArray:
+    """`[..., 3, 3]` that turn a small change of the coordinates (x, y, theta) of T into d of T o exp(d).
+
+    The rows (x, y) are R(theta)^T: multiply it from the left onto a Jacobian of the coordinates.
+    """
+    theta = np.asarray(T_a_b, dtype=np.float64)[..., 2]
+    cos, sin, zero = np.cos(theta), np.sin(theta), np.zeros_like(theta)
+    return _affine(cos, sin, zero, -sin, cos, zero)
+
+
 def interpolate(T_w_a: ArrayLike, T_w_b: ArrayLike, fraction: ArrayLike) -> FloatArray:
     """The transform at `fraction` `[...]` of the way from a (0) to b (1), on the arc of constant twist."""
     share = np.asarray(fraction, dtype=np.float64)[..., np.newaxis]

@@ -1,0 +1,44 @@
+"""The noise parameters, under one name in simulator, estimator, `--noise` and map.json."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from calib.yaml_file import parse_mapping, read_text, validated, write_model
+
+Sigma = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class NoiseParameters(BaseModel):
+    """Standard deviations of wheels and tag readings.
+
+    Over a step of length d and turn a, in the frame of its end: var_x = sigma_distance^2 |d|,
+    var_y = sigma_lateral^2 |d|, var_theta = sigma_heading_rad_per_sqrt_m^2 |d| + sigma_heading_rad_per_sqrt_rad^2 |a|.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    sigma_distance_m_per_sqrt_m: Sigma = 0.01
+    sigma_lateral_m_per_sqrt_m: Sigma = 0.002
+    sigma_heading_rad_per_sqrt_m: Sigma = math.radians(0.6)
+    sigma_heading_rad_per_sqrt_rad: Sigma = 0.02
+    sigma_corner_px: Sigma = 0.2
+    sigma_range_m: Sigma = 0.02
+    sigma_range_per_m: Sigma = 0.01  # adds in quadrature: share of the range
+    sigma_bearing_rad: Sigma = math.radians(0.3)
+
+
+def read_noise_yaml(path: Path) -> NoiseParameters:
+    """The parameters in a YAML file; those it leaves out keep their defaults.
+
+    Raises:
+        CalibError: one line that names file, field, value, limit and way out.
+    """
+    return validated(NoiseParameters, parse_mapping(read_text(path), str(path)), str(path))
+
+
+def write_noise_yaml(noise: NoiseParameters, path: Path) -> None:
+    """Writes all parameters, so that `read_noise_yaml` gives them back."""
+    write_model(noise, path)
