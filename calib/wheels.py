@@ -17,7 +17,8 @@ def advance(left_m: ArrayLike, right_m: ArrayLike, track_m: ArrayLike) -> FloatA
     """Motion `[..., 3]` (x_m, y_m, theta_rad) of the base over one step.
 
     Args:
-        left_m, right_m: `[...]` how far each wheel rolled, forward positive.
+        left_m: `[...]` how far the left wheel rolled, forward positive.
+        right_m: `[...]` the same of the right wheel.
         track_m: `[...]` distance between the wheels' contact points.
 
     Returns:

@@ -1,0 +1,164 @@
+"""Lens distortion in normalised image coordinates, as OpenCV and ROS define it.
+
+Every model here is a radial factor g(s), s = x^2 + y^2, plus plumb_bob's two tangential terms:
+distorted = g(s) (x, y) + (2 p1 x y + p2 (s + 2 x^2), p1 (s + 2 y^2) + 2 p2 x y).
+
+- plumb_bob (k1, k2, p1, p2, k3): g = 1 + k1 s + k2 s^2 + k3 s^3
+- rational_polynomial (k1, k2, p1, p2, k3, k4, k5, k6): g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
+- equidistant (k1, k2, k3, k4): g = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / tan(t), t = atan(sqrt(s))
+
+A polynomial turns back on itself far outside the picture; points beyond that radius would land in the picture
+again. `Distortion.limit` is that radius, and nothing beyond it is projected.
+Sources: OpenCV, calib3d and fisheye module documentation; ROS sensor_msgs/distortion_models.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from calib.arrays import BoolArray, FloatArray
+
+COEFFICIENTS: Final = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+
+_WIDEST_RAD: Final = np.radians(89.0)  # off the optical axis; z > 0 in any case
+_NEWTON_STEPS: Final = 60  # bisection alone halves the bracket to the last bit in these
+_POLISH_STEPS: Final = 12
+_RESIDUAL: Final = 1e-12  # normalised: 1e-9 px at a focal length of 1000 px
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """One lens. Coordinates are `[..., 2]` (x/z, y/z) in the optical frame.
+
+    `limit` is the undistorted radius from which on there is no image, `distorted_limit` its image.
+    """
+
+    numerator: Polynomial  # of s, or of t^2 for equidistant
+    denominator: Polynomial
+    p1: float
+    p2: float
+    is_equidistant: bool
+    limit: float
+    distorted_limit: float
+
+    @classmethod
+    def of(cls, model: str, coefficients: tuple[float, ...]) -> "Distortion":
+        """The lens of one of `COEFFICIENTS`, its coefficients in OpenCV's order."""
+        if model == "equidistant":
+            numerator, denominator = Polynomial([1.0, *coefficients]), Polynomial([1.0])
+            p1, p2 = 0.0, 0.0
+            # The angle t (1 + k1 t^2 + ...) must grow: d/dt = N + 2 u N' with u = t^2.
+            angle = np.sqrt(_first_positive_root(_growth(numerator, denominator), float(_WIDEST_RAD) ** 2))
+            limit = float(np.tan(angle))
+        else:
+            k1, k2, p1, p2, k3, *below = coefficients
+            numerator, denominator = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, *below])
+            widest = float(np.tan(_WIDEST_RAD)) ** 2
+            fold = _first_positive_root(_growth(numerator, denominator), widest)
+            limit = float(np.sqrt(_first_positive_root(denominator, fold)))
+        unlimited = cls(numerator, denominator, p1, p2, model == "equidistant", limit, np.inf)
+        factor, _ = unlimited._factor(np.array(limit * limit))
+        return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
+
+    def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
+        inside = np.hypot(undistorted[..., 0], undistorted[..., 1]) < self.limit
+        return self._apply(np.where(inside[..., np.newaxis], undistorted, np.nan))
+
+    def _apply(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x, y = points[..., 0], points[..., 1]
+        square, p1, p2 = x * x + y * y, self.p1, self.p2
+        factor, slope = self._factor(square)
+
+        distorted = np.empty(points.shape)
+        distorted[..., 0] = factor * x + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        distorted[..., 1] = factor * y + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+
+        jacobian = np.empty((*points.shape, 2))
+        jacobian[..., 0, 0] = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        jacobian[..., 0, 1] = jacobian[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        jacobian[..., 1, 1] = factor + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        return distorted, jacobian
+
+    def remove(self, distorted: FloatArray) -> FloatArray:
+        """Undistorted points `[..., 2]`, whose images are `distorted` to 1e-12; NaN where there is none."""
+        points = self._radially_undistorted(distorted)
+        with np.errstate(all="ignore"):  # a point without a solution may run away; it is refused below
+            if self.p1 or self.p2:
+                for _ in range(_POLISH_STEPS):
+                    image, jacobian = self._apply(points)
+                    points = points - _solved(jacobian, image - distorted)
+            error = np.abs(self._apply(points)[0] - distorted).max(axis=-1, initial=0.0)
+            scale = 1.0 + np.abs(distorted).max(axis=-1, initial=0.0)
+            found = (error < _RESIDUAL * scale) & (np.hypot(points[..., 0], points[..., 1]) < self.limit)
+        return np.where(found[..., np.newaxis], points, np.nan)
+
+    def _radially_undistorted(self, distorted: FloatArray) -> FloatArray:
+        """The start for the tangential terms: exact without them. Newton on r g(r^2), kept in a bracket."""
+        target = np.minimum(np.hypot(distorted[..., 0], distorted[..., 1]), self.distorted_limit)
+        low, high = np.zeros_like(target), np.full_like(target, self.limit)
+        radius = np.minimum(target, 0.5 * self.limit)
+        for _ in range(_NEWTON_STEPS):
+            square = radius * radius
+            factor, slope = self._factor(square)
+            excess = radius * factor - target
+            low, high = np.where(excess < 0, radius, low), np.where(excess < 0, high, radius)
+            growth = factor + 2 * square * slope
+            step = np.divide(excess, growth, out=np.full_like(excess, np.inf), where=growth > 0)
+            inside = (radius - step >= low) & (radius - step <= high)
+            following = np.where(inside, radius - step, 0.5 * (low + high))
+            converged: BoolArray = np.abs(following - radius) <= 1e-15 * (1.0 + radius)
+            radius = following
+            if np.all(converged | np.isnan(target)):
+                break
+        length = np.hypot(distorted[..., 0], distorted[..., 1])
+        ratio = np.divide(radius, length, out=np.ones_like(length), where=length > 0)
+        return distorted * ratio[..., np.newaxis]
+
+    def _factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """g(s) and dg/ds."""
+        if self.is_equidistant:
+            return self._equidistant_factor(square)
+        above, below = self.numerator(square), self.denominator(square)
+        factor = above / below
+        return factor, (self.numerator.deriv()(square) - factor * self.denominator.deriv()(square)) / below
+
+    def _equidistant_factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        radius = np.sqrt(square)
+        angle = np.arctan(radius)
+        polynomial = self.numerator(angle * angle)
+        near_axis = square < 1e-16
+        safe = np.where(near_axis, 1.0, square)
+        factor = np.where(near_axis, 1.0, angle * polynomial / np.sqrt(safe))
+        angle_slope = polynomial + 2 * angle * angle * self.numerator.deriv()(angle * angle)
+        slope = (angle_slope / (1.0 + safe) - factor) / (2.0 * safe)
+        # Near the axis t = r - r^3/3, so g = 1 + (k1 - 1/3) s.
+        return factor, np.where(near_axis, self.numerator.coef[1] - 1.0 / 3.0, slope)
+
+
+def _growth(numerator: Polynomial, denominator: Polynomial) -> Polynomial:
+    """Has the sign of d/dr of r N(r^2) / D(r^2), as a polynomial of r^2."""
+    s = Polynomial([0.0, 1.0])
+    grown: Polynomial = (numerator + 2 * s * numerator.deriv()) * denominator - 2 * s * numerator * denominator.deriv()
+    return grown
+
+
+def _first_positive_root(polynomial: Polynomial, bound: float) -> float:
+    """The smallest root in (0, bound), else `bound`."""
+    trimmed = polynomial.trim()
+    if trimmed.degree() == 0:
+        return bound
+    roots = trimmed.roots()
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
+    return float(min(real.min(initial=bound), bound))
+
+
+def _solved(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions of `[..., 2, 2]` systems; not finite where singular, which LAPACK would refuse for all of them."""
+    a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
+    determinant = a * d - b * c
+    x = (d * right[..., 0] - b * right[..., 1]) / determinant
+    y = (a * right[..., 1] - c * right[..., 0]) / determinant
+    return np.stack([x, y], axis=-1)
