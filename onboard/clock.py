@@ -1,0 +1,153 @@
+"""Time: the only place that reads a clock, and the mapping of the wheel controller's clock onto the host's."""
+
+import ctypes
+import itertools
+import time
+from collections import deque
+from typing import Final, NamedTuple
+
+_NS_PER_US: Final = 1000
+
+_BUCKET_NS: Final = 500_000_000
+_WINDOW_BUCKETS: Final = 120  # a minute
+_MAX_RATE_ERROR: Final = 0.01  # ceramic resonators are within 0.5 %
+
+_TIMEX_BYTES: Final = 512  # more than struct timex needs on any Linux
+_TIME_ERROR: Final = 5
+
+
+class ClockReading(NamedTuple):
+    """Both clocks at one moment."""
+
+    monotonic_ns: int
+    realtime_ns: int
+
+
+class RunClock:
+    """The one line on which every stamp of a run lies: monotonic time plus an offset frozen at the start.
+
+    So it reads like wall-clock time but never steps, whatever happens to the wall clock.
+
+    Attributes:
+        run_epoch_ns: realtime minus monotonic, at the start.
+    """
+
+    def __init__(self) -> None:
+        reading = read_clocks()
+        self.run_epoch_ns = reading.realtime_ns - reading.monotonic_ns
+
+    def now_ns(self) -> int:
+        """Now, on the run's line."""
+        return time.monotonic_ns() + self.run_epoch_ns
+
+    def from_realtime(self, realtime_ns: int) -> int:
+        """A recent wall-clock time on the run's line: the wall clock's present offset is taken out."""
+        reading = read_clocks()
+        return realtime_ns - reading.realtime_ns + reading.monotonic_ns + self.run_epoch_ns
+
+
+def read_clocks() -> ClockReading:
+    """Reads both clocks; of three tries the one that was interrupted least."""
+    tries = []
+    for _ in range(3):
+        before_ns, realtime_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        tries.append((after_ns - before_ns, (before_ns + after_ns) // 2, realtime_ns))
+    return ClockReading(*min(tries)[1:])
+
+
+def wall_clock_synchronised() -> bool:
+    """Whether the kernel says that something disciplines its wall clock; False where it does not say."""
+    try:
+        state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: read only
+    except (AttributeError, OSError):
+        return False
+    return 0 <= state < _TIME_ERROR
+
+
+class DeviceClockFilter:
+    """When a reading was measured, on the host's clock, from its device time and its time of arrival.
+
+    Arrival is measurement plus a delay that is never below some least one. So a line below all points (device time,
+    arrival), as close to them as can be, is the mapping between the clocks, a fixed delay aside: the passive one-way
+    filter of Olson (2010), "A passive solution to the sensor synchronization problem", here with the clocks' rates
+    learned as well by the linear programme of Moon, Skelly and Towsley (1999), "Estimation and removal of clock skew
+    from network delay measurements", over the last minute. Its solution is the edge of the points' lower hull that
+    spans their mean device time.
+    """
+
+    def __init__(self) -> None:
+        self._fastest: deque[tuple[int, int]] = deque(maxlen=_WINDOW_BUCKETS)  # (device, host) per finished bucket
+        self._bucket = 0
+        self._bucket_best: tuple[int, int] | None = None
+        # The mapping: host = device + offset + rate_error * (device - origin), device time in ns.
+        self._origin_ns = 0
+        self._offset_ns = 0
+        self._rate_error = 0.0
+        self._last_stamp_ns: int | None = None
+
+    def add(self, device_time_us: int, host_ns: int) -> int:
+        """Takes one reading in; returns its stamp.
+
+        Args:
+            device_time_us: the device's clock, unwrapped, not running backwards.
+            host_ns: time of arrival, on the run's clock.
+
+        Returns:
+            ns on the run's clock: not after the arrival, and after the previous stamp unless the arrival forbids it.
+        """
+        stamp_ns = self.observe(device_time_us, host_ns)
+        if self._last_stamp_ns is not None:  # a better mapping may lie a little lower
+            stamp_ns = min(max(stamp_ns, self._last_stamp_ns + 1), max(host_ns, self._last_stamp_ns + 1))
+        self._last_stamp_ns = stamp_ns
+        return stamp_ns
+
+    def observe(self, device_time_us: int, host_ns: int) -> int:
+        """Learns from one reading; returns its stamp by the mapping as it now is."""
+        device_ns = device_time_us * _NS_PER_US
+        if self._bucket_best is None:
+            self._origin_ns, self._offset_ns, self._bucket = device_ns, host_ns - device_ns, device_ns // _BUCKET_NS
+            self._bucket_best = (device_ns, host_ns)
+            return host_ns
+        if device_ns // _BUCKET_NS != self._bucket:
+            self._fastest.append(self._bucket_best)
+            self._fit()
+            self._bucket, self._bucket_best = device_ns // _BUCKET_NS, (device_ns, host_ns)
+        elif host_ns - self.stamp(device_ns) < self._bucket_best[1] - self.stamp(self._bucket_best[0]):
+            self._bucket_best = (device_ns, host_ns)
+        early_ns = self.stamp(device_ns) - host_ns
+        if early_ns > 0:  # faster than any before
+            self._offset_ns -= early_ns
+            return host_ns
+        return self.stamp(device_ns)
+
+    def stamp(self, device_ns: int) -> int:
+        """The mapping as it is."""
+        since_origin = device_ns - self._origin_ns
+        return device_ns + self._offset_ns + round(self._rate_error * since_origin)
+
+    def _fit(self) -> None:
+        points = [(device - self._origin_ns, host - device) for device, host in self._fastest]
+        first, second = _edge_below(points)
+        if second[0] > first[0]:
+            slope = (second[1] - first[1]) / (second[0] - first[0])
+            self._rate_error = min(max(slope, -_MAX_RATE_ERROR), _MAX_RATE_ERROR)
+        self._offset_ns = min(delay - round(self._rate_error * at) for at, delay in points)
+
+
+def _edge_below(points: list[tuple[int, int]]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The edge of the lower convex hull that spans the mean of x; `points` in order of x. One point: it, twice."""
+    hull: list[tuple[int, int]] = []
+    for x, y in points:
+        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
+            hull.pop()
+        hull.append((x, y))
+    mean_times_n = sum(x for x, _ in points)
+    for first, second in itertools.pairwise(hull):
+        if second[0] * len(points) >= mean_times_n:
+            return first, second
+    return hull[-1], hull[-1]
+
+
+def _turns_down(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
+    """Whether b lies on or above the line from a to c."""
+    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])
