@@ -113,11 +113,13 @@ def _explained(model: type[BaseModel], problem: ErrorDetails) -> str:
     if problem["type"] == "missing":
         return f"{field} is missing; add it"
     if problem["type"] == "extra_forbidden":
-        return f"{field} is not a field; {_nearest_field(model, problem['loc'])}"
+        return f"{field} (given as {_shown(problem['input'])}) is not a field; {_nearest_field(model, problem['loc'])}"
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "value_error":  # our own validators say the way out themselves
         return f"{field}: {message}" if field else message
-    message = message.removeprefix("Input ").replace("should be", "must be")
+    if problem["type"] == "model_type":
+        message = "must have its own `field: value` lines"
+    message = re.sub(r"^\w+ should ", "must ", message)
     return f"{field} is {_shown(problem['input'])} but {message}; correct it"
 
 
