@@ -1,0 +1,96 @@
+"""groundsbot-offline: from run logs to a map, and what goes with it. Heavy imports wait until a command runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.command_line import new_app
+from calib.command_line import run as run_program
+from calib.errors import GroundsbotError
+
+app = new_app("Turns run logs into one map of tags and trajectories, and tells what is in them.")
+
+OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of runs; made if need be.", metavar="DIR")]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+
+
+@app.command("import")
+def import_csv(
+    folder: Annotated[Path, typer.Argument(help="Holds odometry.csv + observations.csv, or odom.csv + landmarks.csv.")],
+    output: OutputFolder,
+    run_id: Annotated[str | None, typer.Option(help="Name of the run. [default: the folder's]")] = None,
+    robot_id: Annotated[str | None, typer.Option(help="Name of the robot. [default: the folder's]")] = None,
+    robot: Annotated[Path | None, typer.Option(help="robot.yaml with wheels and mount; options win over it.")] = None,
+    track_width_m: Annotated[float | None, typer.Option(help="Distance between the wheels.")] = None,
+    state_rate_hz: Annotated[float | None, typer.Option(help="States a second, for odom.csv.")] = None,
+    wheel_radius_m: Annotated[float | None, typer.Option(help="Radius of both wheels, for ticks.")] = None,
+    ticks_per_turn: Annotated[float | None, typer.Option(help="Ticks in one turn of a wheel.")] = None,
+    camera_x_m: Annotated[float | None, typer.Option(help="Camera ahead of the wheels' middle. [default: 0]")] = None,
+    camera_y_m: Annotated[float | None, typer.Option(help="Camera left of the wheels' middle. [default: 0]")] = None,
+    camera_yaw_deg: Annotated[float | None, typer.Option(help="Camera turned to the left. [default: 0]")] = None,
+    tag_family: Annotated[str, typer.Option(help="Family of the tags seen.")] = "tag36h11",
+) -> None:
+    """Makes a run log, DIR/RUN_ID/0000.core.mcap, from a folder of CSV files (docs/formats.md).
+
+    Observations in observations.csv are in the robot's base frame, unless a --camera option is given: then they are
+    in the camera's. Those in landmarks.csv always are.
+    """
+    from offline.import_robot import ImportOptions
+    from offline.importers import import_folder
+
+    options = ImportOptions(
+        run_id=run_id,
+        robot_id=robot_id,
+        robot=robot,
+        track_width_m=track_width_m,
+        state_rate_hz=state_rate_hz,
+        wheel_radius_m=wheel_radius_m,
+        ticks_per_turn=ticks_per_turn,
+        camera_x_m=camera_x_m,
+        camera_y_m=camera_y_m,
+        camera_yaw_deg=camera_yaw_deg,
+        tag_family=tag_family,
+    )
+    for line in import_folder(folder, output, options).lines():
+        typer.echo(line)
+
+
+@app.command()
+def info(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")],
+    json_output: JsonFlag = False,
+) -> None:
+    """Tells what logs hold: run, robot, duration, rates, distance, tags, gaps, events, sizes.
+
+    A log that cannot be read is named at the end, with exit 1; the others are described all the same.
+    """
+    import json
+
+    from offline.info import describe_log
+    from onboard.log_reader import find_logs
+
+    described, refused = [], []
+    for log in find_logs(logs):
+        try:
+            described.append(describe_log(log))
+        except GroundsbotError as error:
+            refused.append(error)
+    if json_output:
+        typer.echo(json.dumps([each.as_json() for each in described], indent=2, allow_nan=False))
+    else:
+        for line in (line for each in described for line in each.lines()):
+            typer.echo(line)
+    for earlier in refused[:-1]:
+        typer.echo(f"error: {earlier}", err=True)
+    if refused:
+        raise refused[-1]
+
+
+def main() -> None:
+    """The program `groundsbot-offline`."""
+    run_program(app)
+
+
+if __name__ == "__main__":
+    main()

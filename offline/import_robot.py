@@ -1,0 +1,164 @@
+"""What is known of an imported run's robot: from the command line, from a robot.yaml, or said to be unknown."""
+
+import re
+from dataclasses import dataclass
+from math import degrees, isfinite, pi, radians
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from offline.errors import OfflineError
+from offline.import_forms import WheelScale
+
+# Somebody else's CSV seldom says where the camera sat; a robot of this kind holds it within these of its axle's middle.
+UNKNOWN_MOUNT_SIGMA_X_M: Final = 0.2
+UNKNOWN_MOUNT_SIGMA_Y_M: Final = 0.1
+UNKNOWN_MOUNT_SIGMA_YAW_DEG: Final = 2.0
+# The log holds metres, so radius and ticks are not used; robot.yaml must name some.
+_NOMINAL_RADIUS_M: Final = 0.1
+_NOMINAL_TICKS_PER_TURN: Final = 1000
+_SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the command line says of the run; None where it says nothing."""
+
+    run_id: str | None = None
+    robot_id: str | None = None
+    robot: Path | None = None
+    track_width_m: float | None = None
+    state_rate_hz: float | None = None
+    wheel_radius_m: float | None = None
+    ticks_per_turn: float | None = None
+    camera_x_m: float | None = None
+    camera_y_m: float | None = None
+    camera_yaw_deg: float | None = None
+    tag_family: str = "tag36h11"
+
+    def __post_init__(self) -> None:
+        for option in ("track_width_m", "state_rate_hz", "wheel_radius_m", "ticks_per_turn"):
+            self._check_number(option, positive=True)
+        for option in ("camera_x_m", "camera_y_m", "camera_yaw_deg"):
+            self._check_number(option, positive=False)
+        for option in ("run_id", "robot_id"):
+            value = getattr(self, option)
+            if value is not None and not _SAFE_NAME.fullmatch(value):
+                raise OfflineError(
+                    f"{_flag(option)} is {value!r}; it may hold letters, digits, dot, dash and underscore, "
+                    "begins with a letter or digit and has at most 64 of them"
+                )
+
+    def _check_number(self, option: str, *, positive: bool) -> None:
+        value = getattr(self, option)
+        if value is None:
+            return
+        if not isfinite(value) or (positive and value <= 0):
+            raise OfflineError(f"{_flag(option)} is {value}, must be {'above 0' if positive else 'finite'}; correct it")
+
+    @property
+    def has_mount(self) -> bool:
+        """Whether any part of the camera's place was given."""
+        return any(value is not None for value in (self.camera_x_m, self.camera_y_m, self.camera_yaw_deg))
+
+
+def safe_name(folder: Path) -> str:
+    """A folder's name with everything but letters, digits, dot, dash and underscore turned to dashes."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).lstrip("._-")
+    if not name:
+        raise OfflineError(f"{folder}: a run cannot be named after this folder; give --run-id and --robot-id")
+    return name
+
+
+def wheel_scale(options: ImportOptions) -> WheelScale:
+    """Lengths of ticks and track: an option wins over robot.yaml."""
+    robot = read_robot_yaml(options.robot) if options.robot else None
+    if robot is None:
+        if options.wheel_radius_m is None or options.ticks_per_turn is None:
+            return WheelScale(options.track_width_m, None, None)
+        tick_m = 2 * pi * options.wheel_radius_m / options.ticks_per_turn
+        return WheelScale(options.track_width_m, tick_m, tick_m)
+    wheels = robot.wheels.model_copy(update=_given_wheels(options))
+    return WheelScale(wheels.track_m, *wheels.metres_per_tick)
+
+
+def describe_robot(folder: Path, options: ImportOptions, in_camera: bool) -> tuple[Robot, str, list[str]]:
+    """The run's robot, its robot.yaml as text for the log, and what a person should know of it.
+
+    Args:
+        folder: the CSV folder, after which the robot is named unless it has a name.
+        options: of the command line.
+        in_camera: whether observations are in the camera's frame, so that its mount matters.
+
+    Raises:
+        OfflineError: the track width is given nowhere.
+        CalibError: robot.yaml cannot be used.
+    """
+    if options.robot is not None:
+        data = read_robot_yaml(options.robot).model_dump()
+        said = f"wheels and mount as in {options.robot}, where no option says otherwise"
+    else:
+        data, said = _bare_robot(folder, options), "robot.yaml made from the options; tag size and wheel radii unknown"
+    if options.robot_id is not None:
+        data["robot_id"] = options.robot_id
+    _apply_wheels(data["wheels"], options)
+    remarks = [said]
+    if in_camera:
+        remarks.append(_apply_mount(data["mount"], options))
+    text = yaml.safe_dump(data, sort_keys=False)
+    return parse_robot_yaml(text, f"{folder}: robot.yaml for the log"), text, remarks
+
+
+def _bare_robot(folder: Path, options: ImportOptions) -> dict[str, Any]:
+    if options.track_width_m is None:
+        raise OfflineError(f"{folder}: the distance between the wheels is not known; give --track-width-m or --robot")
+    return {
+        "robot_id": options.robot_id or safe_name(folder),
+        "wheels": {
+            "radius_left_m": _NOMINAL_RADIUS_M,
+            "radius_right_m": _NOMINAL_RADIUS_M,
+            "track_m": options.track_width_m,
+            "ticks_per_turn": _NOMINAL_TICKS_PER_TURN,
+        },
+        "mount": {},
+    }
+
+
+def _apply_wheels(wheels: dict[str, Any], options: ImportOptions) -> None:
+    for field, value in _given_wheels(options).items():
+        wheels[field] = value
+        wheels.pop(f"{field}_sigma", None)  # that of another value
+
+
+def _given_wheels(options: ImportOptions) -> dict[str, float]:
+    given = {
+        "radius_left_m": options.wheel_radius_m,
+        "radius_right_m": options.wheel_radius_m,
+        "track_m": options.track_width_m,
+        "ticks_per_turn": options.ticks_per_turn,
+    }
+    return {field: value for field, value in given.items() if value is not None}
+
+
+def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
+    """Puts the camera where the options say. What neither they nor robot.yaml tell is 0 with a wide sigma."""
+    yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
+    assumed = []
+    for field, given, sigma, said in (
+        ("x_m", options.camera_x_m, UNKNOWN_MOUNT_SIGMA_X_M, f"x (sigma {UNKNOWN_MOUNT_SIGMA_X_M:g} m)"),
+        ("y_m", options.camera_y_m, UNKNOWN_MOUNT_SIGMA_Y_M, f"y (sigma {UNKNOWN_MOUNT_SIGMA_Y_M:g} m)"),
+        ("yaw_rad", yaw_rad, radians(UNKNOWN_MOUNT_SIGMA_YAW_DEG), f"yaw (sigma {UNKNOWN_MOUNT_SIGMA_YAW_DEG:g} deg)"),
+    ):
+        if given is not None:
+            mount[field] = given
+        elif options.robot is None:
+            mount[field], mount[f"{field}_sigma"] = 0.0, sigma
+            assumed.append(said)
+    place = f"camera at x {mount['x_m']:g} m, y {mount['y_m']:g} m, yaw {degrees(mount['yaw_rad']):g} deg of the base"
+    return f"{place}; not given, so taken as 0 with a wide sigma: {', '.join(assumed)}" if assumed else place
+
+
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"
