@@ -83,47 +83,38 @@ class DeviceClockFilter:
         self._origin_ns = 0
         self._offset_ns = 0
         self._rate_error = 0.0
-        self._last_stamp_ns: int | None = None
 
-    def add(self, device_time_us: int, host_ns: int) -> int:
-        """Takes one reading in; returns its stamp.
+    def observe(self, device_time_us: int, host_ns: int) -> None:
+        """Learns from one reading.
 
         Args:
             device_time_us: the device's clock, unwrapped, not running backwards.
             host_ns: time of arrival, on the run's clock.
-
-        Returns:
-            ns on the run's clock: not after the arrival, and after the previous stamp unless the arrival forbids it.
         """
-        stamp_ns = self.observe(device_time_us, host_ns)
-        if self._last_stamp_ns is not None:  # a better mapping may lie a little lower
-            stamp_ns = min(max(stamp_ns, self._last_stamp_ns + 1), max(host_ns, self._last_stamp_ns + 1))
-        self._last_stamp_ns = stamp_ns
-        return stamp_ns
-
-    def observe(self, device_time_us: int, host_ns: int) -> int:
-        """Learns from one reading; returns its stamp by the mapping as it now is."""
         device_ns = device_time_us * _NS_PER_US
         if self._bucket_best is None:
-            self._origin_ns, self._offset_ns, self._bucket = device_ns, host_ns - device_ns, device_ns // _BUCKET_NS
-            self._bucket_best = (device_ns, host_ns)
-            return host_ns
-        if device_ns // _BUCKET_NS != self._bucket:
+            self._origin_ns, self._offset_ns, self._bucket_best = device_ns, host_ns - device_ns, (device_ns, host_ns)
+            return
+        bucket = (device_ns - self._origin_ns) // _BUCKET_NS  # each holds the end of a burst, the first one too
+        if bucket != self._bucket:
             self._fastest.append(self._bucket_best)
             self._fit()
-            self._bucket, self._bucket_best = device_ns // _BUCKET_NS, (device_ns, host_ns)
-        elif host_ns - self.stamp(device_ns) < self._bucket_best[1] - self.stamp(self._bucket_best[0]):
+            self._bucket, self._bucket_best = bucket, (device_ns, host_ns)
+        elif host_ns - self._mapped(device_ns) < self._bucket_best[1] - self._mapped(self._bucket_best[0]):
             self._bucket_best = (device_ns, host_ns)
-        early_ns = self.stamp(device_ns) - host_ns
+        early_ns = self._mapped(device_ns) - host_ns
         if early_ns > 0:  # faster than any before
             self._offset_ns -= early_ns
-            return host_ns
-        return self.stamp(device_ns)
 
-    def stamp(self, device_ns: int) -> int:
-        """The mapping as it is."""
-        since_origin = device_ns - self._origin_ns
-        return device_ns + self._offset_ns + round(self._rate_error * since_origin)
+    def stamp_ns(self, device_time_us: int) -> int:
+        """When a reading was measured, by the mapping as it now is: never after its arrival, once observed.
+
+        A better mapping may lie a little lower than the one before it, so stamps of successive calls may step back.
+        """
+        return self._mapped(device_time_us * _NS_PER_US)
+
+    def _mapped(self, device_ns: int) -> int:
+        return device_ns + self._offset_ns + round(self._rate_error * (device_ns - self._origin_ns))
 
     def _fit(self) -> None:
         points = [(device - self._origin_ns, host - device) for device, host in self._fastest]

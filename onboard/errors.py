@@ -9,3 +9,7 @@ class OnboardError(GroundsbotError):
 
 class LogError(OnboardError):
     """A log file that cannot be read or written."""
+
+
+class MessageRefusedError(LogError):
+    """One message that cannot stand in a log; the log itself stays whole."""

@@ -13,7 +13,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import register_schema
 
-from onboard.errors import LogError
+from onboard.errors import LogError, MessageRefusedError
 from onboard.messages import TOPICS, Topic
 
 CORE_FILE: Final = "0000.core.mcap"
@@ -88,12 +88,13 @@ class LogWriter:
             publish_time_ns: best estimate of when it was measured, on the run's clock.
 
         Raises:
-            LogError: unknown topic, another schema, a time out of range or backwards. The log stays whole.
+            MessageRefusedError: a time out of range. The log stays whole.
+            LogError: unknown topic, another schema, or log time backwards.
         """
         known = _topic(topic, message)
         for name, value in (("log_time_ns", log_time_ns), ("publish_time_ns", publish_time_ns)):
             if not 0 <= value < _TIME_LIMIT_NS:
-                raise LogError(f"{topic}: {name} is {value}, must lie in 0 to 2^63 - 1; message refused")
+                raise MessageRefusedError(f"{topic}: {name} is {value}, must lie in 0 to 2^63 - 1; message refused")
         if log_time_ns < self._last_ns:
             raise LogError(
                 f"{topic}: log_time_ns {log_time_ns} lies before the last message's {self._last_ns}; sort first"

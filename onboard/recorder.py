@@ -1,0 +1,368 @@
+"""The recorder's core: bytes and pictures with their times in, a log out.
+
+It reads no clock and no device, so that a live recording and a simulated one run through the same code: the same
+calls give the same log to the byte.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from calib.camera_model import CameraModel
+from calib.robot import Robot
+from onboard.errors import LogError, MessageRefusedError
+from onboard.log_head import CAMERA_FRAME, log_head
+from onboard.log_writer import LogWriter
+from onboard.messages import (
+    ClockAnchor,
+    CompressedImage,
+    Event,
+    EventKind,
+    Severity,
+    StampSource,
+    TagDetection,
+    TagDetections,
+    WheelEncoders,
+    timestamp,
+)
+from onboard.picture import encode_jpeg
+from onboard.tag_detector import Detection, TagDetector
+from onboard.wheel_intake import StampedReading, WheelIntake
+
+_NS_PER_S: Final = 1_000_000_000
+_ANCHOR_PERIOD_NS: Final = _NS_PER_S
+_WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
+_WHEEL_SILENCE_NS: Final = 3 * _NS_PER_S
+_WAIT_FOR_WHEELS_NS: Final = 500_000_000
+_WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
+
+
+class Run(NamedTuple):
+    """What names and describes one run."""
+
+    robot: Robot
+    robot_yaml: str  # the text that `robot` was read from
+    camera: CameraModel | None  # None: a run of wheels only
+    run_id: str
+    start_ns: int  # on the run's clock
+    run_epoch_ns: int  # realtime minus monotonic, frozen at the start
+
+
+class _Waiting(NamedTuple):
+    """Detections that wait for the wheel reading after them, so that they can name the one before."""
+
+    message: TagDetections
+    receive_ns: int
+
+
+class RecorderCore:
+    """Writes one run into `<folder>/<run_id>/`.
+
+    All times are ns on the run's clock. A message's log time is when the host received it, or the log's newest time
+    where another one has been written since.
+
+    Attributes:
+        folder: the run's folder.
+        counts: messages written, by topic.
+        losses: what is missing from the log, by a word for it.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run: Run,
+        *,
+        detector: TagDetector | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        expect_wheels: bool = True,
+        durable: bool = True,
+    ) -> None:
+        """Opens the log.
+
+        Args:
+            folder: where run folders go.
+            run: what is recorded.
+            detector: for `on_frame`; one that gives its detections ready does without.
+            on_event: told of each event as it is written.
+            expect_wheels: whether their silence is worth an event.
+            durable: see LogWriter.
+
+        Raises:
+            LogError: the log cannot be opened.
+        """
+        self.folder = folder / run.run_id
+        self.counts: Counter[str] = Counter()
+        self.losses: Counter[str] = Counter()
+        self._run = run
+        self._options = run.robot.recorder
+        self._detector = detector
+        self._on_event = on_event
+        self._expect_wheels = expect_wheels
+        self._intake = WheelIntake()
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
+        self._last_wheel_host_ns = run.start_ns
+        self._silent = False
+        self._waiting: deque[_Waiting] = deque()
+        self._odd_sizes: set[tuple[int, int]] = set()
+        self._next_picture_ns = 0
+        self._next_anchor_ns = 0
+        self._lines_lost = 0  # since the last event about them
+        self._reported = (0, 0)  # rejected and repeated lines in events so far
+        head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
+        keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
+        self._writer = LogWriter(self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable)
+        self._keep_pictures = keep_pictures
+        self._closed = False
+        self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
+
+    # --- wheels
+
+    def on_serial_bytes(self, data: bytes, host_ns: int) -> None:
+        """Takes what the port gave at `host_ns`: any number of bytes, cut anywhere."""
+        for each in self._intake.feed(data, host_ns):
+            self._write_reading(each)
+        self._write_waiting(host_ns)
+
+    def on_port_connected(self, name: str, host_ns: int) -> None:
+        """The port is open, for the first time or again."""
+        self._intake.parser.restart()
+        self.event(EventKind.PORT_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
+
+    def on_port_lost(self, reason: str, host_ns: int) -> None:
+        """The port is gone."""
+        self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
+
+    def _write_reading(self, each: StampedReading) -> None:
+        reading = each.reading
+        self._note_gaps(each)
+        message = WheelEncoders(
+            stamp_ns=each.stamp_ns,
+            device_time_us=reading.device_time_us,
+            boot_id=reading.boot_id,
+            sequence=reading.sequence,
+            ticks_left=reading.ticks_left,
+            ticks_right=reading.ticks_right,
+            flags=reading.flags,
+        )
+        self._write("/wheels", message, each.host_ns, each.stamp_ns)
+        self._recent.append((each.stamp_ns, reading.sequence))
+        self._last_wheel_host_ns = each.host_ns
+        self._silent = False
+
+    def _note_gaps(self, each: StampedReading) -> None:
+        reading = each.reading
+        if reading.lost:
+            self._lines_lost += reading.lost
+            self.losses["wheel lines"] += reading.lost
+        if not self._recent:
+            return
+        gap_ns = each.stamp_ns - self._recent[-1][0]
+        if reading.new_epoch:
+            self.losses["wheel controller resets"] += 1
+            text = f"boot {reading.boot_id} after {gap_ns / _NS_PER_S:.3f} s: the motion in between is unknown"
+            self.event(EventKind.WHEEL_RESET, Severity.SEVERITY_WARNING, text, each.host_ns, 1)
+        elif gap_ns > _WHEEL_GAP_NS:
+            text = f"no wheel reading for {gap_ns / _NS_PER_S:.3f} s"
+            self.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
+
+    # --- camera
+
+    def on_frame(
+        self, grey: NDArray[np.uint8], stamp_ns: int, receive_ns: int, source: "StampSource | int", sequence: int
+    ) -> None:
+        """Detects the tags in a grey picture [height, width] at once, and keeps the picture where one is due.
+
+        Args:
+            grey: the picture.
+            stamp_ns: middle of the exposure.
+            receive_ns: when the host received it.
+            source: where the stamp comes from.
+            sequence: the camera's picture number.
+
+        Raises:
+            LogError: the core was made without a detector.
+        """
+        if self._detector is None:
+            raise LogError("pictures came to a recorder that was made without a detector; give it one")
+        height_px, width_px = grey.shape
+        if self.wants_picture(stamp_ns):
+            self.on_picture(encode_jpeg(grey, self._options.jpeg_quality), stamp_ns, receive_ns)
+        self.on_detections(
+            self._detector.detect(grey),
+            (width_px, height_px),
+            stamp_ns,
+            receive_ns,
+            source,
+            sequence,
+            detector=self._detector.library,
+            detector_settings=self._detector.settings,
+        )
+
+    def on_detections(
+        self,
+        detections: Sequence[Detection],
+        size_px: tuple[int, int],
+        stamp_ns: int,
+        receive_ns: int,
+        source: "StampSource | int",
+        sequence: int,
+        *,
+        detector: str = "",
+        detector_settings: str = "",
+    ) -> None:
+        """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
+        self._check_size(size_px, receive_ns)
+        message = TagDetections(
+            stamp_ns=stamp_ns,
+            frame_sequence=sequence,
+            width_px=size_px[0],
+            height_px=size_px[1],
+            detector=detector,
+            detector_settings=detector_settings,
+            stamp_source=StampSource.Name(source),
+            detections=[
+                TagDetection(
+                    family=each.family,
+                    tag_id=each.tag_id,
+                    hamming=each.hamming,
+                    decision_margin=each.decision_margin,
+                    corners_px=each.corners_px.ravel().tolist(),
+                )
+                for each in detections
+            ],
+        )
+        self._waiting.append(_Waiting(message, receive_ns))
+        self._write_waiting(receive_ns)
+
+    def wants_picture(self, stamp_ns: int) -> bool:
+        """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
+        if not self._keep_pictures:
+            return False
+        period_ns = round(_NS_PER_S / self._options.picture_rate_hz)
+        late_ns = stamp_ns - self._next_picture_ns
+        if late_ns < -period_ns // 10:  # stamps jitter
+            return False
+        self._next_picture_ns = stamp_ns + period_ns if late_ns > period_ns else self._next_picture_ns + period_ns
+        return True
+
+    def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
+        """Keeps one picture, encoded as JPEG."""
+        if self._keep_pictures:
+            message = CompressedImage(timestamp=timestamp(stamp_ns), frame_id=CAMERA_FRAME, data=jpeg, format="jpeg")
+            self._write("/camera/image", message, receive_ns, stamp_ns)
+
+    def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
+        """Pictures that the log will not have: dropped, or of no use."""
+        self.losses["pictures"] += count
+        self.event(kind, Severity.SEVERITY_WARNING, reason, host_ns, count)
+
+    def _check_size(self, size_px: tuple[int, int], host_ns: int) -> None:
+        camera = self._run.camera
+        if camera is None or size_px == (camera.width_px, camera.height_px) or size_px in self._odd_sizes:
+            return
+        self._odd_sizes.add(size_px)
+        text = (
+            f"pictures are {size_px[0]}x{size_px[1]} px, the calibration is for {camera.width_px}x{camera.height_px}: "
+            "set the camera to that size or calibrate at this one"
+        )
+        self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, text, host_ns)
+
+    def _write_waiting(self, now_ns: int) -> None:
+        newest_ns = self._recent[-1][0] if self._recent else None
+        while self._waiting:
+            message, receive_ns = self._waiting[0]
+            wheels_are_past = newest_ns is not None and newest_ns > message.stamp_ns
+            too_late = now_ns - receive_ns >= _WAIT_FOR_WHEELS_NS and not self._intake.warming_up
+            if not (wheels_are_past or too_late):
+                return
+            self._waiting.popleft()
+            self._write_detections(message, receive_ns)
+
+    def _write_detections(self, message: TagDetections, receive_ns: int) -> None:
+        before = next((sequence for at_ns, sequence in reversed(self._recent) if at_ns <= message.stamp_ns), None)
+        if before is not None:
+            message.has_wheel_sequence = True
+            message.wheel_sequence = before
+        self._write("/tags/detections", message, receive_ns, message.stamp_ns)
+
+    # --- time
+
+    def tick(self, now_ns: int, realtime_ns: int | None = None, synchronised: bool = False) -> None:
+        """Does what is due without news from a device; call it a few times a second.
+
+        Args:
+            now_ns: now.
+            realtime_ns: the wall clock at that moment; None where it is the run's own, as in a simulation.
+            synchronised: whether something disciplines the wall clock.
+        """
+        for each in self._intake.release_due(now_ns):
+            self._write_reading(each)
+        self._write_waiting(now_ns)
+        if now_ns < self._next_anchor_ns:
+            return
+        self._next_anchor_ns = now_ns - now_ns % _ANCHOR_PERIOD_NS + _ANCHOR_PERIOD_NS
+        anchor = ClockAnchor(
+            stamp_ns=now_ns,
+            monotonic_ns=now_ns - self._run.run_epoch_ns,
+            realtime_ns=now_ns if realtime_ns is None else realtime_ns,
+            synchronised=synchronised,
+        )
+        self._write("/clock", anchor, now_ns, now_ns)
+        self._report_wheels(now_ns)
+
+    def _report_wheels(self, now_ns: int) -> None:
+        """Lost and bad lines come in numbers, so they are told of once a second."""
+        if self._lines_lost:
+            text = f"{self._lines_lost} lines missing by their sequence numbers"
+            self.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, now_ns, self._lines_lost)
+            self._lines_lost = 0
+        rejected, repeated = self._intake.parser.rejected, self._intake.unwrapper.repeated
+        if rejected > self._reported[0]:
+            count = rejected - self._reported[0]
+            text = f"{count} pieces that are no line, the last {self._intake.parser.last_rejected!r}"
+            self.event(EventKind.WHEEL_LINE_REJECTED, Severity.SEVERITY_WARNING, text, now_ns, count)
+        if repeated > self._reported[1]:
+            count = repeated - self._reported[1]
+            text = f"{count} lines left out: sequence number not newer than the last"
+            self.event(EventKind.WHEEL_SEQUENCE, Severity.SEVERITY_WARNING, text, now_ns, count)
+        self._reported = (rejected, repeated)
+        if self._expect_wheels and not self._silent and now_ns - self._last_wheel_host_ns > _WHEEL_SILENCE_NS:
+            self._silent = True
+            text = f"no valid wheel line for {_WHEEL_SILENCE_NS // _NS_PER_S} s: check cable, port and baud rate"
+            self.event(EventKind.NO_WHEEL_DATA, Severity.SEVERITY_WARNING, text, now_ns)
+
+    def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
+        """Writes one event."""
+        message = Event(stamp_ns=host_ns, severity=Severity.Name(severity), kind=kind, text=text, count=count)
+        self._write("/events", message, host_ns, host_ns)
+        if self._on_event is not None:
+            self._on_event(message)
+
+    def close(self, now_ns: int) -> None:
+        """Writes what still waits and finishes the files. A second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        for each in self._intake.release_all():
+            self._write_reading(each)
+        self._write_waiting(now_ns + _WAIT_FOR_WHEELS_NS)
+        self._report_wheels(now_ns)
+        lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
+        self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
+        self._writer.close()
+
+    def _write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
+        log_time_ns = max(receive_ns, self._writer.last_log_time_ns)
+        try:
+            self._writer.write(topic, message, log_time_ns, stamp_ns)
+        except MessageRefusedError as error:
+            self.losses["messages refused"] += 1
+            now_ns = self._writer.last_log_time_ns
+            self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, str(error), now_ns, 1)
+            return
+        self.counts[topic] += 1

@@ -1,0 +1,203 @@
+"""The recorder's core: what goes in with its times comes out in the log, the same to the byte each time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.camera_model import CameraModel
+from calib.robot import parse_robot_yaml
+from onboard.encoder_protocol import WheelLine, format_line
+from onboard.errors import LogError
+from onboard.log_reader import read_log
+from onboard.messages import Event, EventKind, StampSource, TagDetections
+from onboard.recorder import RecorderCore, Run
+from onboard.tag_detector import Detection
+
+ROBOT_YAML = """
+robot_id: gb1
+wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}
+mount: {x_m: 0.1, z_m: 0.4, pitch_rad: -0.1}
+camera: camera.yaml
+recorder: {picture_rate_hz: PICTURES}
+"""
+CAMERA = CameraModel("front", 64, 48, 60.0, 61.0, 31.5, 23.5, "plumb_bob", (0.1, 0.0, 0.0, 0.0, 0.0))
+START_NS = 1_800_000_000_000_000_000
+MS = 1_000_000
+TAG = Detection("tag36h11", 4, 0, 55.5, np.array([[1.25, 2.0], [9.0, 2.5], [9.5, 9.0], [1.0, 8.75]]))
+
+
+def make_core(folder: Path, pictures_hz: float = 0.0, camera: CameraModel | None = CAMERA) -> RecorderCore:
+    text = ROBOT_YAML.replace("PICTURES", str(pictures_hz))
+    run = Run(parse_robot_yaml(text, "robot.yaml"), text, camera, "run1", START_NS, START_NS - 5)
+    return RecorderCore(folder, run, durable=False)
+
+
+def wheel_bytes(index: int, boot_id: int = 7) -> bytes:
+    return format_line(WheelLine(boot_id, index, index * 10_000 + 2**32 - 50_000, 13 * index, -14 * index, 0))
+
+
+def drive(core: RecorderCore, n_lines: int = 200, skip: range = range(0)) -> int:
+    """Lines every 10 ms, each a millisecond on its way; a picture every 100 ms, 5 ms after a reading."""
+    now_ns = START_NS
+    for index in range(n_lines):
+        measured_ns = START_NS + index * 10 * MS
+        now_ns = measured_ns + MS
+        if index not in skip:
+            core.on_serial_bytes(wheel_bytes(index), now_ns)
+        if index % 10 == 0:
+            stamp_ns = measured_ns + 5 * MS
+            if core.wants_picture(stamp_ns):
+                core.on_picture(b"\xff\xd8\xff jpeg \xff\xd9", stamp_ns, now_ns + 6 * MS)
+            now_ns += 6 * MS
+            core.on_detections([TAG], (64, 48), stamp_ns, now_ns, StampSource.STAMP_SOURCE_SIMULATION, index // 10)
+        core.tick(now_ns)
+    return now_ns
+
+
+def events(folder: Path) -> list[Event]:
+    return [each.message for each in read_log(folder, ["/events"]) if isinstance(each.message, Event)]
+
+
+def test_every_line_and_picture_is_in_the_log_with_its_stamp(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    core.close(drive(core))
+    log = list(read_log(tmp_path / "run1"))
+    wheels = [each for each in log if each.topic == "/wheels"]
+    assert [each.message.sequence for each in wheels] == list(range(200))  # type: ignore[attr-defined]  # of its topic
+    # Both a millisecond of fixed delay: the mapping cannot know it. Device times are whole microseconds.
+    stamps = np.array([each.publish_time_ns for each in wheels])
+    assert np.abs(stamps - START_NS - MS - 10 * MS * np.arange(200)).max() < 5_000
+    assert [each.log_time_ns for each in log] == sorted(each.log_time_ns for each in log)
+    assert not core.losses
+    frames = [each.message for each in log if each.topic == "/tags/detections"]
+    assert [frame.frame_sequence for frame in frames] == list(range(20))  # type: ignore[attr-defined]  # of its topic
+    assert frames[3].detections[0].corners_px == pytest.approx(TAG.corners_px.ravel())  # type: ignore[attr-defined]  # same
+
+
+def test_detections_name_the_last_wheel_reading_measured_before_them(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    # The lines come in bursts of 20: when a picture's tags are known, the readings around it are still on their way.
+    pending = b""
+    for index in range(400):
+        pending += wheel_bytes(index)
+        now_ns = START_NS + index * 10 * MS + MS
+        if index % 20 == 19:
+            core.on_serial_bytes(pending, now_ns)
+            pending = b""
+        if index % 10 == 5:
+            core.on_detections([], (64, 48), START_NS + index * 10 * MS - 4 * MS, now_ns, 5, index)
+    core.close(START_NS + 4000 * MS)
+    frames = [each.message for each in read_log(tmp_path / "run1", ["/tags/detections"])]
+    named = {each.frame_sequence: each.wheel_sequence for each in frames if isinstance(each, TagDetections)}
+    assert named == {index: index - 1 for index in range(5, 400, 10)}
+
+
+def test_without_wheels_detections_wait_half_a_second_and_name_none(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    core.on_detections([TAG], (64, 48), START_NS, START_NS + MS, 5, 0)
+    core.tick(START_NS + 400 * MS)
+    assert core.counts["/tags/detections"] == 0
+    core.tick(START_NS + 502 * MS)
+    assert core.counts["/tags/detections"] == 1
+    core.close(START_NS + 600 * MS)
+    (found,) = read_log(tmp_path / "run1", ["/tags/detections"])
+    assert not found.message.has_wheel_sequence  # type: ignore[attr-defined]  # of its topic
+
+
+def test_same_calls_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        core = make_core(tmp_path / name, pictures_hz=5.0)
+        core.close(drive(core))
+    for file in ("0000.core.mcap", "0000.camera.mcap"):
+        assert (tmp_path / "a/run1" / file).read_bytes() == (tmp_path / "b/run1" / file).read_bytes()
+
+
+def test_pictures_are_kept_at_their_rate(tmp_path: Path) -> None:
+    core = make_core(tmp_path, pictures_hz=5.0)  # of 10 a second
+    core.close(drive(core))
+    stamps = [each.publish_time_ns for each in read_log(tmp_path / "run1", ["/camera/image"])]
+    assert stamps == [START_NS + 5 * MS + index * 200 * MS for index in range(10)]
+
+
+def test_lost_lines_are_counted_and_told(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    core.close(drive(core, 300, skip=range(150, 215)))
+    assert core.losses == {"wheel lines": 65}
+    told = [each for each in events(tmp_path / "run1") if each.kind == EventKind.WHEEL_GAP]
+    assert [each.text for each in told] == [
+        "no wheel reading for 0.660 s",
+        "65 lines missing by their sequence numbers",
+    ]
+    assert [each.count for each in told] == [65, 65]
+
+
+def test_a_controller_reset_is_an_event(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    now_ns = drive(core)
+    for index in range(100):
+        core.on_serial_bytes(wheel_bytes(index, boot_id=8), now_ns + (3000 + 10 * index) * MS)
+    core.close(now_ns + 5000 * MS)
+    assert core.losses == {"wheel controller resets": 1}
+    assert [each.kind for each in events(tmp_path / "run1")] == [
+        "recording_started",
+        "wheel_reset",
+        "recording_stopped",
+    ]
+    assert core.counts["/wheels"] == 300
+
+
+def test_noise_and_repeated_lines_are_told_once_a_second(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    now_ns = drive(core)
+    core.on_serial_bytes(b"garbage\r\n" * 5 + wheel_bytes(199), now_ns + MS)
+    core.close(now_ns + 2 * MS)
+    told = {each.kind: each.count for each in events(tmp_path / "run1")}
+    assert told["wheel_line_rejected"] == 5
+    assert told["wheel_sequence"] == 1
+    assert core.counts["/wheels"] == 200
+
+
+def test_silence_of_the_wheels_is_told_once(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    for second in range(10):
+        core.tick(START_NS + second * 1000 * MS)
+    core.close(START_NS + 10_000 * MS)
+    assert [each.kind for each in events(tmp_path / "run1")].count("no_wheel_data") == 1
+
+
+def test_a_picture_size_that_does_not_fit_the_calibration_is_one_event(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    for index in range(5):
+        core.on_detections([], (128, 96), START_NS, START_NS + index * MS, 5, index)
+    core.close(START_NS + 1000 * MS)
+    (told,) = [each for each in events(tmp_path / "run1") if each.kind == EventKind.FRAME_SIZE]
+    assert "128x96" in told.text
+    assert "64x48" in told.text
+
+
+def test_a_stamp_out_of_range_costs_that_message_only(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    core.on_detections([], (64, 48), -5, START_NS, 5, 0)
+    core.close(drive(core))
+    assert core.losses == {"messages refused": 1}
+    assert core.counts["/tags/detections"] == 20
+    assert "message_refused" in [each.kind for each in events(tmp_path / "run1")]
+
+
+def test_a_run_of_wheels_only(tmp_path: Path) -> None:
+    core = make_core(tmp_path, pictures_hz=5.0, camera=None)
+    core.on_serial_bytes(b"".join(map(wheel_bytes, range(50))), START_NS)
+    core.close(START_NS + MS)
+    topics = [each.topic for each in read_log(tmp_path / "run1")]
+    assert topics == ["/run", "/events", *["/wheels"] * 50, "/events"]
+
+
+def test_a_run_is_never_written_over(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    with pytest.raises(LogError, match=r"0000\.core\.mcap\.active: a recording is running"):
+        make_core(tmp_path)
+    core.close(START_NS)
+    with pytest.raises(LogError, match="exists already"):
+        make_core(tmp_path)
+    assert sorted(each.name for each in (tmp_path / "run1").iterdir()) == ["0000.core.mcap"]
