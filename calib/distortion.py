@@ -59,7 +59,8 @@ class Distortion:
             fold = _first_positive_root(_growth(numerator, denominator), widest)
             limit = float(np.sqrt(_first_positive_root(denominator, fold)))
         unlimited = cls(numerator, denominator, p1, p2, model == "equidistant", limit, np.inf)
-        factor, _ = unlimited._factor(np.array(limit * limit))
+        with np.errstate(all="ignore"):  # where the denominator ends the lens, its image goes to infinity
+            factor, _ = unlimited._factor(np.array(limit * limit))
         return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
 
     def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -84,8 +85,8 @@ class Distortion:
 
     def remove(self, distorted: FloatArray) -> FloatArray:
         """Undistorted points `[..., 2]`, whose images are `distorted` to 1e-12; NaN where there is none."""
-        points = self._radially_undistorted(distorted)
         with np.errstate(all="ignore"):  # a point without a solution may run away; it is refused below
+            points = self._radially_undistorted(distorted)
             if self.p1 or self.p2:
                 for _ in range(_POLISH_STEPS):
                     image, jacobian = self._apply(points)

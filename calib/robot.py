@@ -21,7 +21,7 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 # Nothing on a robot is this long: a larger number was given in millimetres.
 Length = Annotated[float, Field(gt=0.0, le=10.0, allow_inf_nan=False)]
 Place = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
-TagFamily = Literal["tag36h11", "tag36h10", "tag25h9", "tag16h5"]
+TagFamily = Literal["tag36h11", "tag25h9", "tag16h5"]
 DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 
 RELATIVE_RADIUS_SIGMA = 0.005

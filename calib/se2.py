@@ -19,8 +19,9 @@ def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
     angle = np.asarray(angle_rad, dtype=np.float64)
     turns = np.ceil((angle - np.pi) / (2.0 * np.pi))
     wrapped = angle - 2.0 * np.pi * turns
-    # Rounding may end a hair outside.
-    return np.where(wrapped <= -np.pi, np.pi, np.minimum(wrapped, np.pi))
+    # Rounding may end a hair outside, or carry an angle a hair above -pi round to pi.
+    wrapped = np.where(wrapped <= -np.pi, np.pi, np.minimum(wrapped, np.pi))
+    return np.where((angle > -np.pi) & (angle <= np.pi), angle, wrapped)
 
 
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> FloatArray:
