@@ -87,6 +87,30 @@ def info(
         raise refused[-1]
 
 
+@app.command()
+def compare(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")],
+    truth: Annotated[Path, typer.Option(help="truth.json of the simulation.")],
+    json_output: JsonFlag = False,
+) -> None:
+    """Tells how far a map is from ground truth, and whether its covariances are honest.
+
+    With several components the figures of the largest come first, then those of the others, each in its own frame.
+    """
+    import json
+
+    from offline.evaluation import evaluate
+    from offline.map_io import read_map
+    from offline.truth import read_truth
+
+    errors = evaluate(read_map(folder), read_truth(truth))
+    if json_output:
+        typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
+        return
+    for line in errors.lines():
+        typer.echo(line)
+
+
 def main() -> None:
     """The program `groundsbot-offline`."""
     run_program(app)

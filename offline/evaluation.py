@@ -1,0 +1,322 @@
+"""A map against ground truth: how far off it is, and whether it knows.
+
+Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" are of the map as it
+stands. NEES is e' C^-1 e per dimension: 1 on average where the covariances are right (Bar-Shalom, Li, Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, section 5.4).
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray
+from offline.errors import OfflineError
+from offline.result import Component, MapResult, RunResult, TagResult
+from offline.truth import TrueRun, Truth
+
+
+@dataclass(frozen=True)
+class StartError:
+    """From the start of run `a` to the start of run `b`: found and true."""
+
+    a: str
+    b: str
+    distance_m: float
+    true_distance_m: float
+    vector_error_m: float
+
+    @property
+    def distance_error_m(self) -> float:
+        """How wrong the distance is, without sign."""
+        return abs(self.distance_m - self.true_distance_m)
+
+    @property
+    def percent(self) -> float | None:
+        """The distance's error as a share of the true distance; None where that is nothing."""
+        return 100.0 * self.distance_error_m / self.true_distance_m if self.true_distance_m > 1e-9 else None
+
+
+@dataclass(frozen=True)
+class TagError:
+    """How far one tag is off, in the frame of its component."""
+
+    family: str
+    tag_id: int
+    instance: str
+    error_m: float
+    sigma_m: float  # predicted for the error's length: square root of the covariance's trace
+
+
+@dataclass(frozen=True)
+class ComponentErrors:
+    """Figures of one component. None: nothing to measure it by (one run, no tag, no truth)."""
+
+    frame_run: str
+    runs: tuple[str, ...]
+    n_tags: int
+    starts: tuple[StartError, ...]
+    tags: tuple[TagError, ...]
+    tags_rmse_m: float | None
+    tags_rmse_aligned_m: float | None
+    trajectory_rmse_m: float | None
+    nees_tags_per_dim: float | None
+    nees_start_per_dim: float | None
+    notes: tuple[str, ...]
+
+    @property
+    def worst_start(self) -> StartError | None:
+        """The pair of starts whose vector is off most: with two runs, the one pair."""
+        return max(self.starts, key=lambda pair: pair.vector_error_m, default=None)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; the start figures are those of the worst pair, all pairs stand in `starts`."""
+        worst = self.worst_start
+        starts = [
+            asdict(pair) | {"distance_error_m": pair.distance_error_m, "percent": pair.percent} for pair in self.starts
+        ]
+        return {
+            "frame_run": self.frame_run,
+            "runs": list(self.runs),
+            "n_tags": self.n_tags,
+            "start_to_start_vector_error_m": worst.vector_error_m if worst else None,
+            "start_to_start_distance_error_m": worst.distance_error_m if worst else None,
+            "start_to_start_percent": worst.percent if worst else None,
+            "tags_rmse_m": self.tags_rmse_m,
+            "tags_rmse_aligned_m": self.tags_rmse_aligned_m,
+            "trajectory_rmse_m": self.trajectory_rmse_m,
+            "nees_tags_per_dim": self.nees_tags_per_dim,
+            "nees_start_per_dim": self.nees_start_per_dim,
+            "starts": starts,
+            "tags": [asdict(tag) for tag in self.tags],
+            "notes": list(self.notes),
+        }
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        lines = [f"frame: start of {self.frame_run}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
+        for pair in self.starts:
+            percent = "" if pair.percent is None else f" ({pair.percent:.2f} %)"
+            lines.append(
+                f"  start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m found, "
+                f"{pair.true_distance_m:.3f} m true, off by {pair.distance_error_m:.3f} m{percent}; "
+                f"vector off by {pair.vector_error_m:.3f} m"
+            )
+        for what, value, unit in (
+            ("tags RMSE, as the map stands", self.tags_rmse_m, " m"),
+            ("tags RMSE, aligned", self.tags_rmse_aligned_m, " m"),
+            ("trajectory RMSE, as the map stands", self.trajectory_rmse_m, " m"),
+            ("tags NEES per dimension (1 is honest)", self.nees_tags_per_dim, ""),
+            ("start NEES per dimension (1 is honest)", self.nees_start_per_dim, ""),
+        ):
+            lines.append(f"  {what}: {'nothing to judge by' if value is None else f'{value:.3f}{unit}'}")
+        worst = max(self.tags, key=lambda tag: tag.error_m, default=None)
+        if worst is not None:
+            name = f"{worst.family} {worst.tag_id}{worst.instance}"
+            lines.append(f"  worst tag: {name}, off by {worst.error_m:.3f} m (sigma {worst.sigma_m:.3f} m)")
+        return lines + [f"  {note}" for note in self.notes]
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """Figures of a whole map: each component in its own frame, largest first."""
+
+    components: tuple[ComponentErrors, ...]
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        lines = [line for component in self.components for line in component.lines()]
+        if len(self.components) > 1:
+            lines.insert(0, f"{len(self.components)} components, each judged in its own frame, largest first")
+        return lines
+
+    def as_json(self) -> dict[str, Any]:
+        """The largest component's figures on top, and each component's in `components`."""
+        parts = [component.as_json() for component in self.components]
+        return parts[0] | {"components": parts}
+
+
+def evaluate(result: MapResult, truth: Truth) -> MapErrors:
+    """Compares a map with the truth.
+
+    Raises:
+        OfflineError: the truth does not know the run that the largest component's frame is made of.
+    """
+    components = []
+    for index, component in enumerate(result.components):
+        frame = _true_frame(component, truth)
+        if frame is None and index == 0:
+            raise OfflineError(
+                f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
+                f"it has {', '.join(sorted(truth.runs)) or 'no runs'}. Give the truth.json of these drives"
+            )
+        components.append(_unknown(component) if frame is None else _evaluate(component, truth, frame))
+    return MapErrors(tuple(components))
+
+
+def _true_frame(component: Component, truth: Truth) -> FloatArray | None:
+    """T_world_map: the true start pose of the component's first run."""
+    first = next(run for run in component.runs if run.name == component.frame_run)
+    return _true_start(first, truth)
+
+
+def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
+    true_run = truth.runs.get(run.run)
+    if true_run is None:
+        return None
+    poses, covered = true_run.at(run.stamps_ns[:1])
+    return poses[0] if covered[0] else None
+
+
+def _unknown(component: Component) -> ComponentErrors:
+    note = f"the truth does not know the start of {component.frame_run}; this component is not judged"
+    runs = tuple(run.name for run in component.runs)
+    return ComponentErrors(
+        component.frame_run, runs, len(component.tags), (), (), None, None, None, None, None, (note,)
+    )
+
+
+def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> ComponentErrors:
+    notes = _notes(component, truth)
+    starts, nees_start = _start_errors(component, truth, T_world_map)
+    known = [i for i, tag in enumerate(component.tags) if _knows(truth, tag)]
+    tags = [component.tags[i] for i in known]
+    found = np.array([tag.position_m for tag in tags]).reshape(-1, 2)
+    world = np.array([truth.tags_m[_name(tag)] for tag in tags]).reshape(-1, 2)
+    true = se2.apply(se2.inverse(T_world_map), world)
+    errors = found - true
+    rows = np.array([(2 * i, 2 * i + 1) for i in known], dtype=np.int64).reshape(-1)
+    nees_tags = _nees_per_dim(errors.reshape(-1), component.tag_covariance[np.ix_(rows, rows)])
+    for name, value, wanted in (("tags", nees_tags, len(tags)), ("start", nees_start, len(starts))):
+        if wanted and value is None:
+            notes.append(f"nees_{name}_per_dim: the covariance is not positive definite, so there is no figure")
+    return ComponentErrors(
+        frame_run=component.frame_run,
+        runs=tuple(run.name for run in component.runs),
+        n_tags=len(component.tags),
+        starts=starts,
+        tags=tuple(_tag_error(tag, error) for tag, error in zip(tags, errors, strict=True)),
+        tags_rmse_m=_rms(errors),
+        tags_rmse_aligned_m=_rms(aligned(found, true) - true) if len(tags) > 1 else None,
+        trajectory_rmse_m=_rms(_trajectory_errors(component.runs, truth, T_world_map)),
+        nees_tags_per_dim=nees_tags,
+        nees_start_per_dim=nees_start,
+        notes=tuple(notes),
+    )
+
+
+def aligned(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
+    """Points (N, 2) turned and moved, not scaled, so that they lie on others (N, 2) with least squares.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991).
+    """
+    middle, onto_middle = points_m.mean(axis=0), onto_m.mean(axis=0)
+    left, _, right = np.linalg.svd((onto_m - onto_middle).T @ (points_m - middle))
+    no_mirror = np.diag([1.0, np.sign(np.linalg.det(left @ right)) or 1.0])
+    rotation = left @ no_mirror @ right
+    moved: FloatArray = (points_m - middle) @ rotation.T + onto_middle
+    return moved
+
+
+def _start_errors(
+    component: Component, truth: Truth, T_world_map: FloatArray
+) -> tuple[tuple[StartError, ...], float | None]:
+    """Every pair of starts, and the NEES of all starts jointly as seen from the frame's."""
+    places: dict[str, tuple[FloatArray, FloatArray]] = {}  # found, true
+    rows: list[int] = []
+    for index, run in enumerate(component.runs):
+        T_world_start = _true_start(run, truth) if run.run == run.name else None
+        if T_world_start is None:
+            continue
+        places[run.name] = run.T_map_start[:2], se2.between(T_world_map, T_world_start)[:2]
+        if run.name != component.frame_run:
+            rows += [3 * index, 3 * index + 1]
+    pairs = tuple(_start_error(a, b, places) for a, b in combinations(places, 2))
+    vector = [found - true for name, (found, true) in places.items() if name != component.frame_run]
+    errors = np.array(vector).reshape(-1)
+    return pairs, _nees_per_dim(errors, component.joint_covariance[np.ix_(rows, rows)])
+
+
+def _start_error(a: str, b: str, places: dict[str, tuple[FloatArray, FloatArray]]) -> StartError:
+    found = places[b][0] - places[a][0]
+    true = places[b][1] - places[a][1]
+    return StartError(
+        a,
+        b,
+        distance_m=float(np.linalg.norm(found)),
+        true_distance_m=float(np.linalg.norm(true)),
+        vector_error_m=float(np.linalg.norm(found - true)),
+    )
+
+
+def _trajectory_errors(runs: Iterable[RunResult], truth: Truth, T_world_map: FloatArray) -> FloatArray:
+    """Position errors (K, 2) of all keyframes that the truth covers."""
+    errors = [np.empty((0, 2))]
+    for run in runs:
+        true_run = truth.runs.get(run.run)
+        if true_run is not None:
+            T_world_base, covered = true_run.at(run.stamps_ns)
+            T_map_base = se2.between(T_world_map, T_world_base)
+            errors.append((run.T_map_base - T_map_base)[covered, :2])
+    return np.concatenate(errors)
+
+
+def _notes(component: Component, truth: Truth) -> list[str]:
+    """One line each on what the truth does not know."""
+    notes = []
+    unknown_runs = [run.name for run in component.runs if run.run not in truth.runs]
+    if unknown_runs:
+        notes.append(f"not in the truth, left out: runs {', '.join(unknown_runs)}")
+    late = sum(_n_not_covered(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
+    if late:
+        notes.append(f"{late} keyframes lie outside the truth's time, left out of trajectory_rmse_m")
+    unknown_tags = [_tag_label(tag) for tag in component.tags if not _knows(truth, tag)]
+    if unknown_tags:
+        notes.append(f"not in the truth, or there more than once, left out: tags {', '.join(unknown_tags)}")
+    return notes
+
+
+def _n_not_covered(run: RunResult, true_run: TrueRun) -> int:
+    return int((~true_run.at(run.stamps_ns)[1]).sum())
+
+
+def _tag_label(tag: TagResult) -> str:
+    return f"{tag.family}:{tag.tag_id}{tag.instance}"
+
+
+def _name(tag: TagResult) -> tuple[str, int, str]:
+    return tag.family, tag.tag_id, tag.instance
+
+
+def _knows(truth: Truth, tag: TagResult) -> bool:
+    return _name(tag) in truth.tags_m and _name(tag) not in truth.ambiguous
+
+
+def _tag_error(tag: TagResult, error_m: FloatArray) -> TagError:
+    return TagError(
+        tag.family,
+        tag.tag_id,
+        tag.instance,
+        float(np.linalg.norm(error_m)),
+        float(np.sqrt(np.trace(tag.covariance))),
+    )
+
+
+def _rms(errors_m: FloatArray) -> float | None:
+    """Root mean square of the lengths of (N, 2) errors; None of none."""
+    return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else None
+
+
+def _nees_per_dim(error: FloatArray, covariance: FloatArray) -> float | None:
+    """E' C^-1 e / dim; None without dimensions or where C is not positive definite."""
+    if not len(error):
+        return None
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return None
+    whitened = np.linalg.solve(factor, error)
+    return float(whitened @ whitened) / len(error)

@@ -1,0 +1,324 @@
+"""A map's files, written and read: map.json, map.npz, tags.csv and a trajectory for each run.
+
+docs/formats.md describes every key and column.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from calib.arrays import FloatArray
+from calib.errors import CalibError
+from calib.files import written_whole
+from calib.noise import NoiseParameters
+from offline.errors import OfflineError
+from offline.result import (
+    AlignmentResult,
+    CalibrationResult,
+    Component,
+    MapResult,
+    RunResult,
+    StartToStart,
+    TagResult,
+)
+from offline.trajectory_file import read_tum, write_tum
+
+FORMAT_VERSION: Final = 1
+JSON_FILE: Final = "map.json"
+ARRAYS_FILE: Final = "map.npz"
+TAGS_FILE: Final = "tags.csv"
+TAG_COLUMNS: Final = (
+    "tag_id",
+    "x_m",
+    "y_m",
+    "z_m",
+    "yaw_rad",
+    "sigma_x_m",
+    "sigma_y_m",
+    "n_observations",
+    "runs",
+    "family",
+    "instance",
+    "covariance_xy_m2",
+)
+
+
+def write_map(result: MapResult, folder: Path) -> None:
+    """Writes all files of a map into an existing folder; the same bytes for the same result.
+
+    Raises:
+        OSError: the folder is missing or not writable.
+    """
+    text = json.dumps(map_as_json(result), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    with written_whole(folder / JSON_FILE) as partial:
+        partial.write_text(text, encoding="utf-8")
+    with written_whole(folder / ARRAYS_FILE) as partial, partial.open("wb") as stream:
+        np.savez(stream, **_arrays(result))
+    with written_whole(folder / TAGS_FILE) as partial:
+        partial.write_text(_tags_csv(result), encoding="utf-8")
+    for run in result.runs:
+        write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
+
+
+def read_map(folder: Path) -> MapResult:
+    """Reads what `write_map` wrote, with the full precision of map.npz where it has it.
+
+    Raises:
+        OfflineError: a file is missing, damaged, or of a format that this program does not know.
+    """
+    path = folder / JSON_FILE
+    data = _read_json(path)
+    version = data.get("format_version")
+    if version != FORMAT_VERSION:
+        raise OfflineError(
+            f"{path}: format_version is {version!r}, this program reads {FORMAT_VERSION}; make the map again"
+        )
+    try:
+        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+            components = tuple(_component(data, index, arrays, folder) for index in range(len(data["components"])))
+        return MapResult(
+            components=components,
+            alignments=tuple(_alignment(entry) for entry in data["alignments"]),
+            noise=NoiseParameters.model_validate(data["noise"]),
+            calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
+            warnings=tuple(data["warnings"]),
+        )
+    except OSError as error:
+        raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
+    except (KeyError, IndexError, TypeError, ValueError, CalibError) as error:
+        raise OfflineError(
+            f"{folder}: the map's files are damaged or incomplete ({error}); make the map again"
+        ) from error
+
+
+def map_as_json(result: MapResult) -> dict[str, Any]:
+    """What map.json holds: plain data, null where a number is not known."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "frame": "map",
+        "components": [_component_json(component) for component in result.components],
+        "runs": [_run_json(run, i) for i, component in enumerate(result.components) for run in component.runs],
+        "tags": [_tag_json(tag, i) for i, component in enumerate(result.components) for tag in component.tags],
+        "alignments": [_alignment_json(alignment) for alignment in result.alignments],
+        "start_to_start": [
+            {
+                "a": pair.a,
+                "b": pair.b,
+                "vector_m": _plain(pair.vector_m),
+                "distance_m": _plain(pair.distance_m),
+                "sigma_m": _plain(pair.sigma_m),
+                "covariance": _plain(pair.covariance),
+            }
+            for component in result.components
+            for pair in component.start_to_start
+        ],
+        "noise": result.noise.model_dump(),
+        "calibration": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.calibration],
+        "suspect_tags": [],
+        "warnings": list(result.warnings),
+    }
+
+
+def _component_json(component: Component) -> dict[str, Any]:
+    return {
+        "frame_run": component.frame_run,
+        "runs": [run.name for run in component.runs],
+        "tags": [{"family": t.family, "tag_id": t.tag_id, "instance": t.instance} for t in component.tags],
+        "cost": _plain(component.cost),
+        "n_residuals": component.n_residuals,
+    }
+
+
+def _run_json(run: RunResult, component: int) -> dict[str, Any]:
+    return {
+        "run": run.name,
+        "log": str(run.log),
+        "robot": run.robot_id,
+        "T_map_start": _plain(run.T_map_start),
+        "covariance": _plain(run.covariance),
+        "n_keyframes": run.n_keyframes,
+        "distance_m": _plain(run.distance_m),
+        "run_id": run.run_id,
+        "stretch_of": None if run.run == run.name else run.run,
+        "component": component,
+    }
+
+
+def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
+    return {
+        "family": tag.family,
+        "tag_id": tag.tag_id,
+        "instance": tag.instance,
+        "size_m": _plain(tag.size_m),
+        "position_m": _plain(tag.position_m),
+        "quaternion_xyzw": None,
+        "covariance": _plain(tag.covariance),
+        "n_observations": tag.n_observations,
+        "runs": list(tag.runs),
+        "component": component,
+    }
+
+
+def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
+    return {
+        "from": alignment.from_run,
+        "to": alignment.to_run,
+        "transform": _plain(alignment.T_from_to),
+        "n_shared": alignment.n_shared,
+        "n_inliers": alignment.n_inliers,
+        "inlier_rmse_m": _plain(alignment.inlier_rmse_m),
+        "outliers": [{"family": family, "tag_id": tag_id} for family, tag_id in alignment.outliers],
+        "rivals": None,
+    }
+
+
+def _plain(value: FloatArray | float | int | str | None) -> Any:  # noqa: ANN401 - nested lists of any depth
+    """Numbers and nested lists for JSON, which has no NaN: null instead."""
+    if isinstance(value, np.ndarray):
+        return [_plain(entry) for entry in value] if value.ndim else _plain(float(value))
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def _arrays(result: MapResult) -> dict[str, Any]:
+    """Full precision and the joint covariances: what localising in, extending or judging the map needs."""
+    arrays: dict[str, Any] = {"format_version": np.int64(FORMAT_VERSION)}
+    for index, component in enumerate(result.components):
+        tags, key = component.tags, f"component{index}_"
+        arrays |= {
+            f"{key}runs": np.array([run.name for run in component.runs], dtype=np.str_),
+            f"{key}T_map_start": np.array([run.T_map_start for run in component.runs]).reshape(-1, 3),
+            f"{key}start_stamps_ns": np.array([run.stamps_ns[0] for run in component.runs], dtype=np.int64),
+            f"{key}tag_families": np.array([tag.family for tag in tags], dtype=np.str_),
+            f"{key}tag_ids": np.array([tag.tag_id for tag in tags], dtype=np.int64),
+            f"{key}tag_instances": np.array([tag.instance for tag in tags], dtype=np.str_),
+            f"{key}tag_positions_m": np.array([tag.position_m for tag in tags]).reshape(-1, 2),
+            f"{key}joint_covariance": component.joint_covariance,
+        }
+    return arrays
+
+
+def _tags_csv(result: MapResult) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(TAG_COLUMNS)
+    for component in result.components:
+        for tag in component.tags:
+            writer.writerow(_tag_row(tag))
+    return stream.getvalue()
+
+
+def _tag_row(tag: TagResult) -> Sequence[str | int]:
+    sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag.covariance))
+    return (
+        tag.tag_id,
+        _decimal(tag.position_m[0]),
+        _decimal(tag.position_m[1]),
+        "",  # height and direction are not estimated on the floor plan
+        "",
+        _decimal(sigma_x_m),
+        _decimal(sigma_y_m),
+        tag.n_observations,
+        " ".join(tag.runs),
+        tag.family,
+        tag.instance,
+        "" if not np.isfinite(tag.covariance[0, 1]) else f"{tag.covariance[0, 1]:.9g}",
+    )
+
+
+def _decimal(value: float) -> str:
+    return f"{value:.6f}" if np.isfinite(value) else ""
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OfflineError(f"{path}: cannot be read ({error.strerror}); give the folder that `map -o` wrote") from error
+    except ValueError as error:
+        raise OfflineError(f"{path}: is not JSON ({error}); make the map again") from error
+    if not isinstance(data, dict):
+        raise OfflineError(f"{path}: holds no object; make the map again")
+    return data
+
+
+def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], folder: Path) -> Component:
+    entry, key = data["components"][index], f"component{index}_"
+    starts, positions = arrays[f"{key}T_map_start"], arrays[f"{key}tag_positions_m"]
+    run_entries = [each for each in data["runs"] if each["component"] == index]
+    tag_entries = [each for each in data["tags"] if each["component"] == index]
+    runs = tuple(_run(each, start, folder) for each, start in zip(run_entries, starts, strict=True))
+    tags = tuple(replace(_tag(each), position_m=place) for each, place in zip(tag_entries, positions, strict=True))
+    joint = arrays[f"{key}joint_covariance"]
+    if joint.shape != (3 * len(runs) + 2 * len(tags),) * 2:
+        raise ValueError(f"{key}joint_covariance has the shape {joint.shape}")
+    names = {run.name for run in runs}
+    return Component(
+        frame_run=entry["frame_run"],
+        runs=runs,
+        tags=tags,
+        joint_covariance=joint,
+        cost=_number(entry["cost"]),
+        n_residuals=entry["n_residuals"],
+        start_to_start=tuple(
+            StartToStart(pair["a"], pair["b"], _array(pair["vector_m"]), _array(pair["covariance"]))
+            for pair in data["start_to_start"]
+            if pair["a"] in names
+        ),
+    )
+
+
+def _run(entry: dict[str, Any], T_map_start: FloatArray, folder: Path) -> RunResult:
+    stamps_ns, T_map_base = read_tum(folder / f"{entry['run']}.tum")
+    return RunResult(
+        name=entry["run"],
+        run=entry["stretch_of"] or entry["run"],
+        log=Path(entry["log"]),
+        robot_id=entry["robot"],
+        run_id=entry["run_id"],
+        T_map_start=T_map_start,
+        covariance=_array(entry["covariance"]),
+        stamps_ns=stamps_ns,
+        T_map_base=T_map_base,
+        distance_m=_number(entry["distance_m"]),
+    )
+
+
+def _tag(entry: dict[str, Any]) -> TagResult:
+    return TagResult(
+        family=entry["family"],
+        tag_id=entry["tag_id"],
+        instance=entry["instance"],
+        size_m=entry["size_m"],
+        position_m=_array(entry["position_m"]),
+        covariance=_array(entry["covariance"]),
+        n_observations=entry["n_observations"],
+        runs=tuple(entry["runs"]),
+    )
+
+
+def _alignment(entry: dict[str, Any]) -> AlignmentResult:
+    return AlignmentResult(
+        from_run=entry["from"],
+        to_run=entry["to"],
+        T_from_to=_array(entry["transform"]),
+        n_shared=entry["n_shared"],
+        n_inliers=entry["n_inliers"],
+        inlier_rmse_m=_number(entry["inlier_rmse_m"]),
+        outliers=tuple((outlier["family"], outlier["tag_id"]) for outlier in entry["outliers"]),
+    )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _array(values: Sequence[Any]) -> FloatArray:
+    return np.array(values, dtype=np.float64)  # null becomes NaN
