@@ -35,36 +35,21 @@ class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-def _share_of(value: object, share: float) -> float:
-    """A sigma as a share of a value; of a value that is itself refused, any sigma, so that only one error is left."""
-    if isinstance(value, int | float) and math.isfinite(value) and value:
-        return abs(value) * share
-    return 1.0
-
-
-def _with_relative_sigma(data: Any, share: float, *fields: str) -> Any:  # noqa: ANN401 - not validated yet
-    """Fills in `<field>_sigma` as a share of the field where it is left out."""
-    if not isinstance(data, dict):
-        return data
-    return {f"{field}_sigma": _share_of(data[field], share) for field in fields if field in data} | data
+def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's Field
+    """The default of a sigma: a share of the field before it."""
+    return Field(default_factory=lambda data: data[field] * share)
 
 
 class Wheels(_Section):
     """The differential drive. Errors of the two radii are independent: their common scale has sigma / sqrt(2)."""
 
     radius_left_m: Length
-    radius_left_m_sigma: Positive
+    radius_left_m_sigma: Positive = _share_of("radius_left_m", RELATIVE_RADIUS_SIGMA)
     radius_right_m: Length
-    radius_right_m_sigma: Positive
+    radius_right_m_sigma: Positive = _share_of("radius_right_m", RELATIVE_RADIUS_SIGMA)
     track_m: Length
-    track_m_sigma: Positive
+    track_m_sigma: Positive = _share_of("track_m", RELATIVE_TRACK_SIGMA)
     ticks_per_turn: Positive
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_in_sigmas(cls, data: Any) -> Any:  # noqa: ANN401 - not validated yet
-        data = _with_relative_sigma(data, RELATIVE_RADIUS_SIGMA, "radius_left_m", "radius_right_m")
-        return _with_relative_sigma(data, RELATIVE_TRACK_SIGMA, "track_m")
 
     @property
     def metres_per_tick(self) -> tuple[float, float]:
@@ -101,7 +86,7 @@ class Mount(_Section):
         return angle_rad
 
     @property
-    def T_base_camera(self) -> RigidTransform:  # noqa: N802 - frames are capitals in the field
+    def T_base_camera(self) -> RigidTransform:
         """Points in the camera's optical frame to points in base."""
         turned = Rotation.from_euler("ZYX", [self.yaw_rad, self.pitch_rad, self.roll_rad])
         return RigidTransform.from_components(
@@ -109,24 +94,19 @@ class Mount(_Section):
         )
 
 
+def _reference_size(batch: dict[str, Any]) -> float:
+    """The size in m that a batch's sigma is about."""
+    return float(batch["default_size_m"] or max(batch["sizes_m"].values(), default=1.0))
+
+
 class TagBatch(_Section):
     """Tags printed together: one scale error for all, `sigma_size_m` on the default size (or on the largest)."""
 
     family: TagFamily = "tag36h11"
     default_size_m: Length | None = None
-    sigma_size_m: Positive
-    sizes_m: dict[Annotated[int, Field(ge=0)], Length] = Field(default_factory=dict)
+    sizes_m: dict[Annotated[int, Field(ge=0)], Length] = {}
+    sigma_size_m: Positive = Field(default_factory=lambda data: _reference_size(data) * RELATIVE_TAG_SIZE_SIGMA)
     batch: Annotated[str, Field(min_length=1)] = "default"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_in_sigma(cls, data: Any) -> Any:  # noqa: ANN401 - not validated yet
-        if not isinstance(data, dict):
-            return data
-        size_m, sizes_m = data.get("default_size_m"), data.get("sizes_m")
-        if size_m is None and isinstance(sizes_m, dict):
-            size_m = max((size for size in sizes_m.values() if isinstance(size, int | float)), default=None)
-        return {"sigma_size_m": _share_of(size_m, RELATIVE_TAG_SIZE_SIGMA)} | data
 
     @model_validator(mode="after")
     def _has_a_size(self) -> Self:
@@ -139,7 +119,7 @@ class TagBatch(_Section):
     @property
     def relative_sigma(self) -> float:
         """The batch's scale error as a share of the size."""
-        return self.sigma_size_m / (self.default_size_m or max(self.sizes_m.values()))
+        return self.sigma_size_m / _reference_size(vars(self))
 
 
 class Devices(_Section):

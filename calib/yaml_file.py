@@ -96,7 +96,8 @@ def validated(model: type[Model], data: Mapping[str, Any], source: str) -> Model
     try:
         return model.model_validate(dict(data))
     except ValidationError as error:
-        problems = error.errors(include_url=False)
+        # A default worked out from a bad value is no mistake of its own.
+        problems = [each for each in error.errors(include_url=False) if each["type"] != "default_factory_not_called"]
         more = f" (and {len(problems) - 1} more after that)" if len(problems) > 1 else ""
         raise CalibError(f"{source}: {_explained(model, problems[0])}{more}") from error
 
