@@ -1,0 +1,236 @@
+"""Residuals and Jacobians, one class a measurement kind, all of a kind at once.
+
+Each class gives whitened residuals (M, n) and Jacobian blocks: pairs of columns (M, k) of the tangent vector and
+derivatives (M, n, k). A column of -1 marks something that is held and has no column.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import BoolArray, FloatArray, IntArray
+
+# The calibration numbers that a tag reading depends on, besides the scale of the tag's batch.
+MOUNT_PARAMETERS: Final = ("mount_x_m", "mount_y_m", "mount_yaw_rad")
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all variables.
+
+    Attributes:
+        poses: (P, 3) T_map_base of all chains, one after the other.
+        tags: (T, 2) in map.
+        calibration: (C,) corrections to nominal values.
+    """
+
+    poses: FloatArray
+    tags: FloatArray
+    calibration: FloatArray
+
+
+class Linearised(NamedTuple):
+    """Whitened residuals (M, n), and blocks of (columns (M, k), derivatives (M, n, k))."""
+
+    residual: FloatArray
+    blocks: tuple[tuple[IntArray, FloatArray], ...]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where each variable sits in the tangent vector; -1 where it is held.
+
+    Attributes:
+        poses: (P, 3); perturbed on the right.
+        tags: (T, 2); added.
+        calibration: (C,); added.
+        n: length of the tangent vector.
+    """
+
+    poses: IntArray
+    tags: IntArray
+    calibration: IntArray
+    n: int
+
+
+@dataclass(frozen=True)
+class OdometryFactors:
+    """Motion between neighbouring keyframes against the wheels: r = W log(M(c)^-1 o T_i^-1 o T_j).
+
+    M(c) = motion o exp(jacobian c) with c the wheel parameters of the robot.
+
+    Attributes:
+        first: (M,) index of T_i; T_j is the next pose.
+        motion: (M, 3) by nominal calibration.
+        whitening: (M, 3, 3) W with W^T W the information of the motion's right tangent.
+        jacobian: (M, 3, 3) by the wheel parameters.
+        parameters: (M, 3) indices into the calibration.
+    """
+
+    first: IntArray
+    motion: FloatArray
+    whitening: FloatArray
+    jacobian: FloatArray
+    parameters: IntArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(M, 3), whitened."""
+        error, _, _ = self._error(state)
+        return _times(self.whitening, error)
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (M, 3) and blocks for both poses and the wheel parameters."""
+        error, moved, twist = self._error(state)
+        by_second = self.whitening @ se2.right_jacobian_inverse(error)
+        by_first = -by_second @ se2.adjoint(se2.inverse(moved))
+        # log(exp(-(t + dt)) o G) with t = jacobian c: the change enters on the left.
+        by_twist = -self.whitening @ se2.right_jacobian_inverse(-error) @ se2.right_jacobian(twist)
+        return Linearised(
+            _times(self.whitening, error),
+            (
+                (columns.poses[self.first], by_first),
+                (columns.poses[self.first + 1], by_second),
+                (columns.calibration[self.parameters], by_twist @ self.jacobian),
+            ),
+        )
+
+    def _error(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        twist = _times(self.jacobian, state.calibration[self.parameters])
+        moved = se2.between(state.poses[self.first], state.poses[self.first + 1])
+        expected = se2.compose(self.motion, se2.exp(twist))
+        return se2.log(se2.between(expected, moved)), moved, twist
+
+
+@dataclass(frozen=True)
+class ReadingFactors:
+    """A tag's place seen from a pose, as (range, bearing) or (x, y) about a sensor on the base.
+
+    With l the tag in map: l_base = R^T (l - t), l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale); the reading is
+    l_sensor or its polar coordinates.
+
+    Attributes:
+        pose: (M,) index of the pose; tag: (M,) of the tag.
+        value: (M, 2); polar: (M,) which form.
+        whitening: (M, 2, 2).
+        mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
+        mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
+    """
+
+    pose: IntArray
+    tag: IntArray
+    value: FloatArray
+    polar: BoolArray
+    whitening: FloatArray
+    mount: FloatArray
+    mount_parameters: IntArray
+    scale_parameter: IntArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(M, 2), whitened, predicted minus read."""
+        _, in_sensor, _ = self._places(state)
+        return _times(self.whitening, self._difference(in_sensor))
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (M, 2) and blocks for pose, tag, mount and tag scale."""
+        in_base, in_sensor, mount = self._places(state)
+        theta, yaw = state.poses[self.pose, 2], mount[:, 2]
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        outer = self.whitening @ self._form_jacobian(in_sensor)
+        by_base = outer @ (_rotation(-yaw) / scale[:, None, None])
+        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
+        by_pose = np.zeros((len(self.pose), 2, 3))
+        by_pose[..., :2] = -by_base
+        by_pose[..., 2] = _times(by_base, _turned_right(in_base))
+        by_mount = np.zeros((len(self.pose), 2, 3))
+        by_mount[..., :2] = -by_base
+        by_mount[..., 2] = _times(outer, _turned_right(in_sensor))
+        by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
+        return Linearised(
+            _times(self.whitening, self._difference(in_sensor)),
+            (
+                (columns.poses[self.pose], by_pose),
+                (columns.tags[self.tag], by_base @ _rotation(-theta)),
+                (columns.calibration[self.mount_parameters], by_mount),
+                (columns.calibration[self.scale_parameter][:, None], by_scale),
+            ),
+        )
+
+    def places_in_map(self, state: State) -> FloatArray:
+        """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""
+        first, second = self.value[:, 0], self.value[:, 1]
+        in_sensor = np.where(
+            self.polar[:, None],
+            np.stack([first * np.cos(second), first * np.sin(second)], axis=-1),
+            self.value,
+        )
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        mount = self.mount + state.calibration[self.mount_parameters]
+        return se2.apply(se2.compose(state.poses[self.pose], mount), in_sensor * scale[:, None])
+
+    def _places(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The tags in base, in the sensor by the tags' stated size, and the sensor's mount."""
+        mount = self.mount + state.calibration[self.mount_parameters]
+        in_base = se2.apply(se2.inverse(state.poses[self.pose]), state.tags[self.tag])
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
+
+    def _difference(self, in_sensor: FloatArray) -> FloatArray:
+        x, y = in_sensor[:, 0], in_sensor[:, 1]
+        first = np.where(self.polar, np.hypot(x, y), x) - self.value[:, 0]
+        turned = se2.wrap_angle(np.arctan2(y, x) - self.value[:, 1])
+        return np.stack([first, np.where(self.polar, turned, y - self.value[:, 1])], axis=-1)
+
+    def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
+        """(M, 2, 2) derivative of the reading by the place in the sensor; the identity for (x, y)."""
+        x, y = in_sensor[:, 0], in_sensor[:, 1]
+        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
+        range_m = np.maximum(np.hypot(x, y), 1e-6)
+        jacobian = np.empty((len(x), 2, 2))
+        jacobian[:, 0, 0] = np.where(self.polar, x / range_m, 1.0)
+        jacobian[:, 0, 1] = np.where(self.polar, y / range_m, 0.0)
+        jacobian[:, 1, 0] = np.where(self.polar, -y / range_m**2, 0.0)
+        jacobian[:, 1, 1] = np.where(self.polar, x / range_m**2, 1.0)
+        return jacobian
+
+
+@dataclass(frozen=True)
+class CalibrationPrior:
+    """What robot.yaml says of each calibration number: r = c / sigma; where sigma is 0 it is held.
+
+    Attributes:
+        sigma: (C,)
+    """
+
+    sigma: FloatArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(C, 1), whitened."""
+        return (state.calibration / np.where(self.sigma > 0.0, self.sigma, 1.0))[:, None]
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (C, 1) and one block."""
+        weight = 1.0 / np.where(self.sigma > 0.0, self.sigma, 1.0)
+        return Linearised(self.residual(state), ((columns.calibration[:, None], weight[:, None, None]),))
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """W (..., n, n) with W^T W = covariance^-1."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Matrices (M, n, k) times vectors (M, k), one each."""
+    products: FloatArray = np.einsum("mij,mj->mi", matrices, vectors)
+    return products
+
+
+def _rotation(theta: FloatArray) -> FloatArray:
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+
+
+def _turned_right(vectors: FloatArray) -> FloatArray:
+    """(M, 2) turned by a quarter to the right: the derivative of R(a)^T v by a."""
+    return np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1)

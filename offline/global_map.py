@@ -1,0 +1,143 @@
+"""All runs of a component in one solve, and the typed result."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray
+from offline.factors import State
+from offline.graph import Graph, Parameter, build_graph
+from offline.local_map import LocalMap
+from offline.merge import Group
+from offline.result import CalibrationResult, Component, RunResult, StartToStart, TagResult
+from offline.run import TagKey
+from offline.solver import Solution, solve
+
+
+def solve_global_map(maps: Sequence[LocalMap], group: Group) -> tuple[Graph, Solution]:
+    """Solves the members of a group together, from their local maps placed by the alignments."""
+    members = [maps[m] for m in group.members]
+    graph = build_graph([member.chain for member in members])
+    if len(members) == 1:
+        return graph, members[0].solution
+    poses = np.concatenate(
+        [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
+    )
+    solution = solve(graph.problem, graph.start(poses, _mean_tags(members, group), _mean_calibration(members)))
+    return graph, solution
+
+
+def component_of(graph: Graph, solution: Solution) -> Component:
+    """Typed results with covariances, in the frame of the first chain's start."""
+    state = solution.state
+    starts = graph.first_pose
+    columns = graph.problem.columns
+    joint = solution.covariance(np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)]))
+    joint = _in_map_axes(joint, state.poses[starts, 2])
+    n_starts = 3 * len(starts)
+    runs = tuple(
+        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(len(graph.chains))
+    )
+    tag_covariances = [
+        joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2]
+        for i in range(len(graph.tags))
+    ]
+    return Component(
+        frame_run=graph.chains[0].name,
+        runs=runs,
+        tags=_tag_results(graph, state, tag_covariances),
+        joint_covariance=joint,
+        cost=solution.cost,
+        n_residuals=graph.problem.n_residuals,
+        start_to_start=_start_to_start(runs, joint),
+    )
+
+
+def calibration_of(graph: Graph, solution: Solution, component: int) -> list[CalibrationResult]:
+    """What the solve found for the calibration numbers it carried."""
+    columns = graph.problem.columns.calibration
+    sigmas = np.sqrt(np.diag(solution.covariance(columns)))
+    return [
+        CalibrationResult(parameter.owner, parameter.name, component, float(value), float(sigma), parameter.sigma)
+        for parameter, value, sigma, column in zip(
+            graph.parameters, solution.state.calibration, sigmas, columns, strict=True
+        )
+        if column >= 0
+    ]
+
+
+def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:
+    """Tags in the group's frame, the mean over the maps that have them."""
+    places: dict[TagKey, list[FloatArray]] = {}
+    for T_frame_start, member in zip(group.T_frame_start, members, strict=True):
+        for tag, place in member.tags_m.items():
+            places.setdefault(tag, []).append(se2.apply(T_frame_start, place))
+    return {tag: np.mean(found, axis=0) for tag, found in places.items()}
+
+
+def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
+    values: dict[Parameter, list[float]] = {}
+    for member in members:
+        for parameter, value in member.calibration.items():
+            values.setdefault(parameter, []).append(value)
+    return {parameter: float(np.mean(found)) for parameter, found in values.items()}
+
+
+def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
+    """From right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
+    turn = np.eye(len(joint))
+    for i, theta in enumerate(start_headings_rad):
+        cos, sin = np.cos(theta), np.sin(theta)
+        turn[3 * i : 3 * i + 2, 3 * i : 3 * i + 2] = [[cos, -sin], [sin, cos]]
+    return turn @ joint @ turn.T
+
+
+def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray) -> RunResult:
+    chain = graph.chains[index]
+    poses = graph.poses_of(state, index)
+    return RunResult(
+        name=chain.name,
+        run=chain.run.name,
+        log=chain.run.log,
+        robot_id=chain.run.robot_id,
+        run_id=chain.run.run_id,
+        T_map_start=poses[0],
+        covariance=covariance,
+        stamps_ns=chain.stamps_ns,
+        T_map_base=poses,
+        distance_m=float(chain.odometry.distance_m.sum()),
+    )
+
+
+def _tag_results(graph: Graph, state: State, covariances: Sequence[FloatArray]) -> tuple[TagResult, ...]:
+    results = []
+    for i, (tag, n) in enumerate(zip(graph.tags, graph.n_readings().tolist(), strict=True)):
+        seen_by = [chain for chain in graph.chains if tag in chain.tags]
+        robot = seen_by[0].run.robot
+        has_size = any(batch.family == tag.family for batch in robot.tags)
+        results.append(
+            TagResult(
+                family=tag.family,
+                tag_id=tag.tag_id,
+                instance="",
+                size_m=robot.tag_size_m(*tag)[0] if has_size else None,
+                position_m=state.tags[i],
+                covariance=covariances[i],
+                n_observations=n,
+                runs=tuple(chain.name for chain in seen_by),
+            )
+        )
+    return tuple(results)
+
+
+def _start_to_start(runs: Sequence[RunResult], joint: FloatArray) -> tuple[StartToStart, ...]:
+    found = []
+    for i in range(len(runs)):
+        for j in range(i + 1, len(runs)):
+            difference = np.zeros((2, len(joint)))
+            difference[:, 3 * i : 3 * i + 2] = -np.eye(2)
+            difference[:, 3 * j : 3 * j + 2] = np.eye(2)
+            vector_m = runs[j].T_map_start[:2] - runs[i].T_map_start[:2]
+            found.append(StartToStart(runs[i].name, runs[j].name, vector_m, difference @ joint @ difference.T))
+    return tuple(found)

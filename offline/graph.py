@@ -1,0 +1,206 @@
+"""From chains to one problem: which variables there are, which factor touches which, what is held."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from calib.robot import Robot
+from offline.chain import Chain
+from offline.factors import (
+    MOUNT_PARAMETERS,
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+    whitening,
+)
+from offline.odometry import WHEEL_PARAMETERS
+from offline.run import TagKey
+from offline.solver import Problem
+
+TAG_SCALE: Final = "tag_scale"
+
+
+class Parameter(NamedTuple):
+    """One calibration number: a correction to what a robot.yaml says."""
+
+    owner: str  # robot id or printed batch
+    name: str
+    nominal: tuple[float, ...]  # logs of one robot share a correction as long as they share what it corrects
+    sigma: float
+
+
+# Takes the place of a calibration number where a reading depends on none; held at zero.
+_NONE: Final = Parameter("", "", (), 0.0)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A problem and what its variables mean.
+
+    Attributes:
+        chains: in order; the first one's start is held at its value: the frame.
+        first_pose: (number of chains,) index of each chain's start among the poses.
+        tags: in order.
+        parameters: in order; the first is a held zero.
+    """
+
+    problem: Problem
+    chains: tuple[Chain, ...]
+    first_pose: IntArray
+    tags: tuple[TagKey, ...]
+    parameters: tuple[Parameter, ...]
+
+    def poses_of(self, state: State, chain: int) -> FloatArray:
+        """(K, 3) of one chain."""
+        first = int(self.first_pose[chain])
+        return state.poses[first : first + len(self.chains[chain].stamps_ns)]
+
+    def wheel_calibration(self, state: State, chain: int) -> FloatArray:
+        """(3,) wheel parameters of one chain's robot."""
+        return state.calibration[_indices(self.parameters, _wheel_parameters(self.chains[chain].run.robot))]
+
+    def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
+        """Starting values from poses (P, 3) and what is known; other tags start where their readings put them."""
+        values = np.array([calibration.get(p, 0.0) for p in self.parameters])
+        state = State(poses, np.zeros((len(self.tags), 2)), values)
+        places = self.problem.readings.places_in_map(state)
+        n = np.maximum(self.n_readings(), 1)
+        mean = np.stack(
+            [np.bincount(self.problem.readings.tag, places[:, i], len(self.tags)) / n for i in (0, 1)], axis=-1
+        )
+        start = [tags.get(tag, mean[i]) for i, tag in enumerate(self.tags)]
+        return State(poses, np.array(start).reshape(-1, 2), values)
+
+    def tags_of(self, state: State) -> dict[TagKey, FloatArray]:
+        """Places (2,) in map by tag."""
+        return dict(zip(self.tags, state.tags, strict=True))
+
+    def calibration_of(self, state: State) -> dict[Parameter, float]:
+        """Corrections by parameter."""
+        return dict(zip(self.parameters, state.calibration.tolist(), strict=True))
+
+    def n_readings(self) -> IntArray:
+        """(T,) readings of each tag."""
+        return np.bincount(self.problem.readings.tag, minlength=len(self.tags))
+
+
+def build_graph(chains: Sequence[Chain]) -> Graph:
+    """All chains in one problem. The first chain's start is held: it is the frame."""
+    tags = tuple(sorted({tag for chain in chains for tag in chain.tags}))
+    parameters = tuple(sorted({p for chain in chains for p in _parameters(chain)}, key=lambda p: p[:3]))
+    parameters = (_NONE, *parameters)
+    lengths = np.array([len(chain.stamps_ns) for chain in chains])
+    first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    columns = _columns(int(lengths.sum()), len(tags), parameters)
+    problem = Problem(
+        odometry=_odometry_factors(chains, first_pose, parameters),
+        readings=_reading_factors(chains, first_pose, tags, parameters),
+        prior=CalibrationPrior(np.array([p.sigma for p in parameters])),
+        columns=columns,
+    )
+    return Graph(problem, tuple(chains), first_pose, tags, parameters)
+
+
+def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:
+    """Poses in order of time, then tags, then calibration; the first pose and exact calibration are held."""
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    first_tag = 3 * n_poses - 3
+    tags = first_tag + np.arange(2 * n_tags).reshape(n_tags, 2)
+    free = np.array([p.sigma > 0.0 for p in parameters])
+    calibration = np.where(free, first_tag + 2 * n_tags + np.cumsum(free) - 1, -1)
+    return Columns(poses, tags, calibration, first_tag + 2 * n_tags + int(free.sum()))
+
+
+def _odometry_factors(
+    chains: Sequence[Chain], first_pose: IntArray, parameters: Sequence[Parameter]
+) -> OdometryFactors:
+    first, indices = [], []
+    for chain, start in zip(chains, first_pose, strict=True):
+        n = len(chain.odometry)
+        first.append(start + np.arange(n))
+        indices.append(np.tile(_indices(parameters, _wheel_parameters(chain.run.robot)), (n, 1)))
+    return OdometryFactors(
+        first=np.concatenate(first),
+        motion=np.concatenate([chain.odometry.motion for chain in chains]),
+        whitening=whitening(np.concatenate([chain.odometry.covariance for chain in chains])),
+        jacobian=np.concatenate([chain.odometry.jacobian for chain in chains]),
+        parameters=np.concatenate(indices),
+    )
+
+
+def _reading_factors(
+    chains: Sequence[Chain], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
+) -> ReadingFactors:
+    tag_index = {tag: i for i, tag in enumerate(tags)}
+    pose, tag, mount, mount_parameters, scale_parameter = [], [], [], [], []
+    for chain, start in zip(chains, first_pose, strict=True):
+        readings = chain.readings
+        own_tags = np.array([tag_index[t] for t in chain.tags], dtype=np.int64)
+        scales = np.array([parameters.index(_scale_parameter(chain, t)) for t in chain.tags], dtype=np.int64)
+        pose.append(start + readings.keyframe)
+        tag.append(own_tags[readings.tag])
+        by_camera = readings.in_camera[:, None]
+        mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
+        camera_parameters = _indices(parameters, _mount_parameters(chain.run.robot))
+        mount_parameters.append(np.where(by_camera, camera_parameters, 0))
+        scale_parameter.append(scales[readings.tag])
+    return ReadingFactors(
+        pose=np.concatenate(pose),
+        tag=np.concatenate(tag),
+        value=np.concatenate([chain.readings.value for chain in chains]),
+        polar=np.concatenate([chain.readings.polar for chain in chains]),
+        whitening=whitening(np.concatenate([chain.readings.covariance for chain in chains])),
+        mount=np.concatenate(mount),
+        mount_parameters=np.concatenate(mount_parameters),
+        scale_parameter=np.concatenate(scale_parameter),
+    )
+
+
+def _parameters(chain: Chain) -> list[Parameter]:
+    robot = chain.run.robot
+    found = _wheel_parameters(robot) + [_scale_parameter(chain, tag) for tag in chain.tags]
+    if chain.readings.in_camera.any():
+        found += _mount_parameters(robot)
+    return [p for p in found if p != _NONE]
+
+
+def _wheel_parameters(robot: Robot) -> list[Parameter]:
+    """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent."""
+    wheels = robot.wheels
+    nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
+    relative_left = wheels.radius_left_m_sigma / wheels.radius_left_m
+    relative_right = wheels.radius_right_m_sigma / wheels.radius_right_m
+    ratio_sigma = float(np.hypot(relative_left, relative_right))
+    sigmas = (0.5 * ratio_sigma, ratio_sigma, wheels.track_m_sigma / wheels.track_m)
+    return [
+        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(WHEEL_PARAMETERS, sigmas, strict=True)
+    ]
+
+
+def _mount_parameters(robot: Robot) -> list[Parameter]:
+    """In the order of MOUNT_PARAMETERS."""
+    mount = robot.mount
+    nominal = (mount.x_m, mount.y_m, mount.yaw_rad)
+    sigmas = (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma)
+    return [
+        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(MOUNT_PARAMETERS, sigmas, strict=True)
+    ]
+
+
+def _scale_parameter(chain: Chain, tag: TagKey) -> Parameter:
+    """Of the batch that a tag was printed in; none for imported positions of tags whose size nobody gave."""
+    robot = chain.run.robot
+    if not any(batch.family == tag.family for batch in robot.tags):
+        return _NONE
+    size_m, sigma_m, batch = robot.tag_size_m(*tag)
+    return Parameter(f"{batch} {tag.family}", TAG_SCALE, (), sigma_m / size_m)
+
+
+def _indices(parameters: Sequence[Parameter], wanted: Sequence[Parameter]) -> IntArray:
+    return np.array([parameters.index(p) if p in parameters else 0 for p in wanted], dtype=np.int64)

@@ -1,0 +1,220 @@
+"""Detections and imported positions of one run -> tag readings in metres, each with its covariance.
+
+A reading is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from calib import se2
+from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.noise import NoiseParameters
+from offline.errors import OfflineError
+from offline.run import Detections, Positions, Run
+from offline.tag_pose import TagReadings, general_readings, upright_readings
+
+# A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
+MAX_RANGE_SIGMA_PER_M: Final = 0.03
+# Nearer than this a reading is a phantom, and its covariance would wreck the condition of the solve.
+MIN_RANGE_M: Final = 0.1
+_UPRIGHT_DOF: Final = 2
+_FALSE_ALARM: Final = 1e-6
+# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its fellows is
+# said to hang askew.
+_ASKEW_FACTOR: Final = 4.0
+
+
+@dataclass(frozen=True)
+class Readings:
+    """M tag readings.
+
+    Attributes:
+        keyframe: (M,) index of the pose it was taken from.
+        tag: (M,) index into the tags of the run.
+        value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
+        covariance: (M, 2, 2) of the value.
+        polar: (M,)
+        in_camera: (M,) about the camera's place and yaw, else about base.
+    """
+
+    keyframe: IntArray
+    tag: IntArray
+    value: FloatArray
+    covariance: FloatArray
+    polar: BoolArray
+    in_camera: BoolArray
+
+    def __len__(self) -> int:
+        """Number of readings."""
+        return len(self.tag)
+
+    def where(self, mask: BoolArray) -> "Readings":
+        """Those of the mask."""
+        return Readings(
+            self.keyframe[mask],
+            self.tag[mask],
+            self.value[mask],
+            self.covariance[mask],
+            self.polar[mask],
+            self.in_camera[mask],
+        )
+
+
+def read_detections(
+    run: Run, detections: Detections, keyframe: IntArray, noise: NoiseParameters
+) -> tuple[Readings, list[str]]:
+    """Turns corners into readings about the camera.
+
+    Pictures that share a keyframe were taken from one standing pose: their corners are averaged, and the average keeps
+    the sigma of one picture, since what a detector gets wrong it gets wrong in each of them.
+
+    Args:
+        run: whose camera and tag sizes apply.
+        detections: (M,) of one stretch.
+        keyframe: (M,) the keyframe of each.
+        noise: for the corners' sigma.
+
+    Returns:
+        The readings, and sentences about those that were left out.
+    """
+    camera = run.camera
+    if camera is None or not len(detections.tag):
+        return _no_readings(), []
+    keyframe, tag, corners_px = _averaged(keyframe, detections.tag, detections.corners_px)
+    sides_m = np.array([run.robot.tag_size_m(*key)[0] for key in run.tags])[tag]
+    rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
+    found, askew = _upright_or_general(
+        tag,
+        upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px),
+        general_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px),
+    )
+    warnings = [
+        f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
+        for t in askew
+    ]
+    range_m = found.range_bearing[:, 0]
+    # From base's axes to the camera's yaw, about which all readings in_camera are.
+    value = np.stack([range_m, se2.wrap_angle(found.range_bearing[:, 1] - run.robot.mount.yaw_rad)], axis=-1)
+    with np.errstate(invalid="ignore"):
+        is_askew = np.isin(tag, askew)
+        sure = found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
+        good = found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew)
+    if (n_bad := int((~good).sum())) > 0:
+        warnings.append(
+            f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
+        )
+    return (
+        Readings(
+            keyframe=keyframe[good],
+            tag=tag[good],
+            value=value[good],
+            covariance=found.covariance[good],
+            polar=np.ones(int(good.sum()), dtype=np.bool_),
+            in_camera=np.ones(int(good.sum()), dtype=np.bool_),
+        ),
+        warnings,
+    )
+
+
+def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> Readings:
+    """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's."""
+    unknown = ~np.isfinite(positions.covariance).all((-1, -2))
+    value, polar = positions.value.copy(), positions.polar | unknown
+    x, y = positions.value[:, 0], positions.value[:, 1]
+    convert = unknown & ~positions.polar
+    value[convert] = np.stack([np.hypot(x, y), np.arctan2(y, x)], axis=-1)[convert]
+    covariance = positions.covariance.copy()
+    range_variance = noise.sigma_range_m**2 + (noise.sigma_range_per_m * value[unknown, 0]) ** 2
+    covariance[unknown] = 0.0
+    covariance[unknown, 0, 0] = range_variance
+    covariance[unknown, 1, 1] = noise.sigma_bearing_rad**2
+    range_m = np.where(polar, value[:, 0], np.hypot(value[:, 0], value[:, 1]))
+    good = np.isfinite(value).all(-1) & (range_m > MIN_RANGE_M)
+    return Readings(keyframe, positions.tag, value, covariance, polar, positions.in_camera).where(good)
+
+
+def joined(a: Readings, b: Readings) -> Readings:
+    """Both, ordered by keyframe."""
+    both = Readings(
+        np.concatenate([a.keyframe, b.keyframe]),
+        np.concatenate([a.tag, b.tag]),
+        np.concatenate([a.value, b.value]),
+        np.concatenate([a.covariance, b.covariance]),
+        np.concatenate([a.polar, b.polar]),
+        np.concatenate([a.in_camera, b.in_camera]),
+    )
+    order = np.argsort(both.keyframe, kind="stable")
+    return Readings(
+        both.keyframe[order],
+        both.tag[order],
+        both.value[order],
+        both.covariance[order],
+        both.polar[order],
+        both.in_camera[order],
+    )
+
+
+def check_tag_sizes(runs: Sequence[Run]) -> None:
+    """Refuses detections whose tag has no size, and runs that disagree about a tag's size.
+
+    Raises:
+        GroundsbotError: naming the run, the tag and the sizes.
+    """
+    known: dict[tuple[str, int], tuple[float, Run]] = {}
+    for run in runs:
+        for index in np.unique(run.detections.tag):
+            key = run.tags[index]
+            size_m = run.robot.tag_size_m(*key)[0]
+            other_m, other = known.setdefault(key, (size_m, run))
+            if abs(other_m - size_m) > 1e-6:
+                raise OfflineError(
+                    f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
+                    f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"
+                )
+
+
+def _upright_or_general(tag: IntArray, upright: TagReadings, general: TagReadings) -> tuple[TagReadings, IntArray]:
+    """Upright readings, but general ones for tags whose residuals say that they hang askew."""
+    n_tags = int(tag.max()) + 1
+    usable = np.isfinite(upright.chi2)
+    # Capped, so that one spoilt picture does not speak for its tag.
+    capped = np.where(usable, np.minimum(upright.chi2, 100.0), 100.0)
+    count = np.bincount(tag, minlength=n_tags)
+    mean = np.bincount(tag, capped, n_tags) / np.maximum(count, 1) / _UPRIGHT_DOF
+    level = max(1.0, float(np.median(mean[count > 0])))
+    dof = _UPRIGHT_DOF * np.maximum(count, 1)
+    limit = np.maximum(_ASKEW_FACTOR, chi2_distribution.ppf(1.0 - _FALSE_ALARM, dof) / dof) * level
+    askew = np.flatnonzero((count > 0) & (mean > limit))
+    use_general = np.isin(tag, askew)
+    spoilt = ~use_general & ~(upright.chi2 < level * chi2_distribution.ppf(1.0 - _FALSE_ALARM, _UPRIGHT_DOF))
+    pick = use_general[:, None]
+    return (
+        TagReadings(
+            np.where(pick, general.range_bearing, upright.range_bearing),
+            np.where(pick[..., None], general.covariance, upright.covariance),
+            np.where(use_general, general.height_m, upright.height_m),
+            np.where(use_general, general.chi2, upright.chi2),
+            np.where(use_general, general.valid, upright.valid & ~spoilt),
+        ),
+        askew,
+    )
+
+
+def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """One set of corners for each tag and keyframe."""
+    n_tags = int(tag.max()) + 1
+    pairs, group = np.unique(keyframe * n_tags + tag, return_inverse=True)
+    total = np.zeros((len(pairs), 4, 2))
+    np.add.at(total, group, corners_px)
+    count = np.bincount(group, minlength=len(pairs))
+    return pairs // n_tags, pairs % n_tags, total / count[:, None, None]
+
+
+def _no_readings() -> Readings:
+    empty_int = np.zeros(0, dtype=np.int64)
+    empty_bool = np.zeros(0, dtype=np.bool_)
+    return Readings(empty_int, empty_int, np.zeros((0, 2)), np.zeros((0, 2, 2)), empty_bool, empty_bool)

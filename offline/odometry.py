@@ -1,0 +1,179 @@
+"""Wheel readings between keyframes -> one motion, its covariance and its dependence on the wheel calibration.
+
+No reading is thinned out: exact arcs from reading to reading, composed, with the noise of each carried to the
+keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the chain's first wheel reading.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib import se2, wheels
+from calib.arrays import FloatArray, IntArray
+from calib.noise import NoiseParameters
+
+# The calibration numbers that odometry depends on, in the order of `ChainOdometry.jacobian`:
+# left = left_nominal (1 + wheel_scale) (1 - wheel_ratio / 2), right likewise with +, track = nominal (1 + track_scale).
+WHEEL_PARAMETERS: Final = ("wheel_scale", "wheel_ratio", "track_scale")
+
+# Where readings are missing for longer, cumulative counts still give distance and turn, not the path between.
+GAP_NS: Final = 500_000_000
+_GAP_SIGMA_PER_M: Final = 0.1
+
+# Below what any encoder resolves; keeps the information of a step that measured no motion finite.
+_SMALLEST_QUANTUM_M: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class WheelTrack:
+    """Wheel readings of one stretch: unbroken cumulative distances.
+
+    Attributes:
+        stamps_ns: (N,) strictly increasing.
+        left_m, right_m: (N,) cumulative, by the nominal radii.
+        quantum_m: distance of one encoder tick; 0 where unknown.
+    """
+
+    stamps_ns: IntArray
+    left_m: FloatArray
+    right_m: FloatArray
+    quantum_m: float = 0.0
+
+    def at(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Cumulative (left_m, right_m) at other times: speeds are constant between readings."""
+        times, readings = _seconds(stamps_ns, self.stamps_ns[0]), _seconds(self.stamps_ns, self.stamps_ns[0])
+        return np.interp(times, readings, self.left_m), np.interp(times, readings, self.right_m)
+
+
+@dataclass(frozen=True)
+class ChainOdometry:
+    """Motion from each of K keyframes to the next.
+
+    Attributes:
+        motion: (K-1, 3) T_k_k+1 by the nominal calibration.
+        covariance: (K-1, 3, 3) of the motion's right tangent.
+        jacobian: (K-1, 3, 3) derivative of that tangent by WHEEL_PARAMETERS.
+        distance_m: (K-1,) driven.
+    """
+
+    motion: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+    distance_m: FloatArray
+
+    def __len__(self) -> int:
+        """Number of steps."""
+        return len(self.motion)
+
+    def prefix(self, n_steps: int) -> "ChainOdometry":
+        """The first steps only."""
+        part = slice(0, n_steps)
+        return ChainOdometry(self.motion[part], self.covariance[part], self.jacobian[part], self.distance_m[part])
+
+    def dead_reckoned(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
+        """(K, 3) poses that follow from the motions alone, from `start` (3,) on, with wheel parameters (3,)."""
+        motion = self.motion
+        if calibration is not None:
+            motion = se2.compose(motion, se2.exp(self.jacobian @ calibration))
+        return chained(motion, np.zeros(3) if start is None else start)
+
+
+def compose_odometry(
+    track: WheelTrack, keyframe_stamps_ns: IntArray, track_m: float, noise: NoiseParameters
+) -> ChainOdometry:
+    """Composes all wheel readings between keyframes.
+
+    Args:
+        track: the stretch's readings.
+        keyframe_stamps_ns: (K,) strictly increasing, within the stretch.
+        track_m: nominal distance between the wheels.
+        noise: what is added per metre and per radian.
+    """
+    if len(keyframe_stamps_ns) < 2:
+        return ChainOdometry(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+    inner = track.stamps_ns[(track.stamps_ns >= keyframe_stamps_ns[0]) & (track.stamps_ns <= keyframe_stamps_ns[-1])]
+    grid_ns = np.union1d(inner, keyframe_stamps_ns)
+    left_m, right_m = track.at(grid_ns)
+    left_m, right_m = np.diff(left_m), np.diff(right_m)
+    pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
+    poses = chained(pieces, np.zeros(3))
+
+    ends = np.searchsorted(grid_ns, keyframe_stamps_ns)
+    step_of_piece = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+    # A disturbance at a piece's end, seen from the keyframe at the step's end.
+    to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
+
+    duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
+    variance = _piece_variance(left_m, right_m, track_m, duration_s, step_of_piece, noise)
+    tangent = se2.right_tangent_from_coordinates(pieces)
+    jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
+    covariance = np.einsum("nij,nj,nkj->nik", to_step_end, variance, to_step_end)
+    return ChainOdometry(
+        motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
+        covariance=_summed(covariance, ends) + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+        jacobian=_summed(to_step_end @ jacobian, ends),
+        distance_m=_summed(np.abs(0.5 * (left_m + right_m)), ends),
+    )
+
+
+def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
+    """(N+1, 3) poses reached from `start` (3,) by N motions one after the other."""
+    theta = start[2] + np.concatenate([[0.0], np.cumsum(motions[:, 2])])
+    cos, sin = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = start[0] + np.concatenate([[0.0], np.cumsum(cos * motions[:, 0] - sin * motions[:, 1])])
+    y = start[1] + np.concatenate([[0.0], np.cumsum(sin * motions[:, 0] + cos * motions[:, 1])])
+    return np.stack([x, y, se2.wrap_angle(theta)], axis=-1)
+
+
+def _piece_variance(
+    left_m: FloatArray,
+    right_m: FloatArray,
+    track_m: float,
+    duration_s: FloatArray,
+    step_of_piece: IntArray,
+    noise: NoiseParameters,
+) -> FloatArray:
+    """(N, 3) variances of the pieces' right tangents."""
+    distance_m = np.abs(0.5 * (left_m + right_m))
+    turn_rad = (right_m - left_m) / track_m
+    # The turn of a whole step, spread over its pieces: quantised readings taken one by one would add up a turn that
+    # never was.
+    n_steps = int(step_of_piece[-1]) + 1
+    step_turn = np.abs(np.bincount(step_of_piece, turn_rad, n_steps))
+    step_duration = np.bincount(step_of_piece, duration_s, n_steps)
+    net_turn_rad = step_turn[step_of_piece] * duration_s / step_duration[step_of_piece]
+    in_gap = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
+    return np.stack(
+        [
+            noise.sigma_distance_m_per_sqrt_m**2 * distance_m + in_gap,
+            noise.sigma_lateral_m_per_sqrt_m**2 * distance_m + in_gap,
+            noise.sigma_heading_rad_per_sqrt_m**2 * distance_m + noise.sigma_heading_rad_per_sqrt_rad**2 * net_turn_rad,
+        ],
+        axis=-1,
+    )
+
+
+def _by_wheel_parameters(
+    d_wheels: FloatArray, d_track: FloatArray, left_m: FloatArray, right_m: FloatArray, track_m: float
+) -> FloatArray:
+    """(N, 3, 3) derivative of the pieces' coordinates by WHEEL_PARAMETERS."""
+    by_left, by_right = d_wheels[..., 0] * left_m[:, None], d_wheels[..., 1] * right_m[:, None]
+    return np.stack([by_left + by_right, 0.5 * (by_right - by_left), d_track * track_m], axis=-1)
+
+
+def _quantisation_variance(quantum_m: float, track_m: float) -> FloatArray:
+    """(3,) of a step: each wheel's two readings are known to a tick."""
+    quantum = max(quantum_m, _SMALLEST_QUANTUM_M)
+    wheel = quantum**2 / 6.0
+    return np.array([wheel / 2.0, wheel / 2.0, 2.0 * wheel / track_m**2])
+
+
+def _summed(values: FloatArray, ends: IntArray) -> FloatArray:
+    """Sums (N, ...) over the pieces of each step."""
+    summed: FloatArray = np.add.reduceat(values, ends[:-1], axis=0)
+    return summed
+
+
+def _seconds(stamps_ns: IntArray, zero_ns: int) -> FloatArray:
+    return np.asarray(stamps_ns - zero_ns, dtype=np.float64) * 1e-9

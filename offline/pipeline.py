@@ -1,0 +1,142 @@
+"""Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from calib.noise import NoiseParameters
+from offline.chain import Chain, chains_of
+from offline.errors import OfflineError
+from offline.global_map import calibration_of, component_of, solve_global_map
+from offline.local_map import LocalMap, solve_local_map
+from offline.merge import Group, PairAlignment, align_pairs, group, reason_apart
+from offline.observations import check_tag_sizes
+from offline.result import AlignmentResult, CalibrationResult, Component, MapResult
+from offline.run import RobotFile, Run, load_run
+
+Progress = Callable[[str, int, int], None]  # what is being done, how many are done, of how many
+
+
+def _silent(_what: str, _done: int, _total: int) -> None:
+    """Progress for nobody."""
+
+
+def map_logs(
+    logs: Sequence[Path],
+    robot_files: Mapping[str, RobotFile] | None = None,
+    noise: NoiseParameters | None = None,
+    progress: Progress = _silent,
+) -> MapResult:
+    """Turns logs into one map in the frame of the first log's start.
+
+    Args:
+        logs: files or run folders.
+        robot_files: calibrations by robot id that replace those in the logs.
+        noise: sigmas of wheels and readings; defaults where None.
+        progress: told what is being done.
+
+    Raises:
+        GroundsbotError: one line that says why there can be no map.
+    """
+    runs = []
+    for i, log in enumerate(logs):
+        progress("reading", i, len(logs))
+        runs.append(load_run(log, robot_files))
+    return map_runs(runs, noise or NoiseParameters(), progress)
+
+
+def map_runs(runs: Sequence[Run], noise: NoiseParameters, progress: Progress = _silent) -> MapResult:
+    """As `map_logs`, from runs already read."""
+    _check_distinct(runs)
+    check_tag_sizes(runs)
+    chains = [chain for run in runs for chain in chains_of(run, noise)]
+    maps = []
+    for i, chain in enumerate(chains):
+        progress("local maps", i, len(chains))
+        maps.append(solve_local_map(chain))
+    progress("merging", 0, 1)
+    pairs = align_pairs(maps)
+    groups = group(maps, pairs)
+    components: list[Component] = []
+    calibration: list[CalibrationResult] = []
+    warnings = [w for run in runs for w in run.warnings] + [w for chain in chains for w in chain.warnings]
+    for i, members in enumerate(groups):
+        progress("solving all runs together", i, len(groups))
+        graph, solution = solve_global_map(maps, members)
+        components.append(component_of(graph, solution))
+        calibration.extend(calibration_of(graph, solution, i))
+        if not solution.converged:
+            warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
+    warnings += _alignment_warnings(maps, pairs) + _chain_warnings(chains) + _reasons_apart(maps, groups, pairs)
+    return MapResult(
+        components=tuple(components),
+        alignments=tuple(_alignment_result(maps, pair) for pair in pairs if pair.alignment is not None),
+        noise=noise,
+        calibration=tuple(calibration),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _check_distinct(runs: Sequence[Run]) -> None:
+    if not runs:
+        raise OfflineError("no log given; name at least one log file or run folder")
+    seen: dict[str, Run] = {}
+    for run in runs:
+        if run.name in seen:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {seen[run.name].log}); "
+                "leave one out, or a drive would count as two"
+            )
+        seen[run.name] = run
+
+
+def _alignment_result(maps: Sequence[LocalMap], pair: PairAlignment) -> AlignmentResult:
+    alignment = pair.alignment
+    if alignment is None:
+        raise ValueError("no alignment to report")
+    return AlignmentResult(
+        from_run=maps[pair.a].chain.name,
+        to_run=maps[pair.b].chain.name,
+        T_from_to=alignment.T_a_b,
+        n_shared=pair.n_shared,
+        n_inliers=alignment.n_inliers,
+        inlier_rmse_m=alignment.rmse_m,
+        outliers=tuple((*tag,) for tag, fits in zip(alignment.shared, alignment.inlier, strict=True) if not fits),
+    )
+
+
+def _alignment_warnings(maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]) -> list[str]:
+    """Tags that two runs saw in different places."""
+    warnings = []
+    for pair in pairs:
+        if pair.alignment is None:
+            continue
+        odd = [tag for tag, fits in zip(pair.alignment.shared, pair.alignment.inlier, strict=True) if not fits]
+        if odd:
+            names = ", ".join(str(tag.tag_id) for tag in odd)
+            warnings.append(
+                f"tag {names} lies elsewhere in {maps[pair.b].chain.name} than in {maps[pair.a].chain.name} "
+                "(more than 0.5 m): moved between the runs, or carried about?"
+            )
+    return warnings
+
+
+def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
+    warnings = []
+    for chain in chains:
+        if float(chain.odometry.distance_m.sum()) < 0.05:
+            warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
+        if len(chain.tags) == 1:
+            warnings.append(
+                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two are needed to join it to a run"
+            )
+    return warnings
+
+
+def _reasons_apart(maps: Sequence[LocalMap], groups: Sequence[Group], pairs: Sequence[PairAlignment]) -> list[str]:
+    """For each component after the first: why it is one of its own."""
+    reasons = []
+    for i, members in enumerate(groups[1:], start=1):
+        others = [m for g in groups for m in g.members if g is not members]
+        told = [reason_apart(maps[m].chain.name, others, m, maps, pairs) for m in members.members[:1]]
+        reasons += [f"component {i}: {reason}" for reason in told]
+    return reasons

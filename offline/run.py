@@ -1,0 +1,346 @@
+"""One run log -> one Run of measurements, or a refusal with reasons."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.camera_model import CameraModel, read_camera_yaml
+from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from offline.errors import OfflineError
+from offline.odometry import WheelTrack
+from onboard.log_reader import LogMessage, read_log
+from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
+
+
+class TagKey(NamedTuple):
+    """What a detector can tell of a tag."""
+
+    family: str
+    tag_id: int
+
+
+@dataclass(frozen=True)
+class Detections:
+    """M tags in pixels.
+
+    Attributes:
+        stamps_ns: (M,) middle of the picture's exposure.
+        tag: (M,) index into `Run.tags`.
+        corners_px: (M, 4, 2) raw pixels, corner order of groundsbot.proto.
+    """
+
+    stamps_ns: IntArray
+    tag: IntArray
+    corners_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Positions:
+    """M imported tag positions in metres.
+
+    Attributes:
+        stamps_ns: (M,)
+        tag: (M,) index into `Run.tags`.
+        value: (M, 2) (x, y) or (range, bearing).
+        polar: (M,) whether it is the latter.
+        covariance: (M, 2, 2) of the value, NaN where the log has none.
+        in_camera: (M,) about the camera's place and yaw (x forward, y left) instead of base.
+    """
+
+    stamps_ns: IntArray
+    tag: IntArray
+    value: FloatArray
+    polar: BoolArray
+    covariance: FloatArray
+    in_camera: BoolArray
+
+
+@dataclass(frozen=True)
+class Run:
+    """The measurements of one log.
+
+    Attributes:
+        name: robot id and run id, unique among the runs of a map.
+        stretches: wheel readings with unbroken odometry, in order.
+        picture_stamps_ns: (F,) every picture, also those that show no tag.
+        tags: what was seen, sorted.
+        camera: None in an imported log.
+        warnings: what a person should know.
+    """
+
+    name: str
+    robot_id: str
+    run_id: str
+    log: Path
+    robot: Robot
+    camera: CameraModel | None
+    stretches: tuple[WheelTrack, ...]
+    picture_stamps_ns: IntArray
+    tags: tuple[TagKey, ...]
+    detections: Detections
+    positions: Positions
+    warnings: tuple[str, ...]
+
+
+# Readings with corrected bits are the ones that turn out to be phantoms.
+MAX_HAMMING = 0
+
+
+@dataclass
+class _Collected:
+    """What one pass over a log gathers."""
+
+    info: RunInfo | None = None
+    calibration: CameraCalibration | None = None
+    wheels: list[tuple[int, int, int, int]] = field(default_factory=list)  # stamp, boot, left, right
+    odometry: list[PlanarOdometry] = field(default_factory=list)
+    pictures: list[int] = field(default_factory=list)
+    picture_size: tuple[int, int] | None = None
+    sightings: list[tuple[int, TagKey, Sequence[float]]] = field(default_factory=list)
+    observations: list[TagObservations] = field(default_factory=list)
+    n_other_size: int = 0
+    n_corrected: int = 0
+
+    def add(self, entry: LogMessage) -> None:
+        """Takes one message of the log."""
+        message = entry.message
+        if isinstance(message, WheelEncoders):
+            self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
+        elif isinstance(message, TagDetections):
+            self._add_detections(message)
+        elif isinstance(message, PlanarOdometry):
+            self.odometry.append(message)
+        elif isinstance(message, TagObservations):
+            self.observations.append(message)
+        elif isinstance(message, RunInfo):
+            self.info = self.info or message
+        elif isinstance(message, CameraCalibration):
+            self.calibration = self.calibration or message
+
+    def _add_detections(self, message: TagDetections) -> None:
+        size = (message.width_px, message.height_px)
+        self.picture_size = self.picture_size or size
+        if size != self.picture_size:
+            self.n_other_size += 1
+            return
+        self.pictures.append(message.stamp_ns)
+        for detection in message.detections:
+            if detection.hamming > MAX_HAMMING or len(detection.corners_px) != 8:
+                self.n_corrected += 1
+                continue
+            key = TagKey(detection.family, detection.tag_id)
+            self.sightings.append((message.stamp_ns, key, detection.corners_px))
+
+
+_TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations")
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """A robot.yaml given by a person, with its camera, to be used instead of what a log holds."""
+
+    robot: Robot
+    camera: CameraModel | None
+
+
+def read_robot_file(path: Path) -> RobotFile:
+    """Reads robot.yaml and the camera file it names.
+
+    Raises:
+        CalibError: one line that names file, field, value and way out.
+    """
+    robot = read_robot_yaml(path)
+    return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
+
+
+def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> Run:
+    """Reads one log.
+
+    Args:
+        log: a file or a run folder.
+        robot_files: calibrations by robot id that replace what the log holds.
+
+    Raises:
+        GroundsbotError: one line that says why the log cannot be mapped.
+    """
+    collected = _Collected()
+    for entry in read_log(log, topics=_TOPICS):
+        collected.add(entry)
+    info = collected.info
+    if info is None:
+        raise OfflineError(f"{log}: no /run message, so whose run it is cannot be told; is it a groundsbot log?")
+    given = (robot_files or {}).get(info.robot_id)
+    robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
+    stretches, warnings = _stretches(collected, robot, log)
+    tags, detections, positions = _tag_readings(collected)
+    camera = _camera(collected, given.camera if given else None, log)
+    if collected.n_other_size:
+        warnings.append(
+            f"{collected.n_other_size} pictures have another size than the first ({collected.picture_size}); left out"
+        )
+    name = f"{info.robot_id}_{info.run_id}"
+    return Run(
+        name=name,
+        robot_id=info.robot_id,
+        run_id=info.run_id,
+        log=log,
+        robot=robot,
+        camera=camera,
+        stretches=tuple(stretches),
+        picture_stamps_ns=np.unique(np.array(collected.pictures, dtype=np.int64)),
+        tags=tags,
+        detections=detections,
+        positions=positions,
+        warnings=tuple(f"{name}: {warning}" for warning in warnings),
+    )
+
+
+def _stretches(collected: _Collected, robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
+    if collected.wheels:
+        return _encoder_stretches(collected.wheels, robot)
+    if collected.odometry:
+        return _imported_stretch(collected.odometry, robot)
+    raise OfflineError(
+        f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
+        "was the encoder port connected? `groundsbot-onboard check` tells"
+    )
+
+
+def _encoder_stretches(readings: list[tuple[int, int, int, int]], robot: Robot) -> tuple[list[WheelTrack], list[str]]:
+    """Cuts where the controller was reset: what was driven in between is unknown."""
+    table = np.array(readings, dtype=np.int64)
+    cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
+    wheels = robot.wheels
+    m_per_tick_left = 2.0 * np.pi * wheels.radius_left_m / wheels.ticks_per_turn
+    m_per_tick_right = 2.0 * np.pi * wheels.radius_right_m / wheels.ticks_per_turn
+    stretches: list[WheelTrack] = []
+    warnings: list[str] = []
+    for part in np.split(table, cuts):
+        ordered, dropped = _strictly_later(part)
+        if dropped:
+            warnings.append(f"{dropped} wheel readings are not later than the one before them; left out")
+        left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
+        quantum_m = max(m_per_tick_left, m_per_tick_right)
+        stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
+    if len(stretches) > 1:
+        warnings.append(
+            f"the wheel controller restarted {len(stretches) - 1} times; the motion in between is unknown, "
+            f"so the run has {len(stretches)} stretches that only tags can join"
+        )
+    return stretches, warnings
+
+
+def _imported_stretch(readings: list[PlanarOdometry], robot: Robot) -> tuple[list[WheelTrack], list[str]]:
+    stamps, left, right = [], [], []
+    for reading in readings:
+        stamps.append(reading.stamp_ns)
+        left.append(reading.wheels.left_m)
+        right.append(reading.wheels.right_m)
+    warnings: list[str] = []
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    left_m, right_m = np.array(left), np.array(right)
+    if readings[0].WhichOneof("motion") == "pose":
+        poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
+        left_m, right_m, sideways = wheel_distances(poses, robot.wheels.track_m)
+        if sideways > 0.05:
+            warnings.append(
+                f"{100.0 * sideways:.0f} % of the odometry's motion is sideways, which a differential drive cannot do; "
+                "it is not used"
+            )
+    table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
+    if dropped:
+        warnings.append(f"{dropped} odometry readings are not later than the one before them; left out")
+    keep = table[:, 1]
+    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep])], warnings
+
+
+def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:
+    """Cumulative (left_m, right_m) whose arcs join odometry poses (N, 3), and the share of motion that is sideways."""
+    twists = se2.log(se2.between(poses[:-1], poses[1:]))
+    half_turn_m = 0.5 * track_m * twists[:, 2]
+    left_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] - half_turn_m)])
+    right_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] + half_turn_m)])
+    forward = float(np.abs(twists[:, 0]).sum())
+    sideways = float(np.abs(twists[:, 1]).sum())
+    return left_m, right_m, sideways / max(forward, 1e-9) if sideways > 1e-6 else 0.0
+
+
+def _strictly_later(table: IntArray) -> tuple[IntArray, int]:
+    """Rows whose stamp (first column) is later than all before, and how many are not."""
+    latest_before = np.maximum.accumulate(np.concatenate([[table[0, 0] - 1], table[:-1, 0]]))
+    keep = table[:, 0] > latest_before
+    return table[keep], int((~keep).sum())
+
+
+def _tag_readings(collected: _Collected) -> tuple[tuple[TagKey, ...], Detections, Positions]:
+    keys = {key for _, key, _ in collected.sightings}
+    keys |= {TagKey(o.family, o.tag_id) for message in collected.observations for o in message.observations}
+    tags = tuple(sorted(keys))
+    index = {key: i for i, key in enumerate(tags)}
+    n = len(collected.sightings)
+    detections = Detections(
+        stamps_ns=np.fromiter((s[0] for s in collected.sightings), np.int64, n),
+        tag=np.fromiter((index[s[1]] for s in collected.sightings), np.int64, n),
+        corners_px=np.array([s[2] for s in collected.sightings], dtype=np.float64).reshape(n, 4, 2),
+    )
+    return tags, detections, _positions(collected.observations, index)
+
+
+def _positions(messages: list[TagObservations], index: dict[TagKey, int]) -> Positions:
+    rows = [(message.stamp_ns, message.frame, o) for message in messages for o in message.observations]
+    n = len(rows)
+    value, covariance = np.empty((n, 2)), np.full((n, 2, 2), np.nan)
+    polar = np.zeros(n, dtype=np.bool_)
+    for i, (_, _, o) in enumerate(rows):
+        polar[i] = o.WhichOneof("position") == "polar"
+        value[i] = (o.polar.range_m, o.polar.bearing_rad) if polar[i] else (o.cartesian.x_m, o.cartesian.y_m)
+        if len(o.covariance) == 4:
+            covariance[i] = np.reshape(list(o.covariance), (2, 2))
+    return Positions(
+        stamps_ns=np.fromiter((row[0] for row in rows), np.int64, n),
+        tag=np.fromiter((index[TagKey(row[2].family, row[2].tag_id)] for row in rows), np.int64, n),
+        value=value,
+        polar=polar,
+        covariance=covariance,
+        in_camera=np.fromiter((row[1] == "camera_planar" for row in rows), np.bool_, n),
+    )
+
+
+def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:
+    """The given calibration, or the log's; None where there are no pictures to need one."""
+    calibration, size = collected.calibration, collected.picture_size
+    camera, source = given, "the camera file given with --robot"
+    if camera is None and calibration is not None:
+        camera, source = _camera_from_message(calibration), "/camera/calibration"
+    if camera is None and collected.sightings:
+        raise OfflineError(
+            f"{log}: tags were detected but /camera/calibration has 0 messages; "
+            "give the robot's file with --robot, with its `camera` set"
+        )
+    if camera is not None and size is not None and size != (camera.width_px, camera.height_px):
+        raise OfflineError(
+            f"{log}: /tags/detections: pictures are {size[0]}x{size[1]} px but {source} is for "
+            f"{camera.width_px}x{camera.height_px} px; calibrate at the size that is recorded, "
+            "or give the right file with --robot"
+        )
+    return camera
+
+
+def _camera_from_message(message: CameraCalibration) -> CameraModel:
+    K = message.K
+    return CameraModel(
+        name=message.frame_id,
+        width_px=message.width,
+        height_px=message.height,
+        fx_px=K[0],
+        fy_px=K[4],
+        cx_px=K[2],
+        cy_px=K[5],
+        distortion_model=message.distortion_model,
+        distortion=tuple(message.D),
+    )

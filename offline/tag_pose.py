@@ -1,0 +1,209 @@
+"""Corners in pixels -> where the tag is, seen from the camera: horizontal range and bearing.
+
+Near a frontal view the tilt of a planar tag enters its apparent size in second order only, so the full six-parameter
+pose (PnP) always explains noise as tilt and puts the tag up to half a sigma too near or too far, the same way
+in every picture. Most tags hang upright, and then their vertical extent is a yardstick that no turn about the vertical
+shortens. The model used here is
+
+    P_i = c + a_i(rho) (u_x, u_y, 0) + b_i(rho) (0, 0, 1)
+
+with the corners' places (a_i, b_i) on the face turned by the roll rho in its own plane. The horizontal direction u is
+left free in length too: that makes the model smooth through the frontal view, hence its readings free of bias, for the
+price of the horizontal edges' say about the range.
+
+Two residuals of the eight are left to test it: a tag that does not hang upright (on a ceiling, say) shows there, and is
+then read by the general pose with a range sigma wide enough to cover that pose's bias.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+
+from calib.arrays import BoolArray, FloatArray
+from calib.camera_model import CameraModel
+
+# Corners of a tag with side 1 in its own frame; the order is that of groundsbot.proto.
+UNIT_CORNERS: Final[FloatArray] = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+
+_ITERATIONS: Final = 8
+_N_PARAMETERS: Final = 6  # c (3), u (2), rho
+# Sigmas of a general pose that its bias stays well below, down to 15 px of side: along the line of sight as a share of
+# the range, across it in sigmas of one corner.
+_GENERAL_ALONG: Final = 0.10
+_GENERAL_ACROSS: Final = 1.5
+
+
+@dataclass(frozen=True)
+class TagReadings:
+    """M readings as horizontal range and bearing about the camera's place, in axes parallel to those of base.
+
+    Attributes:
+        range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
+        covariance: (M, 2, 2) for the given corner sigma.
+        height_m: (M,) of the tag's centre above the camera.
+        chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
+        valid: (M,) False where no pose in front of the camera explains the corners.
+    """
+
+    range_bearing: FloatArray
+    covariance: FloatArray
+    height_m: FloatArray
+    chi2: FloatArray
+    valid: BoolArray
+
+
+def upright_readings(
+    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigma_corner_px: float
+) -> TagReadings:
+    """Readings of tags that hang upright.
+
+    Args:
+        corners_px: (M, 4, 2) raw pixels.
+        sides_m: (M,) side of each tag.
+        camera: the camera that saw them.
+        R_base_camera: (3, 3) how the camera is mounted.
+        sigma_corner_px: noise of each corner coordinate.
+    """
+    with np.errstate(all="ignore"):
+        parameters = _start(corners_px, sides_m, camera, R_base_camera)
+        for _ in range(_ITERATIONS):
+            residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
+            normal = jacobian.swapaxes(-1, -2) @ jacobian
+            gradient = jacobian.swapaxes(-1, -2) @ residual[..., None]
+            parameters = parameters - _solve(normal, gradient)[..., 0]
+        residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
+        information = jacobian.swapaxes(-1, -2) @ jacobian / sigma_corner_px**2
+        covariance_full = _solve(information, np.broadcast_to(np.eye(_N_PARAMETERS), information.shape))
+        return _polar(parameters[:, :3], covariance_full[:, :3, :3], (residual**2).sum(-1) / sigma_corner_px**2)
+
+
+def general_readings(
+    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigma_corner_px: float
+) -> TagReadings:
+    """Readings of tags at any tilt: the better of the two planar poses, with a range sigma that covers its bias.
+
+    Arguments as in `upright_readings`.
+    """
+    n = len(corners_px)
+    centres = np.full((n, 3), np.nan)
+    chi2 = np.full(n, np.nan)
+    rays = camera.unproject(corners_px)
+    for i in range(n):
+        if not (np.isfinite(rays[i]).all() and (rays[i, :, 2] > 0.0).all()):
+            continue
+        flat = rays[i, :, :2] / rays[i, :, 2:]
+        corners_tag = np.column_stack([UNIT_CORNERS * sides_m[i], np.zeros(4)])
+        found, _, translations, errors = cv2.solvePnPGeneric(
+            corners_tag, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+        if found and np.isfinite(translations[0]).all() and translations[0][2, 0] > 0.0:
+            centres[i] = R_base_camera @ translations[0][:, 0]
+            focal_px = 0.5 * (camera.fx_px + camera.fy_px)
+            chi2[i] = 8.0 * (float(errors[0][0]) * focal_px / sigma_corner_px) ** 2
+    with np.errstate(all="ignore"):
+        distance_m = np.linalg.norm(centres, axis=-1)
+        direction = centres / distance_m[:, None]
+        across = (_GENERAL_ACROSS * distance_m * sigma_corner_px / camera.fx_px) ** 2
+        along = (_GENERAL_ALONG * distance_m) ** 2
+        covariance = across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * (
+            direction[:, :, None] * direction[:, None, :]
+        )
+        return _polar(centres, covariance, chi2)
+
+
+def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray) -> FloatArray:
+    """(M, 6) starting values: with the roll taken from the left edge's direction, the model is linear in the rest."""
+    rays = camera.unproject(corners_px) @ R_base_camera.T  # (M, 4, 3) in axes parallel to base
+    middle = rays.mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    right = np.stack([middle[:, 1], -middle[:, 0], np.zeros(len(middle))], axis=-1)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    # Roll: direction of the face's vertical axis in a picture held upright. A turn of the face about the vertical
+    # shortens the sideways part, which the iterations then put right.
+    up_edge = rays[:, 0] + rays[:, 1] - rays[:, 2] - rays[:, 3]
+    right_edge = rays[:, 1] + rays[:, 2] - rays[:, 0] - rays[:, 3]
+    rho = np.arctan2(
+        right_edge[:, 2] - np.einsum("mi,mi->m", up_edge, right),
+        up_edge[:, 2] + np.einsum("mi,mi->m", right_edge, right),
+    )
+    a, b = _on_face(rho, sides_m)
+    # ray x (c + a u + b z) = 0: three equations a corner, linear in (c, u).
+    cross = _cross_matrix(rays)  # (M, 4, 3, 3)
+    design = np.concatenate([cross, a[..., None, None] * cross[..., :2]], axis=-1).reshape(len(rays), 12, 5)
+    target = -(b[..., None] * cross[..., 2]).reshape(len(rays), 12, 1)
+    normal = design.swapaxes(-1, -2) @ design
+    solution = _solve(normal, design.swapaxes(-1, -2) @ target)[..., 0]
+    return np.concatenate([solution, rho[:, None]], axis=-1)
+
+
+def _on_face(rho: FloatArray, sides_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (M, 4) of the corners along the horizontal and the vertical of a face rolled by rho."""
+    cos, sin = np.cos(rho)[:, None], np.sin(rho)[:, None]
+    x, y = UNIT_CORNERS[:, 0] * sides_m[:, None], UNIT_CORNERS[:, 1] * sides_m[:, None]
+    return cos * x - sin * y, sin * x + cos * y
+
+
+def _linearise(
+    parameters: FloatArray, corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (M, 8), predicted minus seen, in pixels, and their Jacobian (M, 8, 6)."""
+    m = len(parameters)
+    a, b = _on_face(parameters[:, 5], sides_m)
+    points = np.repeat(parameters[:, None, :3], 4, axis=1)
+    points[..., :2] += a[..., None] * parameters[:, None, 3:5]
+    points[..., 2] += b
+    pixels, d_pixel_d_camera = camera.project_with_jacobian(points @ R_base_camera)
+    d_pixel_d_point = d_pixel_d_camera @ R_base_camera.T
+    d_point = np.zeros((m, 4, 3, _N_PARAMETERS))
+    d_point[..., :3, :3] = np.eye(3)
+    d_point[..., 0, 3] = a
+    d_point[..., 1, 4] = a
+    # d a / d rho = -b and d b / d rho = a
+    d_point[..., :2, 5] = -b[..., None] * parameters[:, None, 3:5]
+    d_point[..., 2, 5] = a
+    return (pixels - corners_px).reshape(m, 8), (d_pixel_d_point @ d_point).reshape(m, 8, _N_PARAMETERS)
+
+
+def _polar(centre_m: FloatArray, covariance: FloatArray, chi2: FloatArray) -> TagReadings:
+    """Centres (M, 3) in axes parallel to base, about the camera, with their covariance (M, 3, 3), as readings."""
+    x, y = centre_m[:, 0], centre_m[:, 1]
+    range_m = np.hypot(x, y)
+    jacobian = np.zeros((len(x), 2, 3))
+    jacobian[:, 0, 0] = x / range_m
+    jacobian[:, 0, 1] = y / range_m
+    jacobian[:, 1, 0] = -y / range_m**2
+    jacobian[:, 1, 1] = x / range_m**2
+    polar_covariance = jacobian @ covariance @ jacobian.swapaxes(-1, -2)
+    range_bearing = np.stack([range_m, np.arctan2(y, x)], axis=-1)
+    valid = (
+        np.isfinite(range_bearing).all(-1)
+        & np.isfinite(polar_covariance).all((-1, -2))
+        & (polar_covariance[:, 0, 0] > 0.0)
+        & (polar_covariance[:, 1, 1] > 0.0)
+        & np.isfinite(chi2)
+    )
+    return TagReadings(range_bearing, polar_covariance, centre_m[:, 2], chi2, valid)
+
+
+def _cross_matrix(v: FloatArray) -> FloatArray:
+    """Matrix (..., 3, 3) with which v x w = cross_matrix(v) w."""
+    zero = np.zeros_like(v[..., 0])
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=-2)
+
+
+def _solve(matrices: FloatArray, right_hand_sides: FloatArray) -> FloatArray:
+    """Solves a batch; NaN where a matrix is singular or not finite, and nobody else suffers for it."""
+    n = matrices.shape[-1]
+    good = np.asarray(np.isfinite(matrices).all((-1, -2)) & np.isfinite(right_hand_sides).all((-1, -2)))
+    # Scaled to a unit diagonal: metres, directions and radians differ by powers of ten.
+    diagonal = np.sqrt(np.abs(np.einsum("mii->mi", np.where(good[:, None, None], matrices, np.eye(n)))))
+    scale = 1.0 / np.where(diagonal > 0.0, diagonal, 1.0)
+    scaled = np.where(good[:, None, None], matrices, np.eye(n)) * scale[:, :, None] * scale[:, None, :]
+    good &= np.linalg.det(scaled) > 1e-12
+    scaled[~good] = np.eye(n)
+    solution = scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * right_hand_sides)
+    solution[~good] = np.nan
+    return solution
