@@ -25,8 +25,8 @@ class NoiseParameters(BaseModel):
     sigma_heading_rad_per_sqrt_m: Sigma = math.radians(0.6)
     sigma_heading_rad_per_sqrt_rad: Sigma = 0.02
     sigma_corner_px: Sigma = 0.2
-    # For tag positions that come without a covariance: generous, since they carry the bias of a planar pose (percents of
-    # the range for a small frontal tag) and whatever their stamps are late.
+    # For tag positions that come without a covariance: generous, since they carry the bias of a planar pose (percents
+    # of the range for a small frontal tag) and whatever their stamps are late.
     sigma_range_m: Sigma = 0.05
     sigma_range_per_m: Sigma = 0.03  # adds in quadrature: share of the range
     sigma_bearing_rad: Sigma = math.radians(1.0)

@@ -136,6 +136,11 @@ def test_right_jacobian_near_zero_by_hand() -> None:
     np.testing.assert_allclose(se2.right_jacobian([x, y, turn]), expected, rtol=0, atol=1e-11)
 
 
+def test_series_and_closed_form_meet() -> None:
+    below, above = se2.right_jacobian([[1.0, -2.0, 0.5 - 1e-9], [1.0, -2.0, 0.5 + 1e-9]])
+    np.testing.assert_allclose(below, above, rtol=0, atol=5e-9)
+
+
 @settings(max_examples=30)
 @given(tangents(largest=2.0))
 def test_right_tangent_from_coordinates_agrees_with_finite_differences(transform: FloatArray) -> None:
