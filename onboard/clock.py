@@ -40,6 +40,10 @@ class RunClock:
         """Now, on the run's line."""
         return time.monotonic_ns() + self.run_epoch_ns
 
+    def from_monotonic(self, monotonic_ns: int) -> int:
+        """A monotonic time on the run's line."""
+        return monotonic_ns + self.run_epoch_ns
+
     def from_realtime(self, realtime_ns: int) -> int:
         """A recent wall-clock time on the run's line: the wall clock's present offset is taken out."""
         reading = read_clocks()

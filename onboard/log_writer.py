@@ -4,7 +4,8 @@ A file is called `<name>.active` until it is finished, so that nobody takes half
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -72,10 +73,11 @@ class LogWriter:
                 for file in self._files:
                     file.write(topic, data, start_ns, start_ns)
             self.flush()
-        except BaseException as error:
+        except OSError as error:
             self.discard()
-            if isinstance(error, OSError):
-                raise LogError(f"{path}: cannot write a log here: {error.strerror or error}") from error
+            raise LogError(f"{path}: cannot write a log here: {error.strerror or error}") from error
+        except LogError:
+            self.discard()
             raise
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> None:
@@ -170,6 +172,10 @@ class _LogFile:
         self._writer.start(profile="", library="groundsbot")
 
     def write(self, topic: Topic, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        with self._told_errors():
+            self._write(topic, data, log_time_ns, publish_time_ns)
+
+    def _write(self, topic: Topic, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         channel = self._channels.get(topic.name)
         if channel is None:
             schema = register_schema(self._writer, topic.schema)
@@ -187,23 +193,32 @@ class _LogFile:
         if not self._dirty:
             return
         self._dirty = False
-        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
-        if self._durable:
-            os.fdatasync(self._sink.fileno())
+        with self._told_errors():
+            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
+            if self._durable:
+                os.fdatasync(self._sink.fileno())
 
     def finish(self) -> None:
-        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
-        self._sink.flush()
-        if self._durable:
-            os.fsync(self._sink.fileno())
-        self._sink.close()
-        self._active.rename(self._path)
-        if self._durable:
-            _sync_folder(self._path.parent)
+        with self._told_errors():
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
+            self._sink.flush()
+            if self._durable:
+                os.fsync(self._sink.fileno())
+            self._sink.close()
+            self._active.rename(self._path)
+            if self._durable:
+                _sync_folder(self._path.parent)
 
     def discard(self) -> None:
         self._sink.close()
         self._active.unlink(missing_ok=True)
+
+    @contextmanager
+    def _told_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LogError(f"{self._active}: cannot be written: {error.strerror or error}; make room") from error
 
 
 def _sync_folder(folder: Path) -> None:

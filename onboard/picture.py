@@ -13,9 +13,22 @@ def decode_grey(encoded: bytes) -> NDArray[np.uint8]:
     Raises:
         OnboardError: no picture, or not a whole one.
     """
+    return _decode(encoded, cv2.IMREAD_GRAYSCALE)
+
+
+def decode(encoded: bytes) -> NDArray[np.uint8]:
+    """A PNG or JPEG file's bytes as it was taken: grey [height, width] or BGR [height, width, 3].
+
+    Raises:
+        OnboardError: no picture, or not a whole one.
+    """
+    return _decode(encoded, cv2.IMREAD_ANYCOLOR)
+
+
+def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
     if not is_complete(encoded):
         raise OnboardError(f"picture of {len(encoded)} bytes is cut short or neither PNG nor JPEG")
-    picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), mode)
     if picture is None:
         raise OnboardError(f"picture of {len(encoded)} bytes cannot be decoded")
     return np.asarray(picture, dtype=np.uint8)
@@ -43,3 +56,18 @@ def is_complete(encoded: bytes) -> bool:
     if is_jpeg(encoded):
         return encoded.endswith(b"\xff\xd9")
     return encoded.startswith(b"\x89PNG\r\n\x1a\n") and encoded.endswith(b"IEND\xaeB`\x82")
+
+
+def to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey [height, width] or BGR [height, width, 3] picture as grey.
+
+    Raises:
+        OnboardError: it is empty or of another kind.
+    """
+    if picture.size == 0 or picture.dtype != np.uint8:
+        raise OnboardError(f"picture of shape {picture.shape} and type {picture.dtype} is empty or not of bytes")
+    if picture.ndim == 2:
+        return picture
+    if picture.ndim != 3 or picture.shape[2] != 3:
+        raise OnboardError(f"picture of shape {picture.shape} is neither grey nor BGR")
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

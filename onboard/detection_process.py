@@ -1,0 +1,171 @@
+"""Tag detection in a process of its own: in the recorder's it would hold up the wheel readings by tens of ms."""
+
+import multiprocessing
+import queue
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from onboard.errors import OnboardError
+from onboard.picture import decode, decode_grey, encode_jpeg, is_jpeg, to_grey
+from onboard.tag_detector import Detection, TagDetector
+
+Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
+
+_START_LIMIT_S: Final = 30.0
+_JOB_LIMIT_S: Final = 10.0
+_END_LIMIT_S: Final = 2.0
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """What a TagDetector is made from."""
+
+    families: Sequence[str] = ("tag36h11",)
+    library: str = "pupil-apriltags"
+    quad_decimate: float = 2.0
+    jpeg_quality: int = 90
+
+    def make(self) -> TagDetector:
+        """The detector, in this process."""
+        return TagDetector(self.families, self.library, self.quad_decimate)
+
+
+class DetectionResult(NamedTuple):
+    """What became of one picture."""
+
+    detections: list[Detection]
+    size_px: tuple[int, int]  # width, height
+    jpeg: bytes | None  # where it was asked for
+    error: str | None  # why the picture was of no use; then the rest is empty
+
+
+class ChildDetector:
+    """Detects in a child process, one picture at a time, in the order they come.
+
+    A child that crashes or hangs is replaced; the picture it had is reported as of no use.
+
+    Attributes:
+        library: name and version of the library in use.
+        settings: how it was set, as text for the log.
+        restarts: children replaced.
+    """
+
+    def __init__(self, settings: DetectorSettings) -> None:
+        """Starts the child and waits until it is ready.
+
+        Raises:
+            OnboardError: it cannot start, or no detector is installed.
+        """
+        self.restarts = 0
+        self._settings = settings
+        self._jobs: queue.SimpleQueue[tuple[Picture, bool, Callable[[DetectionResult], None]] | None]
+        self._jobs = queue.SimpleQueue()
+        self._start_child()
+        self._thread = threading.Thread(target=self._serve, name="detection", daemon=True)
+        self._thread.start()
+
+    def submit(self, picture: Picture, want_jpeg: bool, on_result: Callable[[DetectionResult], None]) -> None:
+        """Queues a picture; `on_result` is called from another thread. The caller bounds the queue."""
+        self._jobs.put((picture, want_jpeg, on_result))
+
+    def detect(self, picture: Picture, want_jpeg: bool = False) -> DetectionResult:
+        """Waits for one picture's result."""
+        results: queue.SimpleQueue[DetectionResult] = queue.SimpleQueue()
+        self.submit(picture, want_jpeg, results.put)
+        return results.get()
+
+    def close(self) -> None:
+        """Ends the child; pictures still queued come to nothing once it has been given up on."""
+        self._jobs.put(None)
+        self._thread.join(_END_LIMIT_S)
+        self._stop_child()
+
+    def _serve(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            picture, want_jpeg, on_result = job
+            passed_through = picture if want_jpeg and isinstance(picture, bytes) and is_jpeg(picture) else None
+            result = self._run(picture, want_jpeg and passed_through is None)
+            if passed_through is not None and result.error is None:
+                result = result._replace(jpeg=passed_through)
+            on_result(result)
+
+    def _run(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
+        try:
+            self._connection.send((picture, want_jpeg))
+            if self._connection.poll(_JOB_LIMIT_S):
+                result: DetectionResult = self._connection.recv()
+                return result
+            reason = f"detection gave no answer for {_JOB_LIMIT_S:g} s"
+        except (OSError, EOFError):
+            reason = "detection crashed"
+        try:
+            self._stop_child()
+            self._start_child()
+            self.restarts += 1
+        except OnboardError as error:
+            reason = f"{reason}; {error}"
+        return DetectionResult([], (0, 0), None, f"{reason}; its process was started again")
+
+    def _start_child(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_child, args=(theirs, self._settings), name="groundsbot-detection", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            if not self._connection.poll(_START_LIMIT_S):
+                raise OnboardError(f"detection process did not start within {_START_LIMIT_S:g} s; try again")
+            answer = self._connection.recv()
+        except (OSError, EOFError) as error:
+            raise OnboardError("detection process died at its start; try the other recorder.detector") from error
+        if isinstance(answer, str):
+            raise OnboardError(answer)
+        self.library, self.settings = answer
+
+    def _stop_child(self) -> None:
+        self._connection.close()
+        self._process.join(_END_LIMIT_S / 4)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def _child(connection: Connection, settings: DetectorSettings) -> None:
+    """Runs in the child: answers until the parent is gone."""
+    for each in (signal.SIGINT, signal.SIGTERM):  # the parent decides when recording ends
+        signal.signal(each, signal.SIG_IGN)
+    import cv2
+
+    cv2.setNumThreads(1)
+    try:
+        detector = settings.make()
+    except OnboardError as error:
+        connection.send(str(error))
+        return
+    connection.send((detector.library, detector.settings))
+    while True:
+        try:
+            picture, want_jpeg = connection.recv()
+            connection.send(_detect(detector, picture, want_jpeg, settings.jpeg_quality))
+        except (EOFError, OSError):
+            return
+
+
+def _detect(detector: TagDetector, picture: Picture, want_jpeg: bool, quality: int) -> DetectionResult:
+    try:
+        if isinstance(picture, bytes):
+            picture = decode(picture) if want_jpeg else decode_grey(picture)
+        grey = to_grey(picture)
+        jpeg = encode_jpeg(picture, quality) if want_jpeg else None
+        return DetectionResult(detector.detect(grey), (grey.shape[1], grey.shape[0]), jpeg, None)
+    except OnboardError as error:
+        return DetectionResult([], (0, 0), None, str(error))
