@@ -172,17 +172,16 @@ class _LogFile:
         self._writer.start(profile="", library="groundsbot")
 
     def write(self, topic: Topic, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
-        with self._told_errors():
-            self._write(topic, data, log_time_ns, publish_time_ns)
-
-    def _write(self, topic: Topic, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         channel = self._channels.get(topic.name)
         if channel is None:
             schema = register_schema(self._writer, topic.schema)
             channel = self._writer.register_channel(topic.name, MessageEncoding.Protobuf, schema)
             self._channels[topic.name] = channel
-        self._writer.add_message(channel, log_time_ns, data, publish_time_ns)
         self._dirty = True
+        try:  # spelt out: this is called for every message
+            self._writer.add_message(channel, log_time_ns, data, publish_time_ns)
+        except OSError as error:
+            raise self._told(error) from error
 
     def flush_if_due(self, log_time_ns: int) -> None:
         if log_time_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
@@ -218,7 +217,10 @@ class _LogFile:
         try:
             yield
         except OSError as error:
-            raise LogError(f"{self._active}: cannot be written: {error.strerror or error}; make room") from error
+            raise self._told(error) from error
+
+    def _told(self, error: OSError) -> LogError:
+        return LogError(f"{self._active}: cannot be written: {error.strerror or error}; make room")
 
 
 def _sync_folder(folder: Path) -> None:
