@@ -1,0 +1,239 @@
+"""The recorder as a process of its own: wheels through a pseudo terminal, pictures through a folder."""
+
+import os
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.camera_model import CameraModel, write_camera_yaml
+from onboard.encoder_protocol import WheelLine, format_line
+from onboard.log_reader import find_logs, read_log, read_run_info
+from onboard.messages import Event, TagDetections, WheelEncoders
+from tests.tag_pictures import draw_tag
+
+CAMERA = CameraModel("front", 160, 120, 150.0, 150.0, 79.5, 59.5, "plumb_bob", (0.0,) * 5)
+CORNERS = np.array([[50.0, 30.0], [110.0, 32.0], [108.0, 92.0], [52.0, 90.0]])
+MS = 1_000_000
+
+
+def robot_yaml(folder: Path, devices: str, recorder: str = "{picture_rate_hz: 5}") -> Path:
+    write_camera_yaml(CAMERA, folder / "camera.yaml")
+    path = folder / "robot.yaml"
+    path.write_text(f"""
+robot_id: gb1
+wheels: {{radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}}
+camera: camera.yaml
+devices: {devices}
+recorder: {recorder}
+""")
+    return path
+
+
+class FakePort:
+    """A pseudo terminal with a name that stays, as udev gives a port one."""
+
+    def __init__(self, link: Path) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave, termios.TCSANOW)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def send(self, index: int, boot_id: int = 3) -> int:
+        """Sends line `index`; returns the monotonic time of its measurement. The clock runs 200 ppm fast."""
+        now_ns = time.monotonic_ns()
+        t_us = now_ns // 1000 + now_ns // 5_000_000 + 77
+        os.write(self.master, format_line(WheelLine(boot_id, index, t_us, 5 * index, 6 * index, 0)))
+        return now_ns
+
+    def unplug(self) -> None:
+        os.close(self.master)
+
+
+@contextmanager
+def program(*arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
+    command = [sys.executable, "-m", "onboard.cli", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_for(output: IO[str] | None, *words: str) -> list[str]:
+    """Reads lines until each word has stood in one of them."""
+    assert output is not None
+    lines: list[str] = []
+    while not all(any(word in line for line in lines) for word in words):
+        line = output.readline()
+        assert line, f"ended after {lines}"
+        lines.append(line)
+    return lines
+
+
+def feed_wheels(port: FakePort, seconds: float) -> list[int]:
+    start = time.monotonic()
+    measured = []
+    for index in range(round(seconds * 100)):
+        time.sleep(max(0.0, start + index * 0.01 - time.monotonic()))
+        measured.append(port.send(index))
+    return measured
+
+
+def feed_pictures(folder: Path, seconds: float) -> list[int]:
+    """15 pictures a second; every third as a slow writer does it, in two pieces and in place. Monotonic times."""
+    picture = cv2.imencode(".png", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
+    start = time.monotonic()
+    exposed = []
+    for index in range(round(seconds * 15)):
+        time.sleep(max(0.0, start + index / 15 - time.monotonic()))
+        realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        path = folder / f"{realtime_ns}.png"
+        if index % 3 == 0:
+            with path.open("wb", buffering=0) as file:
+                file.write(picture[:1000])
+                time.sleep(0.02)
+                file.write(picture[1000:])
+        else:
+            path.with_suffix(".part").write_bytes(picture)
+            path.with_suffix(".part").rename(path)
+        exposed.append(monotonic_ns)
+    return exposed
+
+
+def test_a_live_recording_has_every_line_and_picture_on_one_clock(tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    (pictures / "1000.png").write_bytes(b"an old one, left alone")
+    port = FakePort(tmp_path / "wheels")
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+    exposed: list[int] = []
+    with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
+        wait_for(process.stdout, "port_connected", "camera_connected")
+        feeder = threading.Thread(target=lambda: exposed.extend(feed_pictures(pictures, 10.0)))
+        feeder.start()
+        measured = feed_wheels(port, 10.0)
+        feeder.join()
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=10)
+    assert process.returncode == 0, said
+
+    (log,) = find_logs([tmp_path / "logs"])
+    epoch_ns = read_run_info(log).run_epoch_ns
+    wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
+    assert [each.sequence for each in wheels] == list(range(1000))
+    error_ns = np.abs(np.array([each.stamp_ns for each in wheels]) - epoch_ns - measured)
+    assert np.mean(error_ns < 5 * MS) >= 0.99
+    assert error_ns.max() < 50 * MS
+
+    frames = [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
+    assert [each.frame_sequence for each in frames] == list(range(150))
+    error_ns = np.abs(np.array([each.stamp_ns for each in frames]) - epoch_ns - exposed)
+    assert np.mean(error_ns < 5 * MS) >= 0.99
+    assert error_ns.max() < 50 * MS
+    assert all([tag.tag_id for tag in each.detections] == [9] for each in frames)
+    at_or_before = {each.sequence: each.stamp_ns for each in wheels}
+    named = [each for each in frames if each.has_wheel_sequence]
+    assert len(named) >= 145
+    assert all(0 <= each.stamp_ns - at_or_before[each.wheel_sequence] < 200 * MS for each in named)
+    kept = list(read_log(log, ["/camera/image"]))
+    assert 45 <= len(kept) <= 51
+
+
+def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path) -> None:
+    link = tmp_path / "wheels"
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {link}}}")
+    with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
+        wait_for(process.stdout, "waiting for the wheels")  # absent at the start
+        port = FakePort(link)
+        wait_for(process.stdout, "port_connected")
+        for index in range(20):
+            port.send(index)
+        time.sleep(0.2)
+        port.unplug()
+        wait_for(process.stdout, "port_lost")
+        port = FakePort(link)
+        wait_for(process.stdout, "port_connected")
+        for index in range(30, 50):  # ten were sent while nobody listened
+            port.send(index)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=10)
+    assert process.returncode == 3
+    assert "lost: 10 wheel lines" in said
+    (log,) = find_logs([tmp_path / "logs"])
+    kinds = [each.message.kind for each in read_log(log, ["/events"]) if isinstance(each.message, Event)]
+    assert kinds[:4] == ["recording_started", "port_connected", "port_lost", "port_connected"]
+    sequences = [
+        each.message.sequence for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)
+    ]
+    assert sequences == [*range(20), *range(30, 50)]
+
+
+def test_check_tells_of_each_device(tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    cv2.imwrite(str(pictures / f"{time.time_ns()}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
+    port = FakePort(tmp_path / "wheels")
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+    with program("check", "--robot", robot) as process:
+        feeder = threading.Thread(target=feed_wheels, args=(port, 5.0))
+        feeder.start()
+        said, _ = process.communicate(timeout=20)
+        feeder.join()
+    lines = said.splitlines()
+    assert process.returncode == 0, said
+    assert [line.split(":")[0] for line in lines] == [
+        f"ok   {name}" for name in ("wheels", "camera", "detection", "clock", "disk")
+    ]
+    assert "160x120 px" in said
+    assert "tag36h11 9" in said
+
+
+def test_check_fails_for_what_is_missing_or_does_not_fit(tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    cv2.imwrite(str(pictures / f"{time.time_ns()}.jpg"), np.zeros((240, 320), np.uint8))
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+    with program("check", "--robot", robot) as process:
+        said, _ = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert "FAIL wheels: port" in said
+    assert "FAIL camera:" in said
+    assert "320x240 px, the calibration is for 160x120 px" in said
+
+
+@pytest.mark.parametrize(
+    ("devices", "camera", "expected"),
+    [
+        ("{}", None, "devices names neither encoder_port nor camera"),
+        ("{camera: pictures}", "gone.yaml", "gone.yaml"),
+        ("{encoder_baud: -1}", None, "encoder_baud"),
+    ],
+)
+def test_a_robot_file_that_cannot_be_recorded_with_is_one_line(
+    tmp_path: Path, devices: str, camera: str | None, expected: str
+) -> None:
+    robot = robot_yaml(tmp_path, devices)
+    if camera is not None:
+        robot.write_text(robot.read_text().replace("camera.yaml", camera))
+    with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
+        said, _ = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert expected in said
+    assert not (tmp_path / "logs").exists()
