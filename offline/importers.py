@@ -174,11 +174,13 @@ def _write_run(run_folder: Path, info: RunInfo, drive: _Drive, family: str) -> N
             for stamp_ns, topic, message in _messages(drive, family):
                 writer.write(topic, message, stamp_ns, stamp_ns)
         partial.rename(run_folder)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
         for created in made:
             if created.is_dir() and not any(created.iterdir()):
                 created.rmdir()
+        if isinstance(error, OSError):
+            raise OfflineError(f"{run_folder}: cannot be written: {error.strerror}; choose another output") from error
         raise
 
 

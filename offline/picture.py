@@ -35,6 +35,7 @@ _MARGIN: Final = 0.04  # of the extent, so that ids near the rim fit in
 _MOST_PANELS: Final = 6
 _VISIBLE_SHARE: Final = 0.006  # of the extent: a typical ellipse's half axis below it is drawn larger
 _FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
 _LABEL_PT: Final = 9.0
 _START_SIZE: Final = 17.0
 _DART: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)], closed=True)
@@ -211,7 +212,8 @@ def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Da
     ]
     px_per_pt = axes.figure.dpi / 72.0
     places_px = axes.transData.transform(np.array([tag.position_m[:2] for tag in component.tags]))
-    trails_px = axes.transData.transform(np.concatenate([run.T_map_base[:, :2] for run in component.runs]))
+    trails = np.concatenate([run.T_map_base[:, :2] for run in component.runs])
+    trails_px = axes.transData.transform(trails[:: ceil(len(trails) / _TRAIL_POINTS)])
     sizes_px = np.array([[0.64 * len(text) * _LABEL_PT, 1.1 * _LABEL_PT] for text in texts]) * px_per_pt
     centres = axes.transData.inverted().transform(place_labels(places_px, sizes_px, trails_px))
     for tag, text, (x_m, y_m) in zip(component.tags, texts, centres, strict=True):

@@ -1,0 +1,80 @@
+"""Maps and truths made by hand, whose figures are known."""
+
+from pathlib import Path
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray
+from calib.noise import NoiseParameters
+from offline.result import (
+    AlignmentResult,
+    CalibrationResult,
+    Component,
+    MapResult,
+    RunResult,
+    StartToStart,
+    TagResult,
+)
+from offline.truth import TrueRun, Truth
+
+STEP_NS = 100_000_001  # so that stamps do not fit into a float of seconds
+
+START_B = np.array([10.0, 2.0, np.pi / 2])
+TAG_PLACES = {("tag36h11", 3): (4.0, 1.0), ("tag36h11", 7): (6.0, -2.0), ("tag25h9", 3): (9.0, 5.0)}
+
+
+def made_run(name: str, T_map_start: FloatArray, covariance: FloatArray, n: int = 20) -> RunResult:
+    """A run that drives an arc from its start, a keyframe every STEP_NS."""
+    steps = np.arange(n)[:, np.newaxis] * np.array([0.1, 0.0, 0.02])
+    robot_id, run_id = name.split("_")
+    return RunResult(
+        name=name,
+        run=name,
+        log=Path("logs") / name,
+        robot_id=robot_id,
+        run_id=run_id,
+        T_map_start=T_map_start,
+        covariance=covariance,
+        stamps_ns=1_800_000_000_000_000_000 + np.arange(n, dtype=np.int64) * STEP_NS,
+        T_map_base=se2.compose(T_map_start, se2.exp(steps)),
+        distance_m=0.1 * (n - 1),
+    )
+
+
+def made_component(a: str = "red_one", b: str = "blue_two") -> Component:
+    """Two runs and three tags, exactly right, with a joint covariance that couples everything but the frame's start."""
+    n = 3 + 2 * len(TAG_PLACES)
+    root = 0.02 * np.random.default_rng(5).normal(size=(n, n)) + 0.05 * np.eye(n)
+    joint = np.zeros((3 + n, 3 + n))
+    joint[3:, 3:] = root @ root.T
+    runs = (made_run(a, np.zeros(3), np.zeros((3, 3))), made_run(b, START_B, joint[3:6, 3:6]))
+    tags = []
+    for index, ((family, tag_id), place) in enumerate(TAG_PLACES.items()):
+        rows = slice(6 + 2 * index, 8 + 2 * index)
+        seen_by = (a, b) if index < 2 else (b,)
+        tags.append(TagResult(family, tag_id, "", 0.15, np.array(place), joint[rows, rows], 10 + index, seen_by))
+    start = StartToStart(a, b, START_B[:2].copy(), joint[3:5, 3:5])
+    return Component(a, runs, tuple(tags), joint, cost=12.5, n_residuals=40, start_to_start=(start,))
+
+
+def made_map(*components: Component) -> MapResult:
+    """A whole map; of one component unless others are given."""
+    components = components or (made_component(),)
+    return MapResult(
+        components=components,
+        alignments=(AlignmentResult("red_one", "blue_two", START_B, 2, 2, 0.03, (("tag36h11", 9),)),),
+        noise=NoiseParameters(),
+        calibration=(CalibrationResult("red", "wheel_scale", 0, 0.001, 0.002, 0.005),),
+        warnings=("tag 9 lies elsewhere",),
+    )
+
+
+def made_truth(component: Component, T_world_map: FloatArray | None = None) -> Truth:
+    """The truth that a component would be exactly right by, the world's frame lying anywhere."""
+    T = np.zeros(3) if T_world_map is None else T_world_map
+    return Truth(
+        runs={run.name: TrueRun(run.stamps_ns, se2.compose(T, run.T_map_base)) for run in component.runs},
+        tags_m={(tag.family, tag.tag_id, tag.instance): se2.apply(T, tag.position_m) for tag in component.tags},
+        ambiguous=frozenset(),
+    )

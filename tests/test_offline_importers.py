@@ -1,0 +1,376 @@
+"""CSV folders become logs that say the same, or are refused in one line with nothing left behind."""
+
+from collections import Counter
+from math import cos, radians, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib import se2, wheels
+from calib.errors import GroundsbotError
+from calib.robot import parse_robot_yaml
+from offline.import_forms import WheelScale, read_odometry
+from offline.import_robot import ImportOptions
+from offline.importers import ImportReport, import_folder
+from onboard.log_reader import LogMessage, read_log
+from onboard.log_writer import LogWriter
+from onboard.messages import PlanarOdometry, RunInfo, TagObservations
+
+RECORDINGS = Path(__file__).parents[2] / "shared" / "data" / "nsh_first_floor"
+TRACK = ImportOptions(track_width_m=0.5)
+PAPER = ImportOptions(track_width_m=0.508, state_rate_hz=4.2)
+ODOMETRY = "t_s,left_m_s,right_m_s\n0,0,0\n1,1,1\n2,0.5,1\n"
+OBSERVATIONS = "t_s,tag_id,x_m,y_m\n0.5,7,3,1\n1.5,7,2,1\n1.5,9,4,-1\n"
+
+
+def folder_with(tmp_path: Path, files: dict[str, str], name: str = "drive") -> Path:
+    folder = tmp_path / name
+    folder.mkdir()
+    for file, text in files.items():
+        (folder / file).write_text(text)
+    return folder
+
+
+def imported(
+    tmp_path: Path, odometry: str = ODOMETRY, observations: str = OBSERVATIONS, options: ImportOptions = TRACK
+) -> ImportReport:
+    folder = folder_with(tmp_path, {"odometry.csv": odometry, "observations.csv": observations})
+    return import_folder(folder, tmp_path / "logs", options)
+
+
+def odometry_of(log: Path) -> list[PlanarOdometry]:
+    return [entry.message for entry in read_log(log) if isinstance(entry.message, PlanarOdometry)]
+
+
+def observations_of(log: Path) -> list[TagObservations]:
+    return [entry.message for entry in read_log(log) if isinstance(entry.message, TagObservations)]
+
+
+def run_of(log: Path) -> RunInfo:
+    first = next(iter(read_log(log))).message
+    assert isinstance(first, RunInfo)
+    return first
+
+
+def test_speeds_become_cumulative_distances(tmp_path: Path) -> None:
+    report = imported(tmp_path)
+    assert report.run_folder == tmp_path / "logs" / "drive"
+    assert [file.name for file in report.run_folder.iterdir()] == ["0000.core.mcap"]
+    readings = odometry_of(report.run_folder)
+    assert [r.stamp_ns for r in readings] == [0, 1_000_000_000, 2_000_000_000]
+    assert [(r.wheels.left_m, r.wheels.right_m) for r in readings] == [(0, 0), (1, 1), (1.5, 2)]
+    assert report.distance_m == pytest.approx(1.75)
+
+
+def test_tags_of_one_time_are_one_message_in_base(tmp_path: Path) -> None:
+    report = imported(tmp_path)
+    first, second = observations_of(report.run_folder)
+    assert (first.frame, first.stamp_ns) == ("base", 500_000_000)
+    assert [(o.family, o.tag_id) for o in second.observations] == [("tag36h11", 7), ("tag36h11", 9)]
+    assert [(o.cartesian.x_m, o.cartesian.y_m) for o in second.observations] == [(2, 1), (4, -1)]
+    assert not second.observations[0].cartesian.has_z
+    assert list(second.observations[0].covariance) == []
+    assert (report.n_observations, report.n_tags) == (3, 2)
+
+
+def test_the_log_is_in_order_of_time_with_the_run_first(tmp_path: Path) -> None:
+    entries: list[LogMessage] = list(read_log(imported(tmp_path).run_folder))
+    assert entries[0].topic == "/run"
+    assert [entry.log_time_ns for entry in entries] == sorted(entry.log_time_ns for entry in entries)
+    assert all(entry.log_time_ns == entry.publish_time_ns for entry in entries)
+
+
+def test_ranges_bearings_and_sigmas_are_kept(tmp_path: Path) -> None:
+    text = "t_s,tag_id,range_m,bearing_rad,sigma_range_m,sigma_bearing_rad\n1,4,3.5,-0.25,0.1,0.02\n"
+    (message,) = observations_of(imported(tmp_path, observations=text).run_folder)
+    (seen,) = message.observations
+    assert (seen.polar.range_m, seen.polar.bearing_rad) == (3.5, -0.25)
+    assert list(seen.covariance) == pytest.approx([0.01, 0, 0, 0.0004])
+
+
+def test_seconds_keep_their_nanoseconds(tmp_path: Path) -> None:
+    odometry = "t_s,left_m_s,right_m_s\n1800000000.123456789,0,0\n1800000001.123456789,0,0\n"
+    observations = "t_ns,tag_id,x_m,y_m\n1800000000123456790,1,2,0\n"
+    log = imported(tmp_path, odometry, observations).run_folder
+    assert odometry_of(log)[0].stamp_ns == 1_800_000_000_123_456_789
+    assert observations_of(log)[0].stamp_ns == 1_800_000_000_123_456_790
+
+
+def test_ticks_become_metres_from_zero_on(tmp_path: Path) -> None:
+    odometry = "t_s,left_ticks,right_ticks\n0,1000,-500\n1,1500,0\n2,1400,500\n"
+    options = ImportOptions(track_width_m=0.5, wheel_radius_m=0.1, ticks_per_turn=1000)
+    log = imported(tmp_path, odometry, options=options).run_folder
+    turn_m = 2 * np.pi * 0.1
+    distances = [(r.wheels.left_m, r.wheels.right_m) for r in odometry_of(log)]
+    np.testing.assert_allclose(distances, np.array([(0, 0), (0.5, 0.5), (0.4, 1.0)]) * turn_m, rtol=1e-12)
+    robot = parse_robot_yaml(run_of(log).robot_yaml, "log")
+    assert (robot.wheels.radius_left_m, robot.wheels.ticks_per_turn, robot.wheels.track_m) == (0.1, 1000, 0.5)
+
+
+def test_wheels_and_mount_come_from_robot_yaml_and_options_win(tmp_path: Path) -> None:
+    robot_yaml = tmp_path / "robot.yaml"
+    wheels_section = {"radius_left_m": 0.1, "radius_right_m": 0.2, "track_m": 0.4, "ticks_per_turn": 100}
+    mount = {"x_m": 0.3, "yaw_rad": 0.1, "yaw_rad_sigma": 0.001}
+    tags = [{"family": "tag36h11", "default_size_m": 0.15, "sizes_m": {5: 0.2}}]
+    robot_yaml.write_text(yaml.safe_dump({"robot_id": "carl", "wheels": wheels_section, "mount": mount, "tags": tags}))
+    odometry = "t_s,left_ticks,right_ticks\n0,0,0\n1,100,100\n"
+    options = ImportOptions(robot=robot_yaml, track_width_m=0.45, camera_y_m=-0.05)
+    report = imported(tmp_path, odometry, options=options)
+    last = odometry_of(report.run_folder)[-1]
+    assert (last.wheels.left_m, last.wheels.right_m) == pytest.approx((0.2 * np.pi, 0.4 * np.pi))
+    robot = parse_robot_yaml(run_of(report.run_folder).robot_yaml, "log")
+    assert report.robot_id == robot.robot_id == "carl"
+    assert robot.wheels.track_m == 0.45
+    assert robot.wheels.track_m_sigma == pytest.approx(0.0045)  # a sigma belongs to its value
+    assert (robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad, robot.mount.yaw_rad_sigma) == (0.3, -0.05, 0.1, 1e-3)
+    assert robot.tag_size_m("tag36h11", 5)[0] == 0.2
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-2, 2)), min_size=1, max_size=6))
+@settings(max_examples=25)
+def test_turning_speeds_give_back_the_exact_arc(
+    tmp_path_factory: pytest.TempPathFactory, speeds: list[tuple[float, float]]
+) -> None:
+    path = tmp_path_factory.mktemp("speeds") / "odometry.csv"
+    rows = [f"{0.5 * k},{v!r},{omega!r}" for k, (v, omega) in enumerate([(0.0, 0.0), *speeds])]
+    path.write_text("t_s,v_m_s,omega_rad_s\n" + "\n".join(rows))
+    path_of_wheels, _ = read_odometry(path, WheelScale(0.5, None, None))
+    T = np.zeros(3)
+    for left_m, right_m in zip(np.diff(path_of_wheels.left_m), np.diff(path_of_wheels.right_m), strict=True):
+        T = se2.compose(T, wheels.advance(left_m, right_m, 0.5))
+    wanted = np.zeros(3)
+    for v, omega in speeds:  # the integral of the circle itself
+        turn = 0.5 * omega
+        arc = (0.5 * v, 0.0) if abs(turn) < 1e-9 else (v / omega * sin(turn), v / omega * (1 - cos(turn)))
+        wanted = se2.compose(wanted, [*arc, turn])
+    np.testing.assert_allclose(se2.between(wanted, T), 0, atol=1e-7)
+
+
+def test_the_papers_form_counts_states_and_turns_y_to_the_left(tmp_path: Path) -> None:
+    files = {"odom.csv": "1,0,0\n2,0.42,0.84\n", "landmarks.csv": "0,5,1,0.5,0\n2,6,2,-0.25,0\n2,6,2,-0.26,0\n"}
+    report = import_folder(folder_with(tmp_path, files), tmp_path / "logs", PAPER)
+    readings = odometry_of(report.run_folder)
+    assert report.n_odometry == 2
+    assert [r.stamp_ns for r in readings] == [0, 238_095_238, 476_190_476]  # the start, then a state every 1 / 4.2 s
+    assert [r.wheels.left_m for r in readings] == pytest.approx([0, 0, 0.1])
+    assert [r.wheels.right_m for r in readings] == pytest.approx([0, 0, 0.2])
+    first, second = observations_of(report.run_folder)
+    assert first.frame == second.frame == "camera_planar"
+    assert (first.stamp_ns, second.stamp_ns) == (0, 476_190_476)
+    assert first.observations[0].cartesian.y_m == -0.5
+    assert [o.cartesian.y_m for o in second.observations] == [0.25, 0.26]
+
+
+def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> None:
+    files = {"odom.csv": "1,0,0\n", "landmarks.csv": "1,5,1,0.5,0\n"}
+    folder = folder_with(tmp_path, files)
+    unknown = import_folder(folder, tmp_path / "a", PAPER)
+    assert any("not given, so taken as 0 with a wide sigma: x (sigma 0.2 m)" in line for line in unknown.lines())
+    mount = parse_robot_yaml(run_of(unknown.run_folder).robot_yaml, "log").mount
+    assert (mount.x_m, mount.x_m_sigma) == (0, 0.2)
+    options = ImportOptions(track_width_m=0.5, state_rate_hz=4, camera_x_m=0.3, camera_y_m=0, camera_yaw_deg=90)
+    known = import_folder(folder, tmp_path / "b", options)
+    assert not any("not given" in line for line in known.lines())
+    mount = parse_robot_yaml(run_of(known.run_folder).robot_yaml, "log").mount
+    assert (mount.x_m, mount.yaw_rad) == pytest.approx((0.3, radians(90)))
+    assert mount.x_m_sigma < 0.01
+
+
+def test_a_camera_option_says_that_observations_are_in_the_cameras_frame(tmp_path: Path) -> None:
+    report = imported(tmp_path, options=ImportOptions(track_width_m=0.5, camera_x_m=0.2))
+    assert {message.frame for message in observations_of(report.run_folder)} == {"camera_planar"}
+    assert any("camera's frame" in line for line in report.lines())
+
+
+def test_a_drive_without_tags_is_imported(tmp_path: Path) -> None:
+    report = imported(tmp_path, observations="t_s,tag_id,x_m,y_m\n")
+    assert (report.n_observations, report.n_tags) == (0, 0)
+    assert len(odometry_of(report.run_folder)) == 3
+
+
+def test_the_same_folder_gives_the_same_bytes(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
+    logs = [import_folder(folder, tmp_path / name, TRACK).run_folder / "0000.core.mcap" for name in "ab"]
+    assert logs[0].read_bytes() == logs[1].read_bytes()
+
+
+def test_two_folders_become_two_runs_beside_each_other(tmp_path: Path) -> None:
+    names = []
+    for name in ("hall way", "loop"):
+        folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS}, name)
+        report = import_folder(folder, tmp_path / "logs", TRACK)
+        info = run_of(report.run_folder)
+        names.append((info.robot_id, info.run_id, report.run_folder.name))
+    assert names == [("hall-way", "hall-way", "hall-way"), ("loop", "loop", "loop")]
+
+
+def test_names_can_be_given(tmp_path: Path) -> None:
+    report = imported(tmp_path, options=ImportOptions(track_width_m=0.5, run_id="monday", robot_id="carl"))
+    info = run_of(report.run_folder)
+    assert (info.run_id, info.robot_id, report.run_folder.name) == ("monday", "carl", "monday")
+    with pytest.raises(GroundsbotError, match=r"--run-id is 'a/b'"):
+        ImportOptions(run_id="a/b")
+
+
+def test_observations_outside_the_odometrys_time_are_said(tmp_path: Path) -> None:
+    report = imported(tmp_path, observations="t_s,tag_id,x_m,y_m\n1,1,2,0\n2.5,1,2,0\n")
+    assert any(line.strip().startswith("1 observations lie outside") for line in report.lines())
+
+
+BAD_ODOMETRY = [
+    ("", "odometry.csv: is empty"),
+    ("t_s,left_m_s,right_m_s\n", "has a header but no rows"),
+    ("t_s,left,right_m_s\n0,0,0\n", "odometry.csv line 1: column 'left' is unknown"),
+    ("t_s,left_m_s\n0,0\n", "column 'right_m_s' is missing beside 'left_m_s'"),
+    ("left_m_s,right_m_s\n0,0\n", "needs exactly one of the columns t_s and t_ns"),
+    ("t_s,t_ns,left_m_s,right_m_s\n0,0,0,0\n", "needs exactly one of the columns t_s and t_ns"),
+    ("t_s,left_m_s,right_m_s,v_m_s,omega_rad_s\n0,0,0,0,0\n", "needs exactly one of these pairs"),
+    ("t_s,left_m_s,left_m_s,right_m_s\n0,0,0,0\n", "column 'left_m_s' is there twice"),
+    ("t_s;left_m_s;right_m_s\n0;0;0\n", "column 't_s;left_m_s;right_m_s' is unknown"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,0\n", "odometry.csv line 3: has 2 cells where 3 belong"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,x,0\n", "odometry.csv line 3, column left_m_s: 'x' is not a number"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,,0\n", "line 3, column left_m_s: '' is not a number"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,0,nan\n", "line 3, column right_m_s: 'nan' is not finite"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n\n1,0,inf\n", "line 4, column right_m_s: 'inf' is not finite"),
+    ("t_s,left_m_s,right_m_s\n1,0,0\n0.5,0,0\n", "line 3, column t_s: '0.5' runs backwards after '1'"),
+    ("t_s,left_m_s,right_m_s\n1,0,0\n1.0,0,0\n", "line 3, column t_s: '1.0' stands still after '1'"),
+    ("t_s,left_m_s,right_m_s\n-1,0,0\n", "column t_s: '-1' is outside 0"),
+    ("t_s,left_m_s,right_m_s\n1e999999,0,0\n", "column t_s: '1e999999' is not finite or far too large"),
+    ("t_ns,left_m_s,right_m_s\n1.5,0,0\n", "column t_ns: '1.5' is not a whole number"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,250,250\n", "means a wheel at 250 m/s, above 20 m/s"),
+    ("t_s,left_ticks,right_ticks\n0,0,0\n1,5,5\n", "holds ticks of unknown length; give --wheel-radius-m"),
+    ("t_s,left_m_s,right_m_s\n0,\x000,0\n", "is not a number"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_ODOMETRY)
+def test_bad_odometry_is_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(GroundsbotError) as caught:
+        imported(tmp_path, odometry=text)
+    assert said in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+BAD_OBSERVATIONS = [
+    ("", "observations.csv: is empty"),
+    ("t_s,x_m,y_m\n0,1,1\n", "column 'tag_id' is missing"),
+    ("t_s,tag_id,x_m,bearing_rad\n0,1,1,1\n", "needs exactly one of these pairs"),
+    ("t_s,tag_id,x_m,y_m,sigma_x_m\n0,1,1,1,1\n", "column 'sigma_y_m' is missing beside 'sigma_x_m'"),
+    ("t_s,tag_id,x_m,y_m,sigma_range_m\n0,1,1,1,1\n", "'sigma_range_m' does not go with x_m,y_m"),
+    ("t_s,tag_id,x_m,y_m,sigma_x_m,sigma_y_m\n0,1,1,1,0,1\n", "column sigma_x_m: '0' must be above 0"),
+    ("t_s,tag_id,x_m,y_m\n0,-1,1,1\n", "column tag_id: '-1' is outside 0 to 586"),
+    ("t_s,tag_id,x_m,y_m\n0,587,1,1\n", "column tag_id: '587' is outside 0 to 586"),
+    ("t_s,tag_id,x_m,y_m\n0,1.5,1,1\n", "column tag_id: '1.5' is not a whole number"),
+    ("t_s,tag_id,x_m,y_m\n1,1,1,1\n0,1,1,1\n", "line 3, column t_s: '0' runs backwards after '1'"),
+    ("t_s,tag_id,x_m,y_m\n1,1,0,0\n", "puts the tag inside the robot's own origin"),
+    ("t_s,tag_id,range_m,bearing_rad\n1,1,-2,0\n", "column range_m: '-2' must be above 0"),
+    ("t_s,tag_id,range_m,bearing_rad\n1,1,2,30\n", "column bearing_rad: '30' is more than a whole turn"),
+    ("t_s,tag_id,x_m,y_m\n1000,1,1,1\n", "all 1 observations lie outside the odometry's time"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_OBSERVATIONS)
+def test_bad_observations_are_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(GroundsbotError) as caught:
+        imported(tmp_path, observations=text)
+    assert said in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+BAD_PAPER_FILES = [
+    ("1,0,0\n3,0,0\n", "", "odom.csv line 2, column state: '3' comes where 2 belongs"),
+    ("state,left,right\n1,0,0\n", "", "odom.csv line 1, column state: 'state' is not a number"),
+    ("1,0\n", "", "odom.csv line 1: has 2 cells where 3 belong"),
+    ("1,0,0\n2,500,0\n", "", "odom.csv line 2, column v_left_m_s: '500' means a wheel at 500 m/s"),
+    ("1,0,0\n", "", "landmarks.csv: is empty"),
+    ("1,0,0\n", "2,5,1,1,0\n", "landmarks.csv line 1, column state: '2' is beyond the last state in odom.csv, 1"),
+    ("1,0,0\n", "1,5,1,1,0\n0,5,1,1,0\n", "landmarks.csv line 2, column state: '0' runs backwards after 1"),
+    ("1,0,0\n", "1,5,1,nan,0\n", "column right_m: 'nan' is not finite"),
+]
+
+
+@pytest.mark.parametrize(("odometry", "landmarks", "said"), BAD_PAPER_FILES)
+def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str, landmarks: str, said: str) -> None:
+    folder = folder_with(tmp_path, {"odom.csv": odometry, "landmarks.csv": landmarks})
+    with pytest.raises(GroundsbotError) as caught:
+        import_folder(folder, tmp_path / "logs", PAPER)
+    assert said in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("files", "options", "said"),
+    [
+        ({}, TRACK, "holds neither of odometry.csv + observations.csv or odom.csv + landmarks.csv"),
+        ({"odometry.csv": ODOMETRY}, TRACK, "observations.csv: is missing beside"),
+        ({"odometry.csv": ODOMETRY, "odom.csv": ""}, TRACK, "holds both pairs"),
+        ({"odom.csv": "1,0,0\n", "landmarks.csv": "1,1,1,1,0\n"}, TRACK, "give --state-rate-hz"),
+        ({"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS}, PAPER, "leave it out"),
+        ({"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS}, ImportOptions(), "give --track-width-m"),
+        (
+            {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS},
+            ImportOptions(track_width_m=0.5, tag_family="tag99"),
+            "--tag-family is 'tag99', must be one of tag36h11",
+        ),
+    ],
+)
+def test_what_is_missing_is_said(tmp_path: Path, files: dict[str, str], options: ImportOptions, said: str) -> None:
+    folder = folder_with(tmp_path, files)
+    with pytest.raises(GroundsbotError) as caught:
+        import_folder(folder, tmp_path / "logs", options)
+    assert said in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_options_must_be_sane(value: float) -> None:
+    with pytest.raises(GroundsbotError, match=r"--track-width-m is .*, must be above 0"):
+        ImportOptions(track_width_m=value)
+
+
+def test_an_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
+    (tmp_path / "logs").mkdir()
+    import_folder(folder, tmp_path / "logs", TRACK)  # an empty folder will do
+    before = (tmp_path / "logs" / "drive" / "0000.core.mcap").read_bytes()
+    with pytest.raises(GroundsbotError, match="exists already; give another output, another --run-id"):
+        import_folder(folder, tmp_path / "logs", TRACK)
+    assert (tmp_path / "logs" / "drive" / "0000.core.mcap").read_bytes() == before
+    (tmp_path / "logs" / "letter.txt").write_text("dear")
+    with pytest.raises(GroundsbotError, match=r"is not empty: letter\.txt is no run's log"):
+        import_folder(folder, tmp_path / "logs", ImportOptions(track_width_m=0.5, run_id="other"))
+    assert sorted(entry.name for entry in (tmp_path / "logs").iterdir()) == ["drive", "letter.txt"]
+
+
+def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, written = LogWriter.write, []
+
+    def fail_later(self: LogWriter, topic: str, message: PlanarOdometry, log_time_ns: int, publish_ns: int) -> None:
+        written.append(topic)
+        if len(written) == 4:
+            raise OSError(28, "No space left on device")
+        write(self, topic, message, log_time_ns, publish_ns)
+
+    monkeypatch.setattr(LogWriter, "write", fail_later)
+    with pytest.raises(GroundsbotError, match="drive: cannot be written: No space left on device"):
+        imported(tmp_path)
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"the paper's recordings are not at {RECORDINGS}")
+def test_the_papers_recordings_are_imported_whole(tmp_path: Path) -> None:
+    reports = {name: import_folder(RECORDINGS / name, tmp_path, PAPER) for name in ("hallway", "loop")}
+    counts = {name: (r.n_odometry, r.n_observations, r.n_tags) for name, r in reports.items()}
+    assert counts == {"hallway": (489, 539, 31), "loop": (500, 584, 24)}
+    seen = {
+        name: Counter(o.tag_id for message in observations_of(r.run_folder) for o in message.observations)
+        for name, r in reports.items()
+    }
+    assert len(seen["hallway"].keys() & seen["loop"].keys()) == 12
+    assert seen["hallway"].total() == 539
+    first = observations_of(reports["hallway"].run_folder)[0].observations[0]
+    assert (first.tag_id, first.cartesian.x_m, first.cartesian.y_m) == (12, 3.58798, -0.603938)
