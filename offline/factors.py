@@ -57,16 +57,18 @@ class Columns:
 
 @dataclass(frozen=True)
 class OdometryFactors:
-    """Motion between neighbouring keyframes against the wheels: r = W log(M(c)^-1 o T_i^-1 o T_j).
+    """Motion between neighbouring keyframes against the wheels: r = W S(c) log(M(c)^-1 o T_i^-1 o T_j).
 
-    M(c) = motion o exp(jacobian c) with c the wheel parameters of the robot.
+    M(c) = motion o exp(jacobian c) with c the wheel parameters of the robot. S divides lengths by (1 + wheel_scale):
+    the residual is in metres as the wheels count them. In true metres a map that shrinks, wheels and tags with it,
+    would shrink its residuals too, and thousands of small gains would outvote the prior that holds the scale.
 
     Attributes:
         first: (M,) index of T_i; T_j is the next pose.
         motion: (M, 3) by nominal calibration.
         whitening: (M, 3, 3) W with W^T W the information of the motion's right tangent.
         jacobian: (M, 3, 3) by the wheel parameters.
-        parameters: (M, 3) indices into the calibration.
+        parameters: (M, 3) indices into the calibration, wheel_scale first.
     """
 
     first: IntArray
@@ -78,23 +80,33 @@ class OdometryFactors:
     def residual(self, state: State) -> FloatArray:
         """(M, 3), whitened."""
         error, _, _ = self._error(state)
-        return _times(self.whitening, error)
+        return _times(self._scaled_whitening(state), error)
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
         """Residuals (M, 3) and blocks for both poses and the wheel parameters."""
         error, moved, twist = self._error(state)
-        by_second = self.whitening @ se2.right_jacobian_inverse(error)
+        outer = self._scaled_whitening(state)
+        by_second = outer @ se2.right_jacobian_inverse(error)
         by_first = -by_second @ se2.adjoint(se2.inverse(moved))
         # log(exp(-(t + dt)) o G) with t = jacobian c: the change enters on the left.
-        by_twist = -self.whitening @ se2.right_jacobian_inverse(-error) @ se2.right_jacobian(twist)
+        by_twist = -outer @ se2.right_jacobian_inverse(-error) @ se2.right_jacobian(twist)
+        by_parameters = by_twist @ self.jacobian
+        scale = 1.0 + state.calibration[self.parameters[:, 0]]
+        by_parameters[..., 0] -= _times(outer[..., :2], error[:, :2] / scale[:, None])
         return Linearised(
-            _times(self.whitening, error),
+            _times(outer, error),
             (
                 (columns.poses[self.first], by_first),
                 (columns.poses[self.first + 1], by_second),
-                (columns.calibration[self.parameters], by_twist @ self.jacobian),
+                (columns.calibration[self.parameters], by_parameters),
             ),
         )
+
+    def _scaled_whitening(self, state: State) -> FloatArray:
+        """W S(c), (M, 3, 3)."""
+        scaled = self.whitening.copy()
+        scaled[..., :2] /= (1.0 + state.calibration[self.parameters[:, 0]])[:, None, None]
+        return scaled
 
     def _error(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
         twist = _times(self.jacobian, state.calibration[self.parameters])

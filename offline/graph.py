@@ -96,14 +96,23 @@ def build_graph(chains: Sequence[Chain]) -> Graph:
     parameters = (_NONE, *parameters)
     lengths = np.array([len(chain.stamps_ns) for chain in chains])
     first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    columns = _columns(int(lengths.sum()), len(tags), parameters)
+    readings = _reading_factors(chains, first_pose, tags, parameters)
     problem = Problem(
         odometry=_odometry_factors(chains, first_pose, parameters),
-        readings=_reading_factors(chains, first_pose, tags, parameters),
+        readings=readings,
         prior=CalibrationPrior(np.array([p.sigma for p in parameters])),
-        columns=columns,
+        columns=_columns(int(lengths.sum()), len(tags), parameters),
+        anchor=_middle_readings(readings, len(tags)),
     )
     return Graph(problem, tuple(chains), first_pose, tags, parameters)
+
+
+def _middle_readings(readings: ReadingFactors, n_tags: int) -> IntArray:
+    """(T,) the pose of each tag's middle reading."""
+    order = np.argsort(readings.tag, kind="stable")
+    count = np.bincount(readings.tag, minlength=n_tags)
+    first = np.cumsum(count) - count
+    return readings.pose[order[first + count // 2]]
 
 
 def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:

@@ -24,18 +24,25 @@ _MAX_REJECTED: Final = 12
 # The cost is in squared sigmas: a step that would lower it by this much less is some 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
 _COST_ROUNDING: Final = 1e-14  # relative
-_FIRST_DAMPING: Final = 1e-4
-_LEAST_DAMPING: Final = 1e-9  # below it a step is Gauss-Newton's
+# Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
+# drive, so the first damping must be tiny to leave such modes free.
+_FIRST_DAMPING: Final = 1e-9
+_LEAST_DAMPING: Final = 1e-10  # below it a step is Gauss-Newton's
 
 
 @dataclass(frozen=True)
 class Problem:
-    """All factors of one estimate, and where the variables sit."""
+    """All factors of one estimate, and where the variables sit.
+
+    Attributes:
+        anchor: (T,) a pose from which each tag was read.
+    """
 
     odometry: OdometryFactors
     readings: ReadingFactors
     prior: CalibrationPrior
     columns: Columns
+    anchor: IntArray
 
     def cost(self, state: State) -> float:
         """Half the sum of squared whitened residuals, Huber's loss on the readings."""
@@ -61,11 +68,23 @@ class Problem:
         return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
 
     def moved(self, state: State, step: FloatArray) -> State:
-        """The state after a step (n,) in the tangent space."""
+        """The state after a step (n,) in the tangent space.
+
+        A tag moves along with its anchor as on a rigid body, and by the rest of its step in the anchor's frame. To first
+        order that is adding the step. But where a whole region turns, poses go round on arcs (T o exp(delta)) and tags
+        stay with them, instead of leaving on the tangent by more than their sigma: full steps work from farther away.
+        """
         padded = np.append(step, 0.0)  # column -1: held
+        by_pose = padded[self.columns.poses]
+        poses = se2.compose(state.poses, se2.exp(by_pose))
+        before, turned = state.poses[self.anchor], by_pose[self.anchor]
+        from_anchor = se2.apply(se2.inverse(before), state.tags)
+        moved_along = turned[:, :2] + turned[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
+        to_anchor_axes = np.column_stack([np.zeros((len(before), 2)), -before[:, 2]])
+        own = se2.apply(to_anchor_axes, padded[self.columns.tags]) - moved_along
         return State(
-            poses=se2.compose(state.poses, se2.exp(padded[self.columns.poses])),
-            tags=state.tags + padded[self.columns.tags],
+            poses=poses,
+            tags=se2.apply(poses[self.anchor], from_anchor + own),
             calibration=state.calibration + padded[self.columns.calibration],
         )
 
