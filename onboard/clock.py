@@ -122,25 +122,35 @@ class DeviceClockFilter:
 
     def _fit(self) -> None:
         points = [(device - self._origin_ns, host - device) for device, host in self._fastest]
-        first, second = _edge_below(points)
-        if second[0] > first[0]:
-            slope = (second[1] - first[1]) / (second[0] - first[0])
-            self._rate_error = min(max(slope, -_MAX_RATE_ERROR), _MAX_RATE_ERROR)
+        rate_error = _rate_error(points)
+        if rate_error is not None:
+            self._rate_error = rate_error
         self._offset_ns = min(delay - round(self._rate_error * at) for at, delay in points)
 
 
-def _edge_below(points: list[tuple[int, int]]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The edge of the lower convex hull that spans the mean of x; `points` in order of x. One point: it, twice."""
-    hull: list[tuple[int, int]] = []
-    for x, y in points:
-        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
-            hull.pop()
-        hull.append((x, y))
+def _rate_error(points: list[tuple[int, int]]) -> float | None:
+    """The slope of the lower hull's edge that spans the mean of x; `points` in order of x.
+
+    Where that slope is none that a clock can have (the points' beginning lay in a buffer, say), the longest edge with
+    a possible one stands in; None if there is none.
+    """
+    hull = _lower_hull(points)
     mean_times_n = sum(x for x, _ in points)
-    for first, second in itertools.pairwise(hull):
-        if second[0] * len(points) >= mean_times_n:
-            return first, second
-    return hull[-1], hull[-1]
+    edges = [(a, b, (b[1] - a[1]) / (b[0] - a[0])) for a, b in itertools.pairwise(hull) if b[0] > a[0]]
+    possible = [edge for edge in edges if abs(edge[2]) <= _MAX_RATE_ERROR]
+    for a, b, slope in possible:
+        if a[0] * len(points) <= mean_times_n <= b[0] * len(points):
+            return slope
+    return max(possible, key=lambda edge: edge[1][0] - edge[0][0])[2] if possible else None
+
+
+def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    hull: list[tuple[int, int]] = []
+    for point in points:
+        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    return hull
 
 
 def _turns_down(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:

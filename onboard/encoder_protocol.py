@@ -12,7 +12,7 @@ import re
 from typing import Final, NamedTuple
 
 PROTOCOL_VERSION: Final = 1
-LINE_LIMIT_BYTES: Final = 96  # the longest line has 77
+LINE_LIMIT_BYTES: Final = 96  # the longest line has 76
 
 _U16: Final = 1 << 16
 _U32: Final = 1 << 32

@@ -1,5 +1,6 @@
 """Picture in, tags out: one corner order and OpenCV's pixel convention, whichever library found them."""
 
+import ctypes
 import importlib
 import importlib.metadata
 from collections.abc import Sequence
@@ -16,8 +17,7 @@ _MODULES: Final = {"pupil-apriltags": "pupil_apriltags", "pyapriltags": "pyapril
 _FAMILIES: Final = ("tag36h11", "tag25h9", "tag16h5")
 # The libraries count the corner of the first pixel as (0, 0), OpenCV its centre.
 _PIXEL_CENTRE_PX: Final = 0.5
-# pupil-apriltags frees the families before the detector that uses them, so a detector once made is kept for the life
-# of the process and never made twice.
+# Detectors once made, never made twice and never freed: see _kept_detector.
 _KEPT: dict[tuple[str, str, float, int], Any] = {}
 
 
@@ -112,5 +112,9 @@ def _kept_detector(name: str, family: str, quad_decimate: float, threads: int) -
     key = (name, family, quad_decimate, threads)
     if key not in _KEPT:
         module = importlib.import_module(_MODULES[name])
-        _KEPT[key] = module.Detector(families=family, nthreads=threads, quad_decimate=quad_decimate)
+        detector = module.Detector(families=family, nthreads=threads, quad_decimate=quad_decimate)
+        # pupil-apriltags frees the families before the detector that uses them, which corrupts the heap. A reference
+        # that nobody gives back keeps it from being freed, at the interpreter's end too.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(detector))
+        _KEPT[key] = detector
     return _KEPT[key]

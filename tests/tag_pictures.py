@@ -15,7 +15,9 @@ def draw_tag(family: str, tag_id: int, corners_px: FloatArray, size: tuple[int, 
     bits = np.pad(tag_bits(family, tag_id), 1, constant_values=True)  # a white margin of one module
     n = bits.shape[0]
     module_px = 40
-    texture = np.kron(np.where(bits, 230, 20).astype(np.uint8), np.ones((module_px, module_px), np.uint8))
+    texture = np.asarray(
+        np.kron(np.where(bits, np.uint8(230), np.uint8(20)), np.ones((module_px, module_px), np.uint8)), dtype=np.uint8
+    )
     inner = (
         np.array([[1, 1], [n - 1, 1], [n - 1, n - 1], [1, n - 1]]) * module_px - 0.5
     )  # pixel centres at whole numbers

@@ -1,0 +1,80 @@
+"""The controller's clock on the host's: what delays and rates differ by must not reach the stamps."""
+
+import math
+import random
+
+import pytest
+
+from onboard.clock import DeviceClockFilter, RunClock, read_clocks
+from onboard.encoder_protocol import WheelLine, format_line
+from onboard.wheel_intake import WheelIntake
+
+HOST_NS = 1_800_000_000_000_000_000
+MS = 1_000_000
+
+
+def mapping_errors_ms(rate_ppm: float, burst_s: float, n: int = 6000, seed: int = 1) -> list[float]:
+    """Errors of the stamps of 100 Hz readings, the least delay of 1 ms taken out."""
+    chance = random.Random(seed)
+    mapping = DeviceClockFilter()
+    errors = []
+    for index in range(n):
+        measured_s = index * 0.01
+        arrival_s = measured_s + 0.001 + abs(chance.gauss(0.0, 3e-4)) + (0.02 if chance.random() < 0.01 else 0.0)
+        if burst_s:  # the last reading of a burst is sent as soon as it is measured
+            arrival_s = math.ceil(round(measured_s / burst_s, 6)) * burst_s + 0.001 + abs(chance.gauss(0.0, 1e-4))
+        device_us = int(measured_s * (1e6 + rate_ppm)) + 123_456_789
+        mapping.observe(device_us, HOST_NS + round(arrival_s * 1e9))
+        errors.append((mapping.stamp_ns(device_us) - HOST_NS) / 1e6 - measured_s * 1e3 - 1.0)
+    return errors
+
+
+@pytest.mark.parametrize("rate_ppm", [200, -200])
+def test_bursts_and_clocks_apart_stay_under_a_millisecond(rate_ppm: float) -> None:
+    errors = mapping_errors_ms(rate_ppm, 0.3)[200:]
+    assert max(map(abs, errors)) < 1.0
+
+
+@pytest.mark.parametrize("rate_ppm", [5000, -5000])
+def test_a_ceramic_resonator_is_learned(rate_ppm: float) -> None:
+    assert max(map(abs, mapping_errors_ms(rate_ppm, 0.0)[500:])) < 0.3
+
+
+def test_a_stamp_is_never_after_the_arrival() -> None:
+    chance = random.Random(2)
+    mapping = DeviceClockFilter()
+    for index in range(3000):
+        arrival_ns = HOST_NS + index * 10 * MS + chance.randrange(40 * MS)
+        mapping.observe(index * 10_000, arrival_ns)
+        assert mapping.stamp_ns(index * 10_000) <= arrival_ns
+
+
+def test_a_fixed_delay_and_exact_clocks_are_mapped_exactly() -> None:
+    mapping = DeviceClockFilter()
+    for index in range(5000):
+        mapping.observe(index * 10_000, HOST_NS + index * 10 * MS)
+        assert mapping.stamp_ns(index * 10_000) == HOST_NS + index * 10 * MS
+
+
+def test_readings_that_lay_in_a_buffer_at_the_start_get_their_true_stamps() -> None:
+    """A second of old lines comes at once on opening; only what follows tells how old they were."""
+    intake = WheelIntake()
+    lines = [format_line(WheelLine(1, index, index * 10_000, 0, 0, 0)) for index in range(300)]
+    ready = intake.feed(b"".join(lines[:100]), HOST_NS + 1000 * MS)
+    assert ready == []
+    assert intake.warming_up
+    for index in range(100, 300):
+        ready += intake.feed(lines[index], HOST_NS + index * 10 * MS + MS)
+    assert [each.reading.sequence for each in ready] == list(range(300))
+    assert max(abs(each.stamp_ns - HOST_NS - each.reading.sequence * 10 * MS - MS) for each in ready) < MS
+    stamps = [each.stamp_ns for each in ready]
+    assert stamps == sorted(set(stamps))
+
+
+def test_the_runs_clock_is_wall_clock_time_that_cannot_step() -> None:
+    clock = RunClock()
+    reading = read_clocks()
+    assert clock.from_monotonic(reading.monotonic_ns) == reading.monotonic_ns + clock.run_epoch_ns
+    assert abs(clock.from_realtime(reading.realtime_ns) - clock.from_monotonic(reading.monotonic_ns)) < 50 * MS
+    earlier = clock.now_ns()
+    assert clock.now_ns() >= earlier
