@@ -56,6 +56,33 @@ def import_csv(
         typer.echo(line)
 
 
+@app.command("map")
+def map_command(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
+    robot: Annotated[
+        list[Path] | None,
+        typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
+    ] = None,
+    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters; the others keep defaults.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
+    json_output: JsonFlag = False,
+) -> None:
+    """Turns the drives in logs into one map of all tags and trajectories, in the frame of the first log's start.
+
+    Exit 3: the runs do not all hang together; the map has several components, and the reasons are printed.
+    """
+    from offline.map_command import MapOptions, as_json, exit_code, make_map, summary
+
+    result = make_map(MapOptions(logs, output, robot or (), noise, overwrite))
+    if json_output:
+        typer.echo(as_json(result))
+    else:
+        for line in summary(result, output):
+            typer.echo(line)
+    raise typer.Exit(exit_code(result))
+
+
 @app.command()
 def info(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")],

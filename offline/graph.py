@@ -111,8 +111,8 @@ def _middle_readings(readings: ReadingFactors, n_tags: int) -> IntArray:
     """(T,) the pose of each tag's middle reading."""
     order = np.argsort(readings.tag, kind="stable")
     count = np.bincount(readings.tag, minlength=n_tags)
-    first = np.cumsum(count) - count
-    return readings.pose[order[first + count // 2]]
+    middle = order[np.cumsum(count) - count + count // 2]
+    return np.asarray(readings.pose[middle])
 
 
 def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:

@@ -15,7 +15,7 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
 from offline.run import Detections, Positions, Run
-from offline.tag_pose import TagReadings, general_readings, upright_readings
+from offline.tag_pose import general_readings, upright_readings
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -87,11 +87,11 @@ def read_detections(
     keyframe, tag, corners_px = _averaged(keyframe, detections.tag, detections.corners_px)
     sides_m = np.array([run.robot.tag_size_m(*key)[0] for key in run.tags])[tag]
     rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
-    found, askew = _upright_or_general(
-        tag,
-        upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px),
-        general_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px),
-    )
+    found = upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px)
+    askew, spoilt = _judged(tag, found.chi2)
+    is_askew = np.isin(tag, askew)
+    general = general_readings(corners_px[is_askew], sides_m[is_askew], camera, rotation, noise.sigma_corner_px)
+    found = found.replaced(is_askew, general)
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in askew
@@ -100,9 +100,8 @@ def read_detections(
     # From base's axes to the camera's yaw, about which all readings in_camera are.
     value = np.stack([range_m, se2.wrap_angle(found.range_bearing[:, 1] - run.robot.mount.yaw_rad)], axis=-1)
     with np.errstate(invalid="ignore"):
-        is_askew = np.isin(tag, askew)
         sure = found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
-        good = found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew)
+        good = found.valid & ~spoilt & (range_m > MIN_RANGE_M) & (sure | is_askew)
     if (n_bad := int((~good).sum())) > 0:
         warnings.append(
             f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
@@ -177,31 +176,19 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
                 )
 
 
-def _upright_or_general(tag: IntArray, upright: TagReadings, general: TagReadings) -> tuple[TagReadings, IntArray]:
-    """Upright readings, but general ones for tags whose residuals say that they hang askew."""
+def _judged(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, BoolArray]:
+    """From the upright model's residuals: the tags that hang askew, and (M,) the readings of others that are spoilt."""
     n_tags = int(tag.max()) + 1
-    usable = np.isfinite(upright.chi2)
     # Capped, so that one spoilt picture does not speak for its tag.
-    capped = np.where(usable, np.minimum(upright.chi2, 100.0), 100.0)
+    capped = np.where(np.isfinite(chi2), np.minimum(chi2, 100.0), 100.0)
     count = np.bincount(tag, minlength=n_tags)
-    mean = np.bincount(tag, capped, n_tags) / np.maximum(count, 1) / _UPRIGHT_DOF
-    level = max(1.0, float(np.median(mean[count > 0])))
     dof = _UPRIGHT_DOF * np.maximum(count, 1)
+    mean = np.bincount(tag, capped, n_tags) / dof
+    level = max(1.0, float(np.median(mean[count > 0])))
     limit = np.maximum(_ASKEW_FACTOR, chi2_distribution.ppf(1.0 - _FALSE_ALARM, dof) / dof) * level
     askew = np.flatnonzero((count > 0) & (mean > limit))
-    use_general = np.isin(tag, askew)
-    spoilt = ~use_general & ~(upright.chi2 < level * chi2_distribution.ppf(1.0 - _FALSE_ALARM, _UPRIGHT_DOF))
-    pick = use_general[:, None]
-    return (
-        TagReadings(
-            np.where(pick, general.range_bearing, upright.range_bearing),
-            np.where(pick[..., None], general.covariance, upright.covariance),
-            np.where(use_general, general.height_m, upright.height_m),
-            np.where(use_general, general.chi2, upright.chi2),
-            np.where(use_general, general.valid, upright.valid & ~spoilt),
-        ),
-        askew,
-    )
+    spoilt = ~np.isin(tag, askew) & ~(chi2 < level * chi2_distribution.ppf(1.0 - _FALSE_ALARM, _UPRIGHT_DOF))
+    return askew, spoilt
 
 
 def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

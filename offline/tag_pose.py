@@ -16,6 +16,7 @@ then read by the general pose with a range sigma wide enough to cover that pose'
 """
 
 from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
 from typing import Final
 
 import cv2
@@ -52,6 +53,15 @@ class TagReadings:
     height_m: FloatArray
     chi2: FloatArray
     valid: BoolArray
+
+    def replaced(self, mask: BoolArray, others: "TagReadings") -> "TagReadings":
+        """These, with those of the mask replaced by others (as many as the mask has)."""
+        fields = []
+        for mine, theirs in ((getattr(self, f.name), getattr(others, f.name)) for f in dataclass_fields(self)):
+            merged = mine.copy()
+            merged[mask] = theirs
+            fields.append(merged)
+        return TagReadings(*fields)
 
 
 def upright_readings(

@@ -1,0 +1,166 @@
+"""The `map` command: logs in, a folder with the map out; everything is written or nothing."""
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+
+from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from calib.noise import read_noise_yaml
+from offline.errors import OfflineError
+from offline.map_io import JSON_FILE, map_as_json, write_map
+from offline.picture import write_picture
+from offline.pipeline import Progress, map_logs
+from offline.result import AlignmentResult, Component, MapResult
+from offline.run import RobotFile, read_robot_file
+from onboard.log_reader import find_logs
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """What the command line says."""
+
+    logs: Sequence[Path]
+    output: Path
+    robots: Sequence[Path] = ()
+    noise: Path | None = None
+    overwrite: bool = False
+
+
+def make_map(options: MapOptions) -> MapResult:
+    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories and map.png.
+
+    Raises:
+        GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
+    """
+    logs = find_logs(list(options.logs))
+    _check_output(options.output, logs, overwrite=options.overwrite)
+    robot_files: dict[str, RobotFile] = {}
+    for path in options.robots:
+        given = read_robot_file(path)
+        if given.robot.robot_id in robot_files:
+            raise OfflineError(f"--robot {path}: robot_id {given.robot.robot_id!r} is given twice; leave one out")
+        robot_files[given.robot.robot_id] = given
+    noise = read_noise_yaml(options.noise) if options.noise else None
+    with _progress_bar() as progress:
+        result = map_logs(logs, robot_files, noise, progress)
+    with _all_or_nothing(options.output) as folder:
+        write_map(result, folder)
+        write_picture(result, folder / "map.png")
+    return result
+
+
+def exit_code(result: MapResult) -> int:
+    """Done, or done in several components."""
+    return EXIT_WITH_LOSSES if len(result.components) > 1 else EXIT_DONE
+
+
+def summary(result: MapResult, output: Path) -> list[str]:
+    """What a person wants to know first."""
+    lines = []
+    for component in result.components:
+        lines += _component_lines(component, several=len(result.components) > 1)
+    lines += [_alignment_line(alignment) for alignment in result.alignments]
+    lines += [
+        f"start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m (sigma {pair.sigma_m:.3f} m)"
+        for component in result.components
+        for pair in component.start_to_start
+    ]
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
+
+
+def as_json(result: MapResult) -> str:
+    """The content of map.json."""
+    return json.dumps(map_as_json(result), indent=2, allow_nan=False)
+
+
+def _component_lines(component: Component, *, several: bool) -> list[str]:
+    lines = []
+    if several:
+        lines.append(f"component in the frame of {component.frame_run}: {len(component.tags)} tags")
+    for run in component.runs:
+        n_tags = sum(run.name in tag.runs for tag in component.tags)
+        lines.append(f"{run.name}: {run.n_keyframes} keyframes, {run.distance_m:.1f} m, {n_tags} tags")
+    if not several:
+        lines.append(f"{len(component.tags)} tags in one map, in the frame of {component.frame_run}'s start")
+    return lines
+
+
+def _alignment_line(alignment: AlignmentResult) -> str:
+    x_m, y_m, theta_rad = alignment.T_from_to
+    return (
+        f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared tags "
+        f"fit (RMS {alignment.inlier_rmse_m:.2f} m); x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
+    )
+
+
+def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> None:
+    """Refuses an output folder in which something could be lost."""
+    if output.exists() and not output.is_dir():
+        raise OfflineError(f"-o {output}: is a file; name a folder that is empty or not there yet")
+    for log in logs:
+        if output.resolve() in (log.resolve(), *log.resolve().parents) or log.resolve() in output.resolve().parents:
+            raise OfflineError(f"-o {output}: holds the log {log} or lies in it; name another folder, recordings stay")
+    if not output.is_dir() or not any(output.iterdir()):
+        return
+    if not overwrite:
+        raise OfflineError(f"-o {output}: the folder is not empty; name another one, or give --overwrite")
+    if not (output / JSON_FILE).is_file():
+        raise OfflineError(
+            f"-o {output}: --overwrite replaces maps only, and there is no {JSON_FILE} in it; name another folder"
+        )
+
+
+@contextmanager
+def _all_or_nothing(output: Path) -> Iterator[Path]:
+    """A folder beside `output` that takes its place if the block ends well."""
+    output = output.resolve()
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
+        partial.mkdir()
+    except OSError as error:
+        raise OfflineError(f"-o {output}: cannot be made ({error.strerror}); name a folder you may write") from error
+    replaced = output.with_name(f".{output.name}.{os.getpid()}.replaced")
+    try:
+        yield partial
+        if output.exists():
+            output.rename(replaced)
+        partial.rename(output)
+    except OSError as error:
+        raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
+    finally:
+        if replaced.exists() and not output.exists():
+            replaced.rename(output)
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Progress]:
+    """A bar on a terminal, gone when done; nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda _what, _done, _total: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+    from rich.progress import TaskID
+
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                for task in tasks.values():
+                    bar.remove_task(task)
+                tasks.clear()
+                tasks[what] = bar.add_task(what, total=total)
+            bar.update(tasks[what], completed=done)
+
+        yield show
