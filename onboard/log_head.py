@@ -86,7 +86,7 @@ def mount_message(mount: Mount, stamp_ns: int) -> FrameTransform:
     """Where the camera sits: points in camera to points in base."""
     translation, rotation = mount.T_base_camera.as_components()
     x, y, z = translation.tolist()
-    qx, qy, qz, qw = rotation.as_quat().tolist()
+    qx, qy, qz, qw = rotation.as_quat(canonical=True).tolist()
     return FrameTransform(
         timestamp=timestamp(stamp_ns),
         parent_frame_id=BASE_FRAME,
