@@ -157,3 +157,12 @@ def test_labels_of_neighbours_keep_clear_of_each_other() -> None:
     centres = place_labels(points, sizes, np.empty((0, 2)))
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert (np.abs(centres[a] - centres[b]) >= sizes[0]).any()
+
+
+def test_a_label_covers_no_other_point() -> None:
+    points = np.array([[0.0, 0.0], [14.0, 10.0]])  # the second stands where the first's label would go first
+    sizes = np.array([[16.0, 10.0], [16.0, 10.0]])
+    centres = place_labels(points, sizes, np.empty((0, 2)))
+    assert (np.abs(centres[0] - points[1]) >= sizes[0] / 2).any()
+    assert (np.abs(centres[1] - points[0]) >= sizes[1] / 2).any()
+    assert (centres[0] < points[1]).any()
