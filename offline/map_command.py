@@ -95,8 +95,9 @@ def _component_lines(component: Component, *, several: bool) -> list[str]:
 def _alignment_line(alignment: AlignmentResult) -> str:
     x_m, y_m, theta_rad = alignment.T_from_to
     return (
-        f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared tags "
-        f"fit (RMS {alignment.inlier_rmse_m:.2f} m); x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
+        f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
+        f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
+        f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
     )
 
 

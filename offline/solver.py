@@ -70,9 +70,9 @@ class Problem:
     def moved(self, state: State, step: FloatArray) -> State:
         """The state after a step (n,) in the tangent space.
 
-        A tag moves along with its anchor as on a rigid body, and by the rest of its step in the anchor's frame. To first
-        order that is adding the step. But where a whole region turns, poses go round on arcs (T o exp(delta)) and tags
-        stay with them, instead of leaving on the tangent by more than their sigma: full steps work from farther away.
+        A tag moves along with its anchor as on a rigid body, and by the rest of its step in the anchor's frame. To
+        first order that is adding the step. But where a whole region turns, poses go round on arcs (T o exp(delta)),
+        and so tags stay with them instead of leaving on the tangent: full steps work from farther away.
         """
         padded = np.append(step, 0.0)  # column -1: held
         by_pose = padded[self.columns.poses]
