@@ -19,6 +19,7 @@ $(READY): requirements.lock pyproject.toml
 	touch $@
 
 demo: $(READY)
+	rm -rf $(DEMO)
 	$(BIN)/python -m fixtures demo --output $(DEMO)
 
 test: $(READY)

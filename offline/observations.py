@@ -21,6 +21,8 @@ from offline.tag_pose import general_readings, upright_readings
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
 # Nearer than this a reading is a phantom, and its covariance would wreck the condition of the solve.
 MIN_RANGE_M: Final = 0.1
+# More than this share of readings left out is worth a sentence.
+MAX_SHARE_LEFT_OUT: Final = 0.05
 _UPRIGHT_DOF: Final = 2
 _FALSE_ALARM: Final = 1e-6
 # A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its fellows is
@@ -102,7 +104,7 @@ def read_detections(
     with np.errstate(invalid="ignore"):
         sure = found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
         good = found.valid & ~spoilt & (range_m > MIN_RANGE_M) & (sure | is_askew)
-    if (n_bad := int((~good).sum())) > 0:
+    if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
         warnings.append(
             f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
         )
