@@ -69,10 +69,21 @@ def test_cut_and_glued_lines_cost_themselves_only() -> None:
 def test_a_changed_byte_is_never_a_reading(line: WheelLine, data: st.DataObject) -> None:
     sent = bytearray(format_line(line))
     at = data.draw(st.integers(0, len(sent) - 1))
-    sent[at] = data.draw(st.integers(0, 255).filter(lambda byte: byte != sent[at]))
-    assert EncoderParser().feed(bytes(sent) + b"\r\n") in ([], [line])  # [line]: the change closed an earlier "$"
-    if at > 0:
-        assert EncoderParser().feed(bytes(sent)) == []
+    anything = st.sampled_from(b"0123456789$*,-\r\n") | st.integers(0, 255)
+    sent[at] = data.draw(anything.filter(lambda byte: byte != sent[at]))
+    assert EncoderParser().feed(bytes(sent)) == []
+
+
+def test_every_changed_digit_is_noticed() -> None:
+    sent = format_line(WheelLine(12, 3456, 78901, -2345, 6789, 1))
+    parser = EncoderParser()
+    parser.feed(b"\n")
+    digits = [at for at, byte in enumerate(sent) if chr(byte).isdigit()]
+    for at in digits:
+        for digit in b"0123456789":
+            changed = sent[:at] + bytes([digit]) + sent[at + 1 :]
+            assert parser.feed(changed) == ([WheelLine(12, 3456, 78901, -2345, 6789, 1)] if changed == sent else [])
+    assert parser.rejected == 9 * len(digits)
 
 
 def test_megabytes_of_noise_take_no_memory_and_make_no_reading() -> None:

@@ -153,6 +153,26 @@ def test_a_live_recording_has_every_line_and_picture_on_one_clock(tmp_path: Path
     assert 45 <= len(kept) <= 51
 
 
+def test_what_the_devices_hold_when_recording_ends_belongs_to_it(tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    port = FakePort(tmp_path / "wheels")
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+    picture = cv2.imencode(".png", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
+    with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
+        wait_for(process.stdout, "port_connected", "camera_connected")
+        for index in range(60):
+            port.send(index)
+        for _ in range(20):
+            (pictures / f"{time.time_ns()}.png").write_bytes(picture)
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=10)
+    assert process.returncode == 0, said
+    (log,) = find_logs([tmp_path / "logs"])
+    assert len(list(read_log(log, ["/wheels"]))) == 60
+    assert len(list(read_log(log, ["/tags/detections"]))) == 20
+
+
 def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path) -> None:
     link = tmp_path / "wheels"
     robot = robot_yaml(tmp_path, f"{{encoder_port: {link}}}")
