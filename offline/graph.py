@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.robot import Robot
+from calib.robot import RELATIVE_TAG_SIZE_SIGMA, Robot
 from offline.chain import Chain
 from offline.factors import (
     MOUNT_PARAMETERS,
@@ -203,10 +203,10 @@ def _mount_parameters(robot: Robot) -> list[Parameter]:
 
 
 def _scale_parameter(chain: Chain, tag: TagKey) -> Parameter:
-    """Of the batch that a tag was printed in; none for imported positions of tags whose size nobody gave."""
+    """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
     robot = chain.run.robot
     if not any(batch.family == tag.family for batch in robot.tags):
-        return _NONE
+        return Parameter(f"imported {tag.family}", TAG_SCALE, (), RELATIVE_TAG_SIZE_SIGMA)
     size_m, sigma_m, batch = robot.tag_size_m(*tag)
     return Parameter(f"{batch} {tag.family}", TAG_SCALE, (), sigma_m / size_m)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
@@ -187,9 +187,9 @@ def _judged(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, BoolArray]:
     dof = _UPRIGHT_DOF * np.maximum(count, 1)
     mean = np.bincount(tag, capped, n_tags) / dof
     level = max(1.0, float(np.median(mean[count > 0])))
-    limit = np.maximum(_ASKEW_FACTOR, chi2_distribution.ppf(1.0 - _FALSE_ALARM, dof) / dof) * level
+    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof) * level
     askew = np.flatnonzero((count > 0) & (mean > limit))
-    spoilt = ~np.isin(tag, askew) & ~(chi2 < level * chi2_distribution.ppf(1.0 - _FALSE_ALARM, _UPRIGHT_DOF))
+    spoilt = ~np.isin(tag, askew) & ~(chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM))
     return askew, spoilt
 
 

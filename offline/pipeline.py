@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
@@ -12,6 +13,9 @@ from offline.merge import Group, PairAlignment, align_pairs, group, reason_apart
 from offline.observations import check_tag_sizes
 from offline.result import AlignmentResult, CalibrationResult, Component, MapResult
 from offline.run import RobotFile, Run, load_run
+
+# A good calibration goes beyond this once in 16,000 times.
+MAX_PRIOR_SIGMAS: Final = 4.0
 
 Progress = Callable[[str, int, int], None]  # what is being done, how many are done, of how many
 
@@ -66,6 +70,7 @@ def map_runs(runs: Sequence[Run], noise: NoiseParameters, progress: Progress = _
         calibration.extend(calibration_of(graph, solution, i))
         if not solution.converged:
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
+    warnings += _calibration_warnings(calibration)
     warnings += _alignment_warnings(maps, pairs) + _chain_warnings(chains) + _reasons_apart(maps, groups, pairs)
     return MapResult(
         components=tuple(components),
@@ -118,6 +123,16 @@ def _alignment_warnings(maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]
                 "(more than 0.5 m): moved between the runs, or carried about?"
             )
     return warnings
+
+
+def _calibration_warnings(calibration: Sequence[CalibrationResult]) -> list[str]:
+    """Corrections that what was known beforehand makes all but impossible."""
+    return [
+        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} times "
+        "the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
+        for entry in calibration
+        if abs(entry.value) > MAX_PRIOR_SIGMAS * entry.prior_sigma
+    ]
 
 
 def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
