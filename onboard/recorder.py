@@ -18,6 +18,7 @@ from calib.robot import Robot
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_head import CAMERA_FRAME, log_head
 from onboard.log_writer import LogWriter
+from onboard.measurements import detections_message, wheel_message
 from onboard.messages import (
     ClockAnchor,
     CompressedImage,
@@ -25,9 +26,7 @@ from onboard.messages import (
     EventKind,
     Severity,
     StampSource,
-    TagDetection,
     TagDetections,
-    WheelEncoders,
     timestamp,
 )
 from onboard.picture import encode_jpeg
@@ -140,16 +139,7 @@ class RecorderCore:
     def _write_reading(self, each: StampedReading) -> None:
         reading = each.reading
         self._note_gaps(each)
-        message = WheelEncoders(
-            stamp_ns=each.stamp_ns,
-            device_time_us=reading.device_time_us,
-            boot_id=reading.boot_id,
-            sequence=reading.sequence,
-            ticks_left=reading.ticks_left,
-            ticks_right=reading.ticks_right,
-            flags=reading.flags,
-        )
-        self._write("/wheels", message, each.host_ns, each.stamp_ns)
+        self._write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._recent.append((each.stamp_ns, reading.sequence))
         self._last_wheel_host_ns = each.host_ns
         self._silent = False
@@ -217,25 +207,7 @@ class RecorderCore:
     ) -> None:
         """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
         self._check_size(size_px, receive_ns)
-        message = TagDetections(
-            stamp_ns=stamp_ns,
-            frame_sequence=sequence,
-            width_px=size_px[0],
-            height_px=size_px[1],
-            detector=detector,
-            detector_settings=detector_settings,
-            stamp_source=StampSource.Name(source),
-            detections=[
-                TagDetection(
-                    family=each.family,
-                    tag_id=each.tag_id,
-                    hamming=each.hamming,
-                    decision_margin=each.decision_margin,
-                    corners_px=each.corners_px.ravel().tolist(),
-                )
-                for each in detections
-            ],
-        )
+        message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         self._waiting.append(_Waiting(message, receive_ns))
         self._write_waiting(receive_ns)
 

@@ -1,0 +1,52 @@
+"""Measurements as the log has them."""
+
+from collections.abc import Sequence
+
+from onboard.messages import StampSource, TagDetection, TagDetections, WheelEncoders
+from onboard.tag_detector import Detection
+from onboard.wheel_intake import StampedReading
+
+
+def wheel_message(each: StampedReading) -> WheelEncoders:
+    """One wheel reading."""
+    reading = each.reading
+    return WheelEncoders(
+        stamp_ns=each.stamp_ns,
+        device_time_us=reading.device_time_us,
+        boot_id=reading.boot_id,
+        sequence=reading.sequence,
+        ticks_left=reading.ticks_left,
+        ticks_right=reading.ticks_right,
+        flags=reading.flags,
+    )
+
+
+def detections_message(
+    detections: Sequence[Detection],
+    size_px: tuple[int, int],
+    stamp_ns: int,
+    source: "StampSource | int",
+    sequence: int,
+    detector: str,
+    detector_settings: str,
+) -> TagDetections:
+    """The tags of one picture; its wheel sequence is filled in when it is known."""
+    return TagDetections(
+        stamp_ns=stamp_ns,
+        frame_sequence=sequence,
+        width_px=size_px[0],
+        height_px=size_px[1],
+        detector=detector,
+        detector_settings=detector_settings,
+        stamp_source=StampSource.Name(source),
+        detections=[
+            TagDetection(
+                family=each.family,
+                tag_id=each.tag_id,
+                hamming=each.hamming,
+                decision_margin=each.decision_margin,
+                corners_px=each.corners_px.ravel().tolist(),
+            )
+            for each in detections
+        ],
+    )
