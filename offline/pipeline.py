@@ -128,8 +128,8 @@ def _alignment_warnings(maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]
 def _calibration_warnings(calibration: Sequence[CalibrationResult]) -> list[str]:
     """Corrections that what was known beforehand makes all but impossible."""
     return [
-        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} times "
-        "the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
+        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
+        "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
         for entry in calibration
         if abs(entry.value) > MAX_PRIOR_SIGMAS * entry.prior_sigma
     ]

@@ -1,0 +1,98 @@
+"""The distribution and its programs, as somebody who installs them meets them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+HEAVY = ("numpy", "cv2", "scipy", "numba")
+COMMANDS = [
+    ("onboard.cli",),
+    ("onboard.cli", "record"),
+    ("onboard.cli", "check"),
+    ("offline.cli",),
+    ("offline.cli", "map"),
+    ("offline.cli", "import"),
+    ("offline.cli", "info"),
+    ("offline.cli", "compare"),
+    ("fixtures.__main__",),
+    ("fixtures.__main__", "simulate"),
+    ("fixtures.__main__", "demo"),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_loads_nothing_heavy(command: tuple[str, ...]) -> None:
+    module, *words = command
+    program = f"""
+import importlib, sys
+sys.argv = ["program", *{words!r}, "-h"]
+try:
+    importlib.import_module({module!r}).main()
+except SystemExit as end:
+    loaded = [name for name in {HEAVY!r} if name in sys.modules]
+    sys.exit(f"help loaded {{loaded}}" if loaded else end.code)
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert found.returncode == 0, found.stderr
+    assert "Usage:" in found.stdout
+
+
+def test_every_command_is_among_those_whose_help_is_tested() -> None:
+    from fixtures.__main__ import app as fixtures_app
+    from offline.cli import app as offline_app
+    from onboard.cli import app as onboard_app
+
+    registered = {
+        (module, command.name or (command.callback.__name__ if command.callback else ""))
+        for module, app in (
+            ("onboard.cli", onboard_app),
+            ("offline.cli", offline_app),
+            ("fixtures.__main__", fixtures_app),
+        )
+        for command in app.registered_commands
+    }
+    assert registered == {command for command in COMMANDS if len(command) == 2}
+
+
+def test_simulate_works_from_an_installed_wheel_in_an_empty_folder(tmp_path: Path) -> None:
+    built, installed, empty = tmp_path / "built", tmp_path / "installed", tmp_path / "empty"
+    empty.mkdir()
+    _run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(built), str(_sources(tmp_path))],
+        empty,
+    )
+    (wheel,) = built.glob("groundsbot-*.whl")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(installed)]
+    _run([*pip, str(wheel)], empty)
+    where = _run([sys.executable, "-c", "import fixtures; print(fixtures.__file__)"], empty, installed)
+    assert Path(where.strip()).is_relative_to(installed)
+
+    simulate = [sys.executable, "-m", "fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render"]
+    _run([*simulate, "--output", "logs"], empty, installed)
+    assert (empty / "logs" / "truth.json").is_file()
+    _run([sys.executable, "-m", "offline.cli", "map", "logs", "-o", "map"], empty, installed)
+    assert (empty / "map" / "tags.csv").read_text().startswith("tag_id,")
+
+
+def _sources(tmp_path: Path) -> Path:
+    """What git would ship, copied, so that a build leaves nothing behind in the tree."""
+    sources = tmp_path / "sources"
+    for name in _run(["git", "ls-files", "--cached", "--others", "--exclude-standard"], ROOT).splitlines():
+        if (ROOT / name).is_file():
+            target = sources / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes((ROOT / name).read_bytes())
+    return sources
+
+
+def _run(command: list[str], folder: Path, first_on_path: Path | None = None) -> str:
+    environment = dict(os.environ)
+    if first_on_path is not None:
+        environment["PYTHONPATH"] = str(first_on_path)
+    found = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    return found.stdout
