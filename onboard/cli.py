@@ -29,7 +29,9 @@ def record(
 
     Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap where pictures are kept. Devices that are absent are waited
     for. A folder as the camera gives the pictures that appear in it as T.png or T.jpg, T being the middle of the
-    exposure in ns of the host's wall clock (CLOCK_REALTIME); relative paths start at robot.yaml. Exit code 0: nothing was lost; 3: something was, said in words and in the log.
+    exposure in ns of the host's wall clock (CLOCK_REALTIME); relative paths start at robot.yaml.
+
+    Exit code 0: nothing was lost; 3: something was, said in words and in the log.
     """
     import signal
     import threading
