@@ -1,8 +1,8 @@
 """What a log holds: one table of topics, their schemas and the rates to expect.
 
 A message's log time is when the host received it (or the log's newest time, where that is later: log times never run
-backwards in a file); its publish time is the best estimate of when it was measured. The field-by-field description, with frames, corner order and units, is in
-`groundsbot.proto`.
+backwards in a file); its publish time is the best estimate of when it was measured. The field-by-field description,
+with frames, corner order and units, is in `groundsbot.proto`.
 """
 
 from dataclasses import dataclass
