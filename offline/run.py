@@ -13,6 +13,7 @@ from calib.camera_model import CameraModel, read_camera_yaml
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
+from onboard.log_head import camera_from_message
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
 
@@ -316,7 +317,7 @@ def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> Came
     calibration, size = collected.calibration, collected.picture_size
     camera, source = given, "the camera file given with --robot"
     if camera is None and calibration is not None:
-        camera, source = _camera_from_message(calibration), "/camera/calibration"
+        camera, source = camera_from_message(calibration), "/camera/calibration"
     if camera is None and collected.sightings:
         raise OfflineError(
             f"{log}: tags were detected but /camera/calibration has 0 messages; "
@@ -329,18 +330,3 @@ def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> Came
             "or give the right file with --robot"
         )
     return camera
-
-
-def _camera_from_message(message: CameraCalibration) -> CameraModel:
-    K = message.K
-    return CameraModel(
-        name=message.frame_id,
-        width_px=message.width,
-        height_px=message.height,
-        fx_px=K[0],
-        fy_px=K[4],
-        cx_px=K[2],
-        cy_px=K[5],
-        distortion_model=message.distortion_model,
-        distortion=tuple(message.D),
-    )
