@@ -45,6 +45,13 @@ def map_logs(
     for i, log in enumerate(logs):
         progress("reading", i, len(logs))
         runs.append(load_run(log, robot_files))
+    recorded = {run.robot_id for run in runs}
+    for robot_id in robot_files or {}:
+        if robot_id not in recorded:
+            raise OfflineError(
+                f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
+                "give the file of one of these robots"
+            )
     return map_runs(runs, noise or NoiseParameters(), progress)
 
 

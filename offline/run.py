@@ -216,9 +216,7 @@ def _encoder_stretches(readings: list[tuple[int, int, int, int]], robot: Robot) 
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
-    wheels = robot.wheels
-    m_per_tick_left = 2.0 * np.pi * wheels.radius_left_m / wheels.ticks_per_turn
-    m_per_tick_right = 2.0 * np.pi * wheels.radius_right_m / wheels.ticks_per_turn
+    m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
     stretches: list[WheelTrack] = []
     warnings: list[str] = []
     for part in np.split(table, cuts):
