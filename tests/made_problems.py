@@ -1,0 +1,109 @@
+"""Small estimation problems with every kind of factor, whose truth is known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import IntArray
+from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
+from offline.solver import Problem
+
+# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags.
+CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005])
+WHEELS, MOUNT, BATCHES = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8])
+CHAINS = (9, 7)  # poses in each
+N_TAGS = 6
+
+
+@dataclass(frozen=True)
+class MadeProblem:
+    """A problem and the state its measurements are of."""
+
+    problem: Problem
+    truth: State
+
+
+def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_calibration: bool = False) -> MadeProblem:
+    """Two chains past six tags; readings polar and cartesian, about a mounted camera and about base.
+
+    Args:
+        seed: of everything.
+        noise: measurements are off by this many of their sigmas.
+        n_outliers: readings that are metres off.
+        true_calibration: robots and tags are what their files say.
+    """
+    rng = np.random.default_rng(seed)
+    n_poses = sum(CHAINS)
+    poses = [np.zeros(3)]
+    first = []
+    for chain, length in enumerate(CHAINS):
+        if chain:
+            poses.append(np.array([2.0, -1.0, 2.5]))
+        for _ in range(length - 1):
+            first.append(len(poses) - 1)
+            poses.append(se2.compose(poses[-1], [rng.uniform(0.2, 0.6), rng.normal(0, 0.02), rng.normal(0, 0.4)]))
+    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else rng.standard_normal(9))
+    truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
+    problem = Problem(
+        odometry=_odometry(truth, np.array(first), noise, rng),
+        readings=_readings(truth, noise, n_outliers, rng),
+        prior=CalibrationPrior(CALIBRATION_SIGMA),
+        columns=made_columns(n_poses),
+        anchor=rng.integers(0, n_poses, N_TAGS),
+    )
+    return MadeProblem(problem, truth)
+
+
+def made_columns(n_poses: int) -> Columns:
+    """Poses, tags, calibration; the first pose and the first calibration number are held."""
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    n = 3 * n_poses - 3
+    tags = n + np.arange(2 * N_TAGS).reshape(N_TAGS, 2)
+    calibration = np.r_[-1, n + 2 * N_TAGS + np.arange(8)]
+    return Columns(poses, tags, calibration, n + 2 * N_TAGS + 8)
+
+
+def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> State:
+    """A state near another one, or just anywhere: headings round the circle, calibration of several percent."""
+    rng = np.random.default_rng(seed)
+    n_poses = sum(CHAINS)
+    if near is None:
+        poses = np.column_stack([rng.uniform(-5, 5, (n_poses, 2)), rng.uniform(-np.pi, np.pi, n_poses)])
+        return State(poses, rng.uniform(-5, 5, (N_TAGS, 2)), np.r_[0.0, 0.05 * rng.standard_normal(8)])
+    poses = se2.compose(near.poses, se2.exp(spread * rng.standard_normal((n_poses, 3))))
+    poses[0] = near.poses[0]
+    tags = near.tags + spread * rng.standard_normal((N_TAGS, 2))
+    return State(poses, tags, np.r_[0.0, 0.1 * spread * rng.standard_normal(8)])
+
+
+def _odometry(truth: State, first: IntArray, noise: float, rng: np.random.Generator) -> OdometryFactors:
+    n = len(first)
+    root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
+    covariance = root @ root.swapaxes(-1, -2)
+    jacobian = 0.4 * rng.standard_normal((n, 3, 3))
+    moved = se2.between(truth.poses[first], truth.poses[first + 1])
+    error = noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 3)))
+    by_calibration = np.einsum("nij,j->ni", jacobian, truth.calibration[WHEELS])
+    motion = se2.compose(se2.compose(moved, se2.exp(error)), se2.inverse(se2.exp(by_calibration)))
+    return OdometryFactors(first, motion, whitening(covariance), jacobian, np.tile(WHEELS, (n, 1)))
+
+
+def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Generator) -> ReadingFactors:
+    n_poses = len(truth.poses)
+    pose, tag = (index.reshape(-1) for index in np.mgrid[0:n_poses, 0:N_TAGS])
+    n = len(pose)
+    polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.5
+    mount = np.where(mounted[:, None], [0.2, -0.1, 0.3], 0.0)
+    mount_parameters = np.where(mounted[:, None], MOUNT, 0)
+    scale_parameter = np.where(rng.random(n) < 0.8, BATCHES[tag % 2], 0)
+    root = 0.05 * (np.eye(2) + 0.3 * rng.standard_normal((n, 2, 2)))
+    sensor = se2.compose(truth.poses[pose], mount + truth.calibration[mount_parameters])
+    place = se2.apply(se2.inverse(sensor), truth.tags[tag]) / (1 + truth.calibration[scale_parameter])[:, None]
+    as_polar = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
+    value = np.where(polar[:, None], as_polar, place)
+    value += noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
+    value[rng.choice(n, n_outliers, replace=False)] += 3.0
+    covariance = root @ root.swapaxes(-1, -2)
+    return ReadingFactors(pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter)
