@@ -146,7 +146,7 @@ def _readings(
     )
     keyframe = _keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
-    imported = read_positions(
+    imported, more_warnings = read_positions(
         Positions(
             positions.stamps_ns[kept],
             positions.tag[kept],
@@ -158,7 +158,7 @@ def _readings(
         keyframe[kept],
         noise,
     )
-    return joined(from_corners, imported), warnings
+    return joined(from_corners, imported), warnings + more_warnings
 
 
 def _keyframe_at(wanted_ns: IntArray, stamps_ns: IntArray, keyframe_of: IntArray) -> IntArray:
