@@ -69,6 +69,11 @@ def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:
         chain = _chain(name, run, track, noise)
         where = f"{name}: " if several else f"{run.name}: "
         chains.append(replace(chain, warnings=tuple(where + warning for warning in chain.warnings)))
+    lost = sorted(set(run.tags) - {tag for chain in chains for tag in chain.tags})
+    if lost:
+        names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
+        warning = f"{run.name}: tag {names} was detected, but no reading of it can be used; this run does not place it"
+        chains[0] = replace(chains[0], warnings=(*chains[0].warnings, warning))
     return chains
 
 
