@@ -14,9 +14,10 @@ from offline.run import Detections, Positions, Run, TagKey
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
 KEYFRAME_DISTANCE_M: Final = 0.04
 KEYFRAME_TURN_RAD: Final = np.radians(2.0)
-# it is one more look from the same standing pose when it has moved less than this.
-_STANDING_DISTANCE_M: Final = 0.002
-_STANDING_TURN_RAD: Final = np.radians(0.1)
+# it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
+# look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
+_STANDING_TICKS: Final = 1.5
+_STANDING_M: Final = 1e-7  # rounding
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,12 @@ def _choose_keyframes(
     left_m, right_m = track.at(stamps_ns)
     distance_m, turn_rad = 0.5 * (left_m + right_m), (right_m - left_m) / track_m
     keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
+    standing_m = _STANDING_TICKS * track.quantum_m + _STANDING_M
     chosen: list[int] = []
     for i, (distance, turn) in enumerate(zip(distance_m.tolist(), turn_rad.tolist(), strict=True)):
         moved_m = abs(distance - distance_m[chosen[-1]]) if chosen else np.inf
         turned_rad = abs(turn - turn_rad[chosen[-1]]) if chosen else np.inf
-        standing = moved_m <= _STANDING_DISTANCE_M and turned_rad <= _STANDING_TURN_RAD
+        standing = moved_m + 0.5 * track_m * turned_rad <= standing_m  # the wheel that moved more
         moved = moved_m >= KEYFRAME_DISTANCE_M or turned_rad >= KEYFRAME_TURN_RAD
         if moved or (not standing and tags_at[i] - tags_at[chosen[-1]]):
             chosen.append(i)
