@@ -139,7 +139,7 @@ def test_edges_lie_to_hundredths_of_a_pixel_where_geometry_has_them() -> None:
 
 def test_a_tag_is_seen_from_its_front_and_in_line_of_sight_only() -> None:
     front = WorldTag(tag_id=1, position_m=[2.0, 0.4, 0.4], yaw_deg=180.0)
-    back = WorldTag(tag_id=2, position_m=[2.0, -0.3, 0.4], yaw_deg=0.0)
+    back = WorldTag(tag_id=2, position_m=[2.0, -0.6, 0.4], yaw_deg=0.0)
     behind_box = WorldTag(tag_id=3, position_m=[2.5, 0.0, 0.4], yaw_deg=180.0)
     above_box = WorldTag(tag_id=4, position_m=[2.5, 0.05, 0.9], yaw_deg=180.0)
     box = Box(centre_m=[1.5, 0.0], size_m=[0.2, 0.3, 0.5])
