@@ -28,10 +28,12 @@ _LEAST_VARIANCE: Final = 1e-12
 # More than this share of readings left out is worth a sentence.
 MAX_SHARE_LEFT_OUT: Final = 0.05
 _UPRIGHT_DOF: Final = 2
+_MEDIAN_CHI2: Final = float(2.0 * np.log(2.0))  # of two degrees of freedom
 _FALSE_ALARM: Final = 1e-6
-# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its fellows is
-# said to hang askew.
-_ASKEW_FACTOR: Final = 4.0
+# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its own general
+# pose, which has as many degrees of freedom, is said to hang askew. A camera whose roll is a degree off stays below it;
+# a tag that leans by half a right angle and is seen from a few metres does not.
+_ASKEW_FACTOR: Final = 2.5
 
 
 @dataclass(frozen=True)
@@ -99,10 +101,14 @@ def read_detections(
     sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
     rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
     found = upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px)
-    askew, spoilt = _judged(tag, found.chi2)
+    doubted = np.isin(tag, _doubted(tag, found.chi2))
+    general = found.replaced(
+        doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, noise.sigma_corner_px)
+    )
+    askew = _askew(tag, found.chi2, general.chi2, doubted)
     is_askew = np.isin(tag, askew)
-    general = general_readings(corners_px[is_askew], sides_m[is_askew], camera, rotation, noise.sigma_corner_px)
-    found = found.replaced(is_askew, general)
+    spoilt = _spoilt(found.chi2, is_askew)
+    found = found.replaced(is_askew, general.where(is_askew))
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in askew
@@ -210,19 +216,35 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
                 )
 
 
-def _judged(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, BoolArray]:
-    """From the upright model's residuals: the tags that hang askew, and (M,) the readings of others that are spoilt."""
-    n_tags = int(tag.max()) + 1
-    # Capped, so that one spoilt picture does not speak for its tag.
+def _mean_chi2(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, FloatArray]:
+    """(T,) readings of each tag, and their mean per degree of freedom; capped: one spoilt picture counts little."""
     capped = np.where(np.isfinite(chi2), np.minimum(chi2, 100.0), 100.0)
-    count = np.bincount(tag, minlength=n_tags)
+    count = np.bincount(tag)
+    return count, np.bincount(tag, capped) / (_UPRIGHT_DOF * np.maximum(count, 1))
+
+
+def _doubted(tag: IntArray, chi2: FloatArray) -> IntArray:
+    """Tags that the upright model does not explain."""
+    count, mean = _mean_chi2(tag, chi2)
     dof = _UPRIGHT_DOF * np.maximum(count, 1)
-    mean = np.bincount(tag, capped, n_tags) / dof
-    level = max(1.0, float(np.median(mean[count > 0])))
-    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof) * level
-    askew = np.flatnonzero((count > 0) & (mean > limit))
-    spoilt = ~np.isin(tag, askew) & ~(chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM))
-    return askew, spoilt
+    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof)
+    return np.flatnonzero((count > 0) & (mean > limit))
+
+
+def _askew(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, doubted: BoolArray) -> IntArray:
+    """Those of the doubted tags that hanging askew explains far better: bad corners alone spoil both poses."""
+    if not doubted.any():
+        return np.zeros(0, dtype=np.int64)
+    _, upright = _mean_chi2(tag[doubted], upright_chi2[doubted])
+    _, general = _mean_chi2(tag[doubted], general_chi2[doubted])
+    return np.flatnonzero(upright > _ASKEW_FACTOR * np.maximum(general, 1.0))
+
+
+def _spoilt(upright_chi2: FloatArray, is_askew: BoolArray) -> BoolArray:
+    """(M,) readings of upright tags whose corners no tag has, by the level of the run's residuals."""
+    finite = upright_chi2[np.isfinite(upright_chi2) & ~is_askew]
+    level = max(1.0, float(np.median(finite)) / _MEDIAN_CHI2) if len(finite) else 1.0
+    return np.asarray(~is_askew & ~(upright_chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM)))
 
 
 def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

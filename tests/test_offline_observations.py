@@ -101,6 +101,19 @@ def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
     assert (np.sqrt(upright.covariance[:, 0, 0]) < 0.03 * upright.value[:, 0]).all()
 
 
+def test_where_all_tags_hang_askew_all_are_said() -> None:
+    """None of them can serve as an example of how tags hang here: on a ceiling, say."""
+    ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]
+    readings, warnings = read_many(ceiling)
+    assert len(warnings) == 4
+    assert all("does not hang upright" in warning for warning in warnings)
+    assert (np.sqrt(readings.covariance[:, 0, 0]) > 0.05 * readings.value[:, 0]).all()
+
+
+def test_a_detector_three_times_as_noisy_makes_no_tag_askew() -> None:
+    assert not any("upright" in warning for warning in read_many(UPRIGHT, n=30, sigma_px=0.6)[1])
+
+
 def test_upright_tags_are_never_called_askew() -> None:
     for seed in range(20):
         assert read_many(UPRIGHT, n=15, seed=seed)[1] == []
