@@ -226,6 +226,22 @@ def test_a_map_is_replaced_only_when_told_so(map_to: Map, logs: dict[str, Path],
     assert len(read_map(tmp_path / "out").runs) == 2
 
 
+def test_a_disk_that_is_full_leaves_everything_as_it_was(
+    map_to: Map, refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert map_to(logs["a"]).code == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+
+    def full(_result: object, path: Path) -> None:
+        path.write_bytes(b"half a pic")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("offline.map_command.write_picture", full)
+    assert "No space left on device" in refused(logs["b"], "--overwrite")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    assert "No space left on device" in refused(logs["b"], output=tmp_path / "new")
+
+
 def test_odometry_that_is_no_number(refused: Callable[..., str], tmp_path: Path) -> None:
     for i, value in enumerate((np.nan, np.inf, 1e300)):
         log = imported_log(tmp_path / "logs" / str(i), odometry_m=value)
