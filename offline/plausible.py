@@ -1,4 +1,4 @@
-"""Refuses wheel readings that no robot can have given, before they become a map of nonsense."""
+"""Refuses names and wheel readings that no robot can have given, before they become a map of nonsense."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -11,7 +11,21 @@ from offline.errors import OfflineError
 # Beyond these, numbers come from broken files or wrong units, not from a robot.
 _LARGEST: Final = 1e7
 _FASTEST_M_S: Final = 100.0
+_LONGEST_NAME: Final = 100
 _BURST_M: Final = 1.0  # stamps may be crowded where readings came in bursts
+
+
+def check_file_name(value: str, where: str) -> None:
+    """Looks for names that no file could have, or only one somewhere else.
+
+    Raises:
+        OfflineError: naming the value and the limit.
+    """
+    if not value.isprintable() or not 1 <= len(value) <= _LONGEST_NAME or value[0] == "." or set(value) & set("/\\"):
+        raise OfflineError(
+            f"{where} is {value[: _LONGEST_NAME + 1]!r}, but file names are made of it: 1 to {_LONGEST_NAME} printable "
+            "characters without slashes, the first no dot; record or import the run again under another name"
+        )
 
 
 def check_numbers(columns: Mapping[str, FloatArray], where: str) -> None:

@@ -14,7 +14,7 @@ from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
-from offline.plausible import check_numbers, check_speed
+from offline.plausible import check_file_name, check_numbers, check_speed
 from onboard.log_head import camera_from_message
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
@@ -177,6 +177,8 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     info = collected.info
     if info is None:
         raise OfflineError(f"{log}: no /run message, so whose run it is cannot be told; is it a groundsbot log?")
+    check_file_name(info.robot_id, f"{log}: /run: robot_id")
+    check_file_name(info.run_id, f"{log}: /run: run_id")
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = _stretches(collected, robot, log)

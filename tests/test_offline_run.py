@@ -243,6 +243,14 @@ def test_a_robot_that_cannot_be_is_refused_with_its_field(tmp_path: Path) -> Non
     assert "-0.15" in text
 
 
+@pytest.mark.parametrize("name", ["", "../../home", "a/b", "a\\b", ".hidden", "two\nlines", "x" * 101])
+def test_names_that_lead_out_of_the_output_folder_are_refused(tmp_path: Path, name: str) -> None:
+    for field, run_id, robot_id in (("run_id", name, "fine"), ("robot_id", "fine", name)):
+        info = RunInfo(run_id=run_id, robot_id=robot_id, robot_yaml=ROBOT.model_dump_json())
+        text = refusal(write_log(tmp_path / field, TWO_READINGS, {"/run": info}))
+        assert f"/run: {field} is" in text
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
 @pytest.mark.parametrize("kind", ["wheels", "pose"])
 def test_odometry_that_is_no_number_is_refused(tmp_path: Path, value: float, kind: str) -> None:
