@@ -1,9 +1,8 @@
 """`map` as a person meets it: what it says, what it leaves behind, and one line for whatever stands in the way."""
 
 import json
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +11,13 @@ from google.protobuf.message import Message
 
 from calib.camera_model import write_camera_yaml
 from calib.robot import write_robot_yaml
-from offline import cli
 from offline.map_io import read_map
 from onboard.log_head import log_head
 from onboard.log_reader import read_log
 from onboard.log_writer import LogWriter
 from onboard.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations, WheelEncoders
 from tests.made_drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
+from tests.programs import Outcome, Run
 
 TAGS = [
     MadeTag(0, (6.0, 1.0, 0.5), np.pi),
@@ -31,33 +30,18 @@ AHEAD = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
 DRIVES = {"a": made_drive([0.0, 0.0, 0.2], AHEAD), "b": made_drive([0.5, 1.0, -0.1], AHEAD)}
 
 
-@dataclass(frozen=True)
-class Outcome:
-    code: int
-    out: str
-    err: str
-
-
-Map = Callable[..., Outcome]
-
-
 @pytest.fixture
-def map_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Map:
-    """`groundsbot-offline map ARGUMENTS -o OUT`, as the program."""
+def map_to(run: Run, tmp_path: Path) -> Run:
+    """`groundsbot-offline map ARGUMENTS -o OUT`."""
 
     def call(*arguments: object, output: Path | None = None) -> Outcome:
-        out = output or tmp_path / "out"
-        monkeypatch.setattr(sys, "argv", ["groundsbot-offline", "map", *map(str, arguments), "-o", str(out)])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        captured = capsys.readouterr()
-        return Outcome(int(caught.value.code or 0), captured.out, captured.err)
+        return run("map", *arguments, "-o", output or tmp_path / "out")
 
     return call
 
 
 @pytest.fixture
-def refused(map_to: Map, tmp_path: Path) -> Callable[..., str]:
+def refused(map_to: Run, tmp_path: Path) -> Callable[..., str]:
     """The one line of a refusal that leaves nothing behind."""
 
     def call(*arguments: object, output: Path | None = None) -> str:
@@ -95,7 +79,7 @@ def rewritten(
     return copy
 
 
-def test_two_logs_become_one_map(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     outcome = map_to(logs["a"], logs["b"])
     assert (outcome.code, outcome.err) == (0, "")
     for part in ("a_one: ", "4 of 4 shared tags fit", "start of a_one to start of b_one: 1.118 m", "4 tags in one map"):
@@ -105,13 +89,13 @@ def test_two_logs_become_one_map(map_to: Map, logs: dict[str, Path], tmp_path: P
     assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
 
 
-def test_a_folder_of_runs_is_several_logs(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     outcome = map_to(tmp_path / "logs", "--json")
     assert outcome.code == 0
     assert [run["run"] for run in json.loads(outcome.out)["runs"]] == ["a_one", "b_one"]
 
 
-def test_several_components_end_with_exit_3_and_the_reason(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
     alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
     outcome = map_to(logs["a"], logs["b"], alone)
@@ -120,7 +104,7 @@ def test_several_components_end_with_exit_3_and_the_reason(map_to: Map, logs: di
     assert len(read_map(tmp_path / "out").components) == 2
 
 
-def test_recordings_are_left_alone(map_to: Map, logs: dict[str, Path]) -> None:
+def test_recordings_are_left_alone(map_to: Run, logs: dict[str, Path]) -> None:
     files = sorted(path for log in logs.values() for path in log.iterdir())
     before = [path.read_bytes() for path in files]
     map_to(*logs.values())
@@ -203,7 +187,7 @@ def test_the_same_run_twice(refused: Callable[..., str], logs: dict[str, Path], 
 
 
 def test_an_output_folder_that_is_not_empty(
-    refused: Callable[..., str], map_to: Map, logs: dict[str, Path], tmp_path: Path
+    refused: Callable[..., str], map_to: Run, logs: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -218,7 +202,7 @@ def test_an_output_folder_that_is_not_empty(
     assert "recordings stay" in refused(logs["a"], output=logs["a"])
 
 
-def test_a_map_is_replaced_only_when_told_so(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_map_is_replaced_only_when_told_so(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     assert map_to(logs["a"]).code == 0
     assert map_to(logs["a"], logs["b"]).code == 1
     assert len(read_map(tmp_path / "out").runs) == 1
@@ -227,7 +211,7 @@ def test_a_map_is_replaced_only_when_told_so(map_to: Map, logs: dict[str, Path],
 
 
 def test_a_disk_that_is_full_leaves_everything_as_it_was(
-    map_to: Map, refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    map_to: Run, refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert map_to(logs["a"]).code == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
@@ -281,7 +265,7 @@ def imported_log(folder: Path, odometry_m: float = 0.2, place_m: float = 3.0) ->
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-def test_tag_places_that_are_no_number_are_left_out(map_to: Map, tmp_path: Path, value: float) -> None:
+def test_tag_places_that_are_no_number_are_left_out(map_to: Run, tmp_path: Path, value: float) -> None:
     outcome = map_to(imported_log(tmp_path / "logs", place_m=value))
     assert outcome.code == 0
     assert "2 of 10 tag positions left out" in outcome.out
@@ -289,7 +273,7 @@ def test_tag_places_that_are_no_number_are_left_out(map_to: Map, tmp_path: Path,
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_corners_that_are_no_number_are_left_out(
-    map_to: Map, logs: dict[str, Path], tmp_path: Path, value: float
+    map_to: Run, logs: dict[str, Path], tmp_path: Path, value: float
 ) -> None:
     def spoil(message: Message) -> object:
         if isinstance(message, TagDetections):
@@ -305,7 +289,7 @@ def test_corners_that_are_no_number_are_left_out(
     assert tags[3].runs == ("b_one",)
 
 
-def test_a_run_that_never_moves(map_to: Map, tmp_path: Path) -> None:
+def test_a_run_that_never_moves(map_to: Run, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "logs", made_drive([0.0, 0.0, 0.2], [(0.0, 0.0, 5.0)]), TAGS, made_robot("a"))
     outcome = map_to(log)
     assert outcome.code == 0
@@ -318,7 +302,7 @@ def test_a_run_that_never_moves(map_to: Map, tmp_path: Path) -> None:
         np.testing.assert_allclose(tag.position_m, turned @ [x_m, y_m], atol=1e-4)
 
 
-def test_a_log_with_a_single_wheel_reading_and_nothing_else(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_log_with_a_single_wheel_reading_and_nothing_else(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     def first_only(message: Message) -> object:
         if isinstance(message, WheelEncoders):
             return message.stamp_ns == START_NS
@@ -330,7 +314,7 @@ def test_a_log_with_a_single_wheel_reading_and_nothing_else(map_to: Map, logs: d
     assert "never moves" in outcome.out
 
 
-def test_a_run_with_a_single_tag(map_to: Map, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_run_with_a_single_tag(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     log = write_drive(tmp_path / "single", DRIVES["b"], TAGS[:1], made_robot("s"))
     outcome = map_to(logs["a"], log)
     assert outcome.code == 3
@@ -338,7 +322,7 @@ def test_a_run_with_a_single_tag(map_to: Map, logs: dict[str, Path], tmp_path: P
     assert "shares only one tag with a_one" in outcome.out
 
 
-def test_tags_on_a_ceiling(map_to: Map, tmp_path: Path) -> None:
+def test_tags_on_a_ceiling(map_to: Run, tmp_path: Path) -> None:
     """A camera that looks up; the tags lie flat above it."""
     mount = {"x_m": 0.2, "y_m": 0.0, "z_m": 0.4, "pitch_rad": -0.7}
     ceiling = [MadeTag(i, (2.0 + 0.8 * i, 0.5 * (-1) ** i, 2.6), 0.3 * i, -np.pi / 2) for i in range(5)]
@@ -354,7 +338,7 @@ def test_tags_on_a_ceiling(map_to: Map, tmp_path: Path) -> None:
         assert np.linalg.norm(error_m) < 0.15
 
 
-def test_a_tag_that_another_robot_carries_about(map_to: Map, tmp_path: Path) -> None:
+def test_a_tag_that_another_robot_carries_about(map_to: Run, tmp_path: Path) -> None:
     """Tag 9 sits on a robot: it was in one place in the first drive, and moves in the second."""
     still = MadeTag(9, (4.0, 0.0, 0.3), np.pi)
     log_a = write_drive(tmp_path / "logs", DRIVES["a"], [*TAGS, still], made_robot("a"))
@@ -383,7 +367,7 @@ def spliced(parts: list[Path], folder: Path) -> Path:
     return log
 
 
-def test_two_families_in_one_log(map_to: Map, tmp_path: Path) -> None:
+def test_two_families_in_one_log(map_to: Run, tmp_path: Path) -> None:
     """The same id in both is two tags."""
     both = [*TAGS, MadeTag(0, (6.0, 0.2, 0.7), np.pi, size_m=0.1, family="tag25h9")]
     small = {"family": "tag25h9", "default_size_m": 0.1, "batch": "small"}
