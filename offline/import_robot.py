@@ -100,7 +100,8 @@ def describe_robot(folder: Path, options: ImportOptions, in_camera: bool) -> tup
         data = read_robot_yaml(options.robot).model_dump()
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
     else:
-        data, said = _bare_robot(folder, options), "robot.yaml made from the options; tag size and wheel radii unknown"
+        unknown = "tag size unknown" if options.wheel_radius_m is not None else "tag size and wheel radii unknown"
+        data, said = _bare_robot(folder, options), f"robot.yaml made from the options; {unknown}"
     if options.robot_id is not None:
         data["robot_id"] = options.robot_id
     _apply_wheels(data["wheels"], options)
@@ -153,6 +154,7 @@ def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
     ):
         if given is not None:
             mount[field] = given
+            mount.pop(f"{field}_sigma", None)  # that of another value
         elif options.robot is None:
             mount[field], mount[f"{field}_sigma"] = 0.0, sigma
             assumed.append(said)

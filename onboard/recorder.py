@@ -324,6 +324,8 @@ class RecorderCore:
             self._write_reading(each)
         self._write_waiting(now_ns + _WAIT_FOR_WHEELS_NS)
         self._report_wheels(now_ns)
+        if self._silent and not self.counts["/wheels"]:
+            self.losses["recording without a single wheel reading"] += 1
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._writer.close()

@@ -114,7 +114,7 @@ def test_ticks_become_metres_from_zero_on(tmp_path: Path) -> None:
 def test_wheels_and_mount_come_from_robot_yaml_and_options_win(tmp_path: Path) -> None:
     robot_yaml = tmp_path / "robot.yaml"
     wheels_section = {"radius_left_m": 0.1, "radius_right_m": 0.2, "track_m": 0.4, "ticks_per_turn": 100}
-    mount = {"x_m": 0.3, "yaw_rad": 0.1, "yaw_rad_sigma": 0.001}
+    mount = {"x_m": 0.3, "y_m": 0.2, "y_m_sigma": 0.0001, "yaw_rad": 0.1, "yaw_rad_sigma": 0.001}
     tags = [{"family": "tag36h11", "default_size_m": 0.15, "sizes_m": {5: 0.2}}]
     robot_yaml.write_text(yaml.safe_dump({"robot_id": "carl", "wheels": wheels_section, "mount": mount, "tags": tags}))
     odometry = "t_s,left_ticks,right_ticks\n0,0,0\n1,100,100\n"
@@ -127,6 +127,7 @@ def test_wheels_and_mount_come_from_robot_yaml_and_options_win(tmp_path: Path) -
     assert robot.wheels.track_m == 0.45
     assert robot.wheels.track_m_sigma == pytest.approx(0.0045)  # a sigma belongs to its value
     assert (robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad, robot.mount.yaw_rad_sigma) == (0.3, -0.05, 0.1, 1e-3)
+    assert robot.mount.y_m_sigma == pytest.approx(0.005)
     assert robot.tag_size_m("tag36h11", 5)[0] == 0.2
 
 

@@ -24,6 +24,7 @@ recorder: {picture_rate_hz: PICTURES}
 CAMERA = CameraModel("front", 64, 48, 60.0, 61.0, 31.5, 23.5, "plumb_bob", (0.1, 0.0, 0.0, 0.0, 0.0))
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000
+S = 1_000_000_000
 TAG = Detection("tag36h11", 4, 0, 55.5, np.array([[1.25, 2.0], [9.0, 2.5], [9.5, 9.0], [1.0, 8.75]]))
 
 
@@ -201,3 +202,10 @@ def test_a_run_is_never_written_over(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="exists already"):
         make_core(tmp_path)
     assert sorted(each.name for each in (tmp_path / "run1").iterdir()) == ["0000.core.mcap"]
+
+
+def test_a_recording_to_which_the_wheels_never_spoke_has_lost_something(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    core.tick(START_NS + 4 * S)
+    core.close(START_NS + 4 * S)
+    assert core.losses == {"recording without a single wheel reading": 1}
