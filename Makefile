@@ -23,7 +23,7 @@ demo: $(READY)
 	$(BIN)/python -m fixtures demo --output $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m "not study"
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

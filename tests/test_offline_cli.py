@@ -1,8 +1,6 @@
 """groundsbot-offline as a person meets it: text, JSON, exit codes."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -100,17 +98,3 @@ def test_compare_without_a_map_is_one_line_and_exit_1(run: Run, truth_file: Path
     assert outcome.code == 1
     assert "map.json: cannot be read" in outcome.err
     assert run("compare", tmp_path).code == 2  # wrong usage
-
-
-@pytest.mark.parametrize("command", [[], ["import"], ["info"], ["compare"]])
-def test_help_loads_nothing_heavy(command: list[str]) -> None:
-    code = (
-        "import sys; sys.argv = ['groundsbot-offline', *sys.argv[1:]]\n"
-        "from offline.cli import main\n"
-        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = {'numpy', 'cv2', 'scipy', 'numba', 'matplotlib'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, *command, "-h"], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "Usage" in done.stdout

@@ -19,8 +19,8 @@ from offline.importers import ImportReport, import_folder
 from onboard.log_reader import LogMessage, read_log
 from onboard.log_writer import LogWriter
 from onboard.messages import PlanarOdometry, RunInfo, TagObservations
+from tests.recordings import RECORDINGS, needs_recordings
 
-RECORDINGS = Path(__file__).parents[2] / "shared" / "data" / "nsh_first_floor"
 TRACK = ImportOptions(track_width_m=0.5)
 PAPER = ImportOptions(track_width_m=0.508, state_rate_hz=4.2)
 ODOMETRY = "t_s,left_m_s,right_m_s\n0,0,0\n1,1,1\n2,0.5,1\n"
@@ -362,7 +362,7 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     assert not (tmp_path / "logs").exists()
 
 
-@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"the paper's recordings are not at {RECORDINGS}")
+@needs_recordings
 def test_the_papers_recordings_are_imported_whole(tmp_path: Path) -> None:
     reports = {name: import_folder(RECORDINGS / name, tmp_path, PAPER) for name in ("hallway", "loop")}
     counts = {name: (r.n_odometry, r.n_observations, r.n_tags) for name, r in reports.items()}

@@ -8,14 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from offline.cli import app
+from tests.recordings import RECORDINGS, needs_recordings
 
 ROOT = Path(__file__).parents[1]
-RECORDINGS = ROOT.parent / "shared" / "data" / "nsh_first_floor"
 MEASURED_BY_HAND_M = 38.05
 
-pytestmark = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason=f"the paper's recordings carry no licence and are not at {RECORDINGS}"
-)
+pytestmark = needs_recordings
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-HEAVY = ("numpy", "cv2", "scipy", "numba")
+HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf")
 COMMANDS = [
     ("onboard.cli",),
     ("onboard.cli", "record"),
