@@ -299,7 +299,7 @@ def _tags_in_nodes(
             here, seen = node_of[reading_pose[m], level], reading_tag[m]
             if here >= 0 and last_seen[seen] != here:
                 last_seen[seen] = here
-                if home[seen] != here:
+                if home[seen] > here:
                     node[n_found], tag[n_found] = here, seen
                     n_found += 1
     return node[:n_found].copy(), tag[:n_found].copy()
