@@ -19,6 +19,7 @@ from offline.arrowhead_tree import Tree, build_tree
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import Free, Odometry, Readings, Values
 from offline.robust import SQUARES, Loss
+from offline.starting_pass import starting_pass
 
 _CONDITION_STEPS: Final = 12
 
@@ -63,6 +64,28 @@ class Arrowhead:
         total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
         total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
         return system, 0.5 * total
+
+    def moved(self, state: State, step: FloatArray, anchor: IntArray) -> State:
+        """The state after a step in the arrowhead's order; tags move along with their anchor poses (T,)."""
+        tree = self.tree
+        values = Values(state.poses, state.tags, state.calibration)
+        out = Values(np.empty_like(state.poses), np.empty_like(state.tags), state.calibration.copy())
+        linearise_kernels.moved(values, step, anchor, out)
+        is_free = self.free.calibration >= 0
+        out.calibration[is_free] += step[len(step) - tree.n_calibration :]
+        return State(*out)
+
+    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
+        """Poses and tags from one pass in order of time.
+
+        Args:
+            state: its calibration counts, and the pose at the start of each chain.
+            start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
+        """
+        values = Values(state.poses, state.tags, state.calibration)
+        out = Values(np.empty_like(state.poses), np.empty_like(state.tags), np.empty_like(state.calibration))
+        starting_pass(self.tree, self.odometry, self.readings, values, np.square(start_sigma), out)
+        return State(*out)
 
     def empty_system(self) -> System:
         """Blocks without values."""

@@ -258,3 +258,46 @@ def _right_jacobian_inverse(x: float, y: float, omega: float, out: FloatArray) -
     out[0, 0], out[0, 1], out[0, 2] = cotangent, -half, half * moved_y - cotangent * moved_x
     out[1, 0], out[1, 1], out[1, 2] = half, cotangent, -half * moved_x - cotangent * moved_y
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
+@jitted
+def moved(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
+    """`solver.Problem.moved` with a step in the arrowhead's order; calibration apart."""
+    n_poses = len(values.poses)
+    for pose in range(n_poses):
+        d0, d1, omega = step[3 * pose], step[3 * pose + 1], step[3 * pose + 2]
+        along, even, _ = _series(omega)
+        across = omega * even
+        x, y = along * d0 - across * d1, across * d0 + along * d1
+        cos, sin = np.cos(values.poses[pose, 2]), np.sin(values.poses[pose, 2])
+        out.poses[pose, 0] = values.poses[pose, 0] + cos * x - sin * y
+        out.poses[pose, 1] = values.poses[pose, 1] + sin * x + cos * y
+        out.poses[pose, 2] = _wrapped(values.poses[pose, 2] + omega)
+    for tag in range(len(values.tags)):
+        pose, column = anchor[tag], 3 * n_poses + 2 * tag
+        before, after = values.poses[pose], out.poses[pose]
+        cos, sin = np.cos(before[2]), np.sin(before[2])
+        dx, dy = values.tags[tag, 0] - before[0], values.tags[tag, 1] - before[1]
+        x, y = cos * dx + sin * dy, cos * dy - sin * dx
+        own_x = cos * step[column] + sin * step[column + 1] - (step[3 * pose] - step[3 * pose + 2] * y)
+        own_y = cos * step[column + 1] - sin * step[column] - (step[3 * pose + 1] + step[3 * pose + 2] * x)
+        x, y = x + own_x, y + own_y
+        cos, sin = np.cos(after[2]), np.sin(after[2])
+        out.tags[tag, 0] = after[0] + cos * x - sin * y
+        out.tags[tag, 1] = after[1] + sin * x + cos * y
+
+
+@jitted
+def diagonal_square(system: System, step: FloatArray) -> float:
+    """step^T diag(H) step."""
+    total = 0.0
+    n_poses, n_tags = len(system.pose), len(system.tag)
+    for pose in range(n_poses):
+        for i in range(3):
+            total += system.pose[pose, i, i] * step[3 * pose + i] ** 2
+    for tag in range(n_tags):
+        for i in range(2):
+            total += system.tag[tag, i, i] * step[3 * n_poses + 2 * tag + i] ** 2
+    for a in range(len(system.calibration)):
+        total += system.calibration[a, a] * step[3 * n_poses + 2 * n_tags + a] ** 2
+    return total
