@@ -154,7 +154,11 @@ class Solution:
 
 
 def solve(
-    problem: Problem, start: State, cost_tolerance: float = COST_TOLERANCE, losses: Losses = DEFAULT_LOSSES
+    problem: Problem,
+    start: State,
+    cost_tolerance: float = COST_TOLERANCE,
+    losses: Losses = DEFAULT_LOSSES,
+    relative_tolerance: float = _COST_ROUNDING,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -163,6 +167,7 @@ def solve(
         start: values to begin from.
         cost_tolerance: stop where the next step would lower the cost by less.
         losses: of each kind of factor.
+        relative_tolerance: or by less than this share.
     """
     arrowhead = problem.arrowhead
     spare, rows = arrowhead.empty_system(), arrowhead.empty_rows()
@@ -182,7 +187,7 @@ def solve(
             untied = error.column if damping == 0.0 else untied
         else:
             expected = _expected_decrease(system, step, damping)
-            if expected <= cost_tolerance + _COST_ROUNDING * cost:
+            if expected <= cost_tolerance + relative_tolerance * cost:
                 return ended("converged", converged=True)
             candidate = arrowhead.moved(state, step, problem.anchor)
             spare, candidate_cost = arrowhead.linearise(candidate, *losses, out=spare)
