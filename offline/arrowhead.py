@@ -59,10 +59,11 @@ class Arrowhead:
         """
         system = out if out is not None else self.empty_system()
         values = Values(state.poses, state.tags, state.calibration)
-        linearise_kernels.clear(system, self.free)
+        linearise_kernels.clear(system)
         total = linearise_kernels.add_odometry(self.odometry, odometry_loss, values, self.free, system)
         total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
         total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
+        linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
         return system, 0.5 * total
 
     def moved(self, state: State, step: FloatArray, anchor: IntArray) -> State:
@@ -234,7 +235,13 @@ def build_arrowhead(
     return Arrowhead(
         tree=tree,
         odometry=Odometry(
-            *_contiguous(odometry.first, odometry.motion, odometry.whitening, odometry.jacobian, odometry.parameters),
+            *_contiguous(
+                odometry.first,
+                odometry.motion,
+                odometry.whitening.swapaxes(-1, -2) @ odometry.whitening,
+                odometry.jacobian,
+                odometry.parameters,
+            ),
             slots=slot[users[0][0][:, None], users[0][1]],
         ),
         readings=Readings(

@@ -39,7 +39,7 @@ class Odometry(NamedTuple):
 
     first: IntArray
     motion: FloatArray
-    whitening: FloatArray
+    information: FloatArray
     jacobian: FloatArray
     parameters: IntArray
     slots: IntArray
@@ -59,133 +59,191 @@ class Readings(NamedTuple):
 
 
 @jitted
-def clear(system: System, free: Free) -> None:
-    """All zero, ones on the diagonal where something is held."""
-    for array in (system.pose, system.pose_next, system.pose_calibration, system.pose_tag):
-        array[:] = 0.0
-    for array in (system.tag, system.tag_calibration):
-        array[:] = 0.0
+def clear(system: System) -> None:
+    """All zero, but for what is overwritten anyway."""
+    for blocks in (system.pose, system.pose_next, system.pose_calibration, system.tag, system.tag_calibration):
+        blocks[:] = 0.0
     system.calibration[:] = 0.0
     system.gradient[:] = 0.0
-    for pose in range(len(free.poses)):
+
+
+@jitted
+def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: System) -> None:
+    """What is held gets a one on the diagonal and nothing else: its step is zero."""
+    n_poses = len(free.poses)
+    for pose in range(n_poses):
         for i in range(3):
-            system.pose[pose, i, i] = 1.0 - free.poses[pose, i]
+            if free.poses[pose, i] == 0.0:
+                system.pose[pose, i, :] = 0.0
+                system.pose[pose, :, i] = 0.0
+                system.pose[pose, i, i] = 1.0
+                system.pose_next[pose, i, :] = 0.0
+                if pose:
+                    system.pose_next[pose - 1, :, i] = 0.0
+                system.pose_calibration[pose, i, :] = 0.0
+                system.gradient[3 * pose + i] = 0.0
     for tag in range(len(free.tags)):
         for i in range(2):
-            system.tag[tag, i, i] = 1.0 - free.tags[tag, i]
+            if free.tags[tag, i] == 0.0:
+                system.tag[tag, i, :] = 0.0
+                system.tag[tag, :, i] = 0.0
+                system.tag[tag, i, i] = 1.0
+                system.tag_calibration[tag, i, :] = 0.0
+                system.gradient[3 * n_poses + 2 * tag + i] = 0.0
+    for m in range(len(reading_pose)):
+        for i in range(3):
+            for j in range(2):
+                system.pose_tag[m, i, j] *= free.poses[reading_pose[m], i] * free.tags[reading_tag[m], j]
 
 
 @jitted
 def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, system: System) -> float:
-    """Adds all odometry factors to the blocks; returns the sum of their losses."""
-    # Whitened residual, and derivatives by both poses and the wheel parameters, side by side.
-    r, J = np.empty(3), np.empty((3, 9))
-    scratch = np.empty((5, 3, 3))
+    """Adds all odometry factors to the blocks; returns the sum of their losses.
+
+    With e = log(M(c)^-1 o T_i^-1 o T_j) and L its information: J_j = Jr^-1(e) and J_i = -J_j A with A the adjoint of
+    T_j^-1 o T_i, so that H_jj = J_j^T L J_j, H_ij = -A^T H_jj, H_ii = A^T H_jj A, g_j = J_j^T L e, g_i = -A^T g_j.
+    """
+    scratch = np.empty((6, 3, 3))
     total = 0.0
     for m in range(len(odometry.first)):
         first = odometry.first[m]
-        _odometry_factor(odometry, m, values, free, r, J, scratch)
-        rho, weight = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        K = odometry.jacobian[m]
+        c0, c1, c2 = (
+            values.calibration[odometry.parameters[m, 0]],
+            values.calibration[odometry.parameters[m, 1]],
+            values.calibration[odometry.parameters[m, 2]],
+        )
+        t0, t1, t2 = 0.0, 0.0, 0.0
+        if c0 != 0.0 or c1 != 0.0 or c2 != 0.0:
+            t0 = K[0, 0] * c0 + K[0, 1] * c1 + K[0, 2] * c2
+            t1 = K[1, 0] * c0 + K[1, 1] * c1 + K[1, 2] * c2
+            t2 = K[2, 0] * c0 + K[2, 1] * c1 + K[2, 2] * c2
+        moved = _between(values.poses[first], values.poses[first + 1])
+        e0, e1, e2 = _error(odometry.motion[m], t0, t1, t2, moved)
+        # S L S: lengths are divided by 1 + wheel_scale.
+        s, L = 1.0 / (1.0 + c0), odometry.information[m]
+        l00, l01, l11 = s * s * L[0, 0], s * s * L[0, 1], s * s * L[1, 1]
+        l02, l12, l22 = s * L[0, 2], s * L[1, 2], L[2, 2]
+        f0, f1, f2 = l00 * e0 + l01 * e1 + l02 * e2, l01 * e0 + l11 * e1 + l12 * e2, l02 * e0 + l12 * e1 + l22 * e2
+        rho, w = loss_and_weight(loss, e0 * f0 + e1 * f1 + e2 * f2)
         total += rho
-        for i in range(3):
-            for j in range(i, 3):
-                h_first = weight * _dot3(J, i, J, j)
-                h_second = weight * _dot3(J, 3 + i, J, 3 + j)
-                system.pose[first, i, j] += h_first
-                system.pose[first + 1, i, j] += h_second
-                if i != j:
-                    system.pose[first, j, i] += h_first
-                    system.pose[first + 1, j, i] += h_second
-            for j in range(3):
-                system.pose_next[first, i, j] += weight * _dot3(J, i, J, 3 + j)
-            system.gradient[3 * first + i] += weight * (J[0, i] * r[0] + J[1, i] * r[1] + J[2, i] * r[2])
-            system.gradient[3 * first + 3 + i] += weight * (
-                J[0, 3 + i] * r[0] + J[1, 3 + i] * r[1] + J[2, 3 + i] * r[2]
-            )
-        if system.pose_calibration.shape[2]:
-            _add_wheels(odometry, m, weight, free, r, J, system)
+        a, b, p, q = _right_jacobian_inverse(e0, e1, e2)  # rows (a, -b, p), (b, a, q), (0, 0, 1)
+        m00, m01, m02 = w * (a * l00 + b * l01), w * (a * l01 + b * l11), w * (a * l02 + b * l12)
+        m10, m11, m12 = w * (a * l01 - b * l00), w * (a * l11 - b * l01), w * (a * l12 - b * l02)
+        m20 = w * (p * l00 + q * l01 + l02)
+        m21 = w * (p * l01 + q * l11 + l12)
+        m22 = w * (p * l02 + q * l12 + l22)
+        h00, h01, h02 = m00 * a + m01 * b, m01 * a - m00 * b, m00 * p + m01 * q + m02
+        h11, h12, h22 = m11 * a - m10 * b, m10 * p + m11 * q + m12, m20 * p + m21 * q + m22
+        cos, sin = np.cos(moved[2]), np.sin(moved[2])
+        x, y = -cos * moved[0] - sin * moved[1], sin * moved[0] - cos * moved[1]
+        # B = H_jj A, rows of A (cos, sin, y), (-sin, cos, -x), (0, 0, 1)
+        b00, b01, b02 = h00 * cos - h01 * sin, h00 * sin + h01 * cos, h00 * y - h01 * x + h02
+        b10, b11, b12 = h01 * cos - h11 * sin, h01 * sin + h11 * cos, h01 * y - h11 * x + h12
+        b20, b21, b22 = h02 * cos - h12 * sin, h02 * sin + h12 * cos, h02 * y - h12 * x + h22
+        H, N = system.pose[first], system.pose_next[first]
+        a01, a02, a12 = cos * b01 - sin * b11, cos * b02 - sin * b12, sin * b02 + cos * b12
+        H[0, 0] += cos * b00 - sin * b10
+        H[0, 1] += a01
+        H[0, 2] += a02
+        H[1, 0] += a01
+        H[1, 1] += sin * b01 + cos * b11
+        H[1, 2] += a12
+        H[2, 0] += a02
+        H[2, 1] += a12
+        H[2, 2] += y * b02 - x * b12 + b22
+        N[0, 0], N[0, 1], N[0, 2] = -b00, -b10, -b20
+        N[1, 0], N[1, 1], N[1, 2] = -b01, -b11, -b21
+        N[2, 0], N[2, 1], N[2, 2] = -b02, -b12, -b22
+        H = system.pose[first + 1]
+        H[0, 0] += h00
+        H[0, 1] += h01
+        H[0, 2] += h02
+        H[1, 0] += h01
+        H[1, 1] += h11
+        H[1, 2] += h12
+        H[2, 0] += h02
+        H[2, 1] += h12
+        H[2, 2] += h22
+        g0, g1, g2 = w * (a * f0 + b * f1), w * (a * f1 - b * f0), w * (p * f0 + q * f1 + f2)
+        g = system.gradient
+        g[3 * first + 3] += g0
+        g[3 * first + 4] += g1
+        g[3 * first + 5] += g2
+        g[3 * first] -= cos * g0 - sin * g1
+        g[3 * first + 1] -= sin * g0 + cos * g1
+        g[3 * first + 2] -= y * g0 - x * g1 + g2
+        if odometry.slots[m, 0] >= 0 or odometry.slots[m, 1] >= 0 or odometry.slots[m, 2] >= 0:
+            M, L, A, f = scratch[0], scratch[1], scratch[2], scratch[3, 0]
+            M[0, 0], M[0, 1], M[0, 2] = m00, m01, m02
+            M[1, 0], M[1, 1], M[1, 2] = m10, m11, m12
+            M[2, 0], M[2, 1], M[2, 2] = m20, m21, m22
+            L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2] = w * l00, w * l01, w * l02, w * l11, w * l12, w * l22
+            L[1, 0], L[2, 0], L[2, 1] = L[0, 1], L[0, 2], L[1, 2]
+            A[0, 0], A[0, 1], A[0, 2] = cos, sin, y
+            A[1, 0], A[1, 1], A[1, 2] = -sin, cos, -x
+            A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, 1.0
+            f[0], f[1], f[2] = w * f0, w * f1, w * f2
+            _by_wheels(K, t0, t1, t2, e0, e1, e2, s, scratch[4], scratch[5])
+            _add_wheels(odometry, m, free, scratch, system)
     return total
 
 
 @jitted
-def _dot3(A: FloatArray, i: int, B: FloatArray, j: int) -> float:
-    """Column i of A times column j of B."""
-    return A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
+def _by_wheels(
+    K: FloatArray,
+    t0: float,
+    t1: float,
+    t2: float,
+    e0: float,
+    e1: float,
+    e2: float,
+    s: float,
+    C: FloatArray,
+    product: FloatArray,
+) -> None:
+    """C <- S^-1 d(S e)/dc: log(exp(-(t + dt)) o G) with t = K c, the change enters on the left."""
+    along, even, odd = _series(t2)
+    across = t2 * even
+    p, q = odd * t0 - even * t1, even * t0 + odd * t1
+    for j in range(3):
+        product[0, j] = along * K[0, j] + across * K[1, j] + p * K[2, j]
+        product[1, j] = along * K[1, j] - across * K[0, j] + q * K[2, j]
+        product[2, j] = K[2, j]
+    a, b, p, q = _right_jacobian_inverse(-e0, -e1, -e2)
+    for j in range(3):
+        C[0, j] = -(a * product[0, j] - b * product[1, j] + p * product[2, j])
+        C[1, j] = -(b * product[0, j] + a * product[1, j] + q * product[2, j])
+        C[2, j] = -product[2, j]
+    C[0, 0] -= e0 * s
+    C[1, 0] -= e1 * s
 
 
 @jitted
-def _add_wheels(
-    odometry: Odometry, m: int, weight: float, free: Free, r: FloatArray, J: FloatArray, system: System
-) -> None:
+def _add_wheels(odometry: Odometry, m: int, free: Free, scratch: FloatArray, system: System) -> None:
+    """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for what is free of the wheel parameters."""
+    M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
     first, base = odometry.first[m], len(system.gradient) - len(system.calibration)
-    for a in range(3):
-        slot, column = odometry.slots[m, a], free.calibration[odometry.parameters[m, a]]
+    for k in range(3):
+        slot, column = odometry.slots[m, k], free.calibration[odometry.parameters[m, k]]
         if slot < 0:
             continue
+        v0 = M[0, 0] * C[0, k] + M[0, 1] * C[1, k] + M[0, 2] * C[2, k]
+        v1 = M[1, 0] * C[0, k] + M[1, 1] * C[1, k] + M[1, 2] * C[2, k]
+        v2 = M[2, 0] * C[0, k] + M[2, 1] * C[1, k] + M[2, 2] * C[2, k]
+        system.pose_calibration[first + 1, 0, slot] += v0
+        system.pose_calibration[first + 1, 1, slot] += v1
+        system.pose_calibration[first + 1, 2, slot] += v2
         for i in range(3):
-            system.pose_calibration[first, i, slot] += weight * _dot3(J, i, J, 6 + a)
-            system.pose_calibration[first + 1, i, slot] += weight * _dot3(J, 3 + i, J, 6 + a)
-        for b in range(3):
-            other = free.calibration[odometry.parameters[m, b]]
-            if other >= 0:
-                system.calibration[column, other] += weight * _dot3(J, 6 + a, J, 6 + b)
-        system.gradient[base + column] += weight * (J[0, 6 + a] * r[0] + J[1, 6 + a] * r[1] + J[2, 6 + a] * r[2])
-
-
-@jitted
-def _odometry_factor(
-    odometry: Odometry, m: int, values: Values, free: Free, r: FloatArray, J: FloatArray, scratch: FloatArray
-) -> None:
-    """r = W S(c) log(M(c)^-1 o T_i^-1 o T_j) and its derivatives; see `factors.OdometryFactors`."""
-    first = odometry.first[m]
-    outer, jr, by_second, adjoint, by_twist = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
-    c0, c1, c2 = (
-        values.calibration[odometry.parameters[m, 0]],
-        values.calibration[odometry.parameters[m, 1]],
-        values.calibration[odometry.parameters[m, 2]],
-    )
-    K, W = odometry.jacobian[m], odometry.whitening[m]
-    scale = 1.0 + c0
-    for i in range(3):
-        outer[i, 0], outer[i, 1], outer[i, 2] = W[i, 0] / scale, W[i, 1] / scale, W[i, 2]
-    moved = _between(values.poses[first], values.poses[first + 1])
-    t0 = K[0, 0] * c0 + K[0, 1] * c1 + K[0, 2] * c2
-    t1 = K[1, 0] * c0 + K[1, 1] * c1 + K[1, 2] * c2
-    t2 = K[2, 0] * c0 + K[2, 1] * c1 + K[2, 2] * c2
-    error = _error(odometry.motion[m], t0, t1, t2, moved)
-    for i in range(3):
-        r[i] = outer[i, 0] * error[0] + outer[i, 1] * error[1] + outer[i, 2] * error[2]
-    _right_jacobian_inverse(error[0], error[1], error[2], jr)
-    _product(outer, jr, by_second, 1.0)
-    # Adjoint of moved^-1.
-    cos, sin = np.cos(moved[2]), np.sin(moved[2])
-    x, y = -cos * moved[0] - sin * moved[1], sin * moved[0] - cos * moved[1]
-    adjoint[0, 0], adjoint[0, 1], adjoint[0, 2] = cos, sin, y
-    adjoint[1, 0], adjoint[1, 1], adjoint[1, 2] = -sin, cos, -x
-    adjoint[2, 0], adjoint[2, 1], adjoint[2, 2] = 0.0, 0.0, 1.0
-    _product(by_second, adjoint, J[:, 0:3], -1.0)
-    J[:, 3:6] = by_second
-    for i in range(3):
-        for j in range(3):
-            J[i, j] *= free.poses[first, j]
-            J[i, 3 + j] *= free.poses[first + 1, j]
-    if odometry.slots[m, 0] < 0 and odometry.slots[m, 1] < 0 and odometry.slots[m, 2] < 0:
-        return
-    # log(exp(-(t + dt)) o G) with t = K c: the change enters on the left.
-    _right_jacobian_inverse(-error[0], -error[1], -error[2], jr)
-    _product(outer, jr, by_twist, -1.0)
-    _right_jacobian(t0, t1, t2, jr)
-    _product(by_twist, jr, adjoint, 1.0)
-    _product(adjoint, K, J[:, 6:9], 1.0)
-    for i in range(3):
-        J[i, 6] -= (outer[i, 0] * error[0] + outer[i, 1] * error[1]) / scale
-
-
-@jitted
-def _product(A: FloatArray, B: FloatArray, out: FloatArray, sign: float) -> None:
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = sign * (A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j])
+            system.pose_calibration[first, i, slot] -= A[0, i] * v0 + A[1, i] * v1 + A[2, i] * v2
+        u0 = L[0, 0] * C[0, k] + L[0, 1] * C[1, k] + L[0, 2] * C[2, k]
+        u1 = L[1, 0] * C[0, k] + L[1, 1] * C[1, k] + L[1, 2] * C[2, k]
+        u2 = L[2, 0] * C[0, k] + L[2, 1] * C[1, k] + L[2, 2] * C[2, k]
+        for other in range(3):
+            row = free.calibration[odometry.parameters[m, other]]
+            if row >= 0:
+                system.calibration[row, column] += C[0, other] * u0 + C[1, other] * u1 + C[2, other] * u2
+        system.gradient[base + column] += C[0, k] * f[0] + C[1, k] * f[1] + C[2, k] * f[2]
 
 
 @jitted
@@ -242,22 +300,12 @@ def _series(omega: float) -> tuple[float, float, float]:
 
 
 @jitted
-def _right_jacobian(x: float, y: float, omega: float, out: FloatArray) -> None:
-    along, even, odd = _series(omega)
-    across = omega * even
-    out[0, 0], out[0, 1], out[0, 2] = along, across, odd * x - even * y
-    out[1, 0], out[1, 1], out[1, 2] = -across, along, even * x + odd * y
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
-
-
-@jitted
-def _right_jacobian_inverse(x: float, y: float, omega: float, out: FloatArray) -> None:
+def _right_jacobian_inverse(x: float, y: float, omega: float) -> tuple[float, float, float, float]:
+    """(a, b, p, q) of the matrix with rows (a, -b, p), (b, a, q), (0, 0, 1)."""
     half, cotangent = 0.5 * omega, _half_angle_cotangent(omega)
     _, even, odd = _series(omega)
     moved_x, moved_y = odd * x - even * y, even * x + odd * y
-    out[0, 0], out[0, 1], out[0, 2] = cotangent, -half, half * moved_y - cotangent * moved_x
-    out[1, 0], out[1, 1], out[1, 2] = half, cotangent, -half * moved_x - cotangent * moved_y
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+    return cotangent, half, half * moved_y - cotangent * moved_x, -half * moved_x - cotangent * moved_y
 
 
 @jitted

@@ -11,28 +11,48 @@ from offline.robust import Loss, loss_and_weight
 
 @jitted
 def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, system: System) -> float:
-    """Adds all tag readings to the blocks; returns the sum of their losses."""
-    # Whitened residual, and derivatives by pose, tag, mount and tag scale, side by side.
+    """Adds all tag readings to the blocks; returns the sum of their losses.
+
+    The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
+    whitened derivative of the reading by the tag's place in the sensor.
+    """
     r, J = np.empty(2), np.empty((2, 9))
-    total = 0.0
+    total, g = 0.0, system.gradient
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
-        _reading_factor(readings, m, values, free, r, J)
-        rho, weight = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
+        _reading_factor(readings, m, values, r, J)
+        rho, w = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
         total += rho
+        a0, a1, a2, b0, b1, b2 = J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2]
+        c0, c1, d0, d1 = J[0, 3], J[0, 4], J[1, 3], J[1, 4]
+        r0, r1 = w * r[0], w * r[1]
+        H, N, T = system.pose[pose], system.pose_tag[m], system.tag[tag]
+        h01, h02, h12 = w * (a0 * a1 + b0 * b1), w * (a0 * a2 + b0 * b2), w * (a1 * a2 + b1 * b2)
+        H[0, 0] += w * (a0 * a0 + b0 * b0)
+        H[0, 1] += h01
+        H[0, 2] += h02
+        H[1, 0] += h01
+        H[1, 1] += w * (a1 * a1 + b1 * b1)
+        H[1, 2] += h12
+        H[2, 0] += h02
+        H[2, 1] += h12
+        H[2, 2] += w * (a2 * a2 + b2 * b2)
+        N[0, 0], N[0, 1] = w * (a0 * c0 + b0 * d0), w * (a0 * c1 + b0 * d1)
+        N[1, 0], N[1, 1] = w * (a1 * c0 + b1 * d0), w * (a1 * c1 + b1 * d1)
+        N[2, 0], N[2, 1] = w * (a2 * c0 + b2 * d0), w * (a2 * c1 + b2 * d1)
+        t01 = w * (c0 * c1 + d0 * d1)
+        T[0, 0] += w * (c0 * c0 + d0 * d0)
+        T[0, 1] += t01
+        T[1, 0] += t01
+        T[1, 1] += w * (c1 * c1 + d1 * d1)
+        g[3 * pose] += a0 * r0 + b0 * r1
+        g[3 * pose + 1] += a1 * r0 + b1 * r1
+        g[3 * pose + 2] += a2 * r0 + b2 * r1
         first_tag = 3 * len(values.poses) + 2 * tag
-        for i in range(3):
-            for j in range(3):
-                system.pose[pose, i, j] += weight * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
-            for j in range(2):
-                system.pose_tag[m, i, j] = weight * (J[0, i] * J[0, 3 + j] + J[1, i] * J[1, 3 + j])
-            system.gradient[3 * pose + i] += weight * (J[0, i] * r[0] + J[1, i] * r[1])
-        for i in range(2):
-            for j in range(2):
-                system.tag[tag, i, j] += weight * (J[0, 3 + i] * J[0, 3 + j] + J[1, 3 + i] * J[1, 3 + j])
-            system.gradient[first_tag + i] += weight * (J[0, 3 + i] * r[0] + J[1, 3 + i] * r[1])
+        g[first_tag] += c0 * r0 + d0 * r1
+        g[first_tag + 1] += c1 * r0 + d1 * r1
         if system.pose_calibration.shape[2]:
-            _add_mount_and_scale(readings, m, weight, free, r, J, system)
+            _add_mount_and_scale(readings, m, w, free, r, J, system)
     return total
 
 
@@ -59,7 +79,7 @@ def _add_mount_and_scale(
 
 
 @jitted
-def _reading_factor(readings: Readings, m: int, values: Values, free: Free, r: FloatArray, J: FloatArray) -> None:
+def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J: FloatArray) -> None:
     """r = W (predicted - read) and its derivatives; see `factors.ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
     theta = values.poses[pose, 2]
@@ -98,10 +118,6 @@ def _reading_factor(readings: Readings, m: int, values: Values, free: Free, r: F
         J[i, 3], J[i, 4] = bx * cos - by * sin, bx * sin + by * cos
         J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
         J[i, 8] = -(a * x + b * y) / scale
-        for j in range(3):
-            J[i, j] *= free.poses[pose, j]
-        for j in range(2):
-            J[i, 3 + j] *= free.tags[tag, j]
 
 
 @jitted

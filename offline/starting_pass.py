@@ -67,8 +67,8 @@ def starting_pass(
 def _predict(
     odometry: Odometry, m: int, values: Values, before: FloatArray, after: FloatArray, P: FloatArray, scratch: FloatArray
 ) -> None:
-    """T <- T o M(c); P <- Ad P Ad^T + (W^T W)^-1, Ad that of M^-1."""
-    K, W = odometry.jacobian[m], odometry.whitening[m]
+    """T <- T o M(c); P <- Ad P Ad^T + L^-1, Ad that of M^-1, L its information."""
+    K = odometry.jacobian[m]
     motion = odometry.motion[m].copy()
     for i in range(3):
         for a in range(3):
@@ -84,13 +84,12 @@ def _predict(
     adjoint[1, 0], adjoint[1, 1], adjoint[1, 2] = -sin, cos, cos * motion[0] + sin * motion[1]
     adjoint[2, 0], adjoint[2, 1], adjoint[2, 2] = 0.0, 0.0, 1.0
     _times(adjoint, P, product)
-    _inverse(W, noise)
+    _inverse(odometry.information[m], noise)
     for i in range(3):
         for j in range(3):
-            total = 0.0
+            P[i, j] = noise[i, j]
             for k in range(3):
-                total += product[i, k] * adjoint[j, k] + noise[i, k] * noise[j, k]
-            P[i, j] = total
+                P[i, j] += product[i, k] * adjoint[j, k]
 
 
 @jitted

@@ -79,7 +79,7 @@ def gtsam(fleet: Fleet, start: State) -> tuple[float, float, int, State]:
     """Levenberg-Marquardt as it comes."""
     import gtsam as library
 
-    graph, values = _gtsam_graph(fleet.problem, library), _gtsam_values(start, library)
+    graph, values = _gtsam_graph(fleet.problem, start.poses[0], library), _gtsam_values(start, library)
     began = time.perf_counter()
     optimizer = library.LevenbergMarquardtOptimizer(graph, values, library.LevenbergMarquardtParams())
     result = optimizer.optimize()
@@ -91,11 +91,11 @@ def gtsam(fleet: Fleet, start: State) -> tuple[float, float, int, State]:
     return seconds, each, optimizer.iterations(), State(poses, tags, start.calibration)
 
 
-def _gtsam_graph(problem: Problem, library: Any) -> Any:  # its bindings carry no types
+def _gtsam_graph(problem: Problem, held: FloatArray, library: Any) -> Any:  # its bindings carry no types
     graph = library.NonlinearFactorGraph()
     n_poses = len(problem.columns.poses)
     hold = library.noiseModel.Isotropic.Sigma(3, 1e-6)
-    graph.add(library.PriorFactorPose2(0, library.Pose2(0.0, 0.0, 0.0), hold))
+    graph.add(library.PriorFactorPose2(0, library.Pose2(*held), hold))
     odometry, readings = problem.odometry, problem.readings
     for i, motion, W in zip(odometry.first.tolist(), odometry.motion, odometry.whitening, strict=True):
         noise = library.noiseModel.Gaussian.Information(W.T @ W)
@@ -110,7 +110,6 @@ def _gtsam_graph(problem: Problem, library: Any) -> Any:  # its bindings carry n
 
 
 def _gtsam_values(start: State, library: Any) -> Any:
-    # The frame is held at the first start: all is taken relative to it, and what is held lies at zero.
     values = library.Values()
     for i, pose in enumerate(start.poses):
         values.insert(i, library.Pose2(*pose))
