@@ -5,7 +5,7 @@ Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissec
 `arrowhead_tree`.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from offline.robust import SQUARES, Loss
 from offline.starting_pass import starting_pass
 
 _CONDITION_STEPS: Final = 12
+_RELAXED_STEPS: Final = 2
 
 
 class UnderDeterminedError(ValueError):
@@ -37,12 +38,14 @@ class Arrowhead:
     """What stays the same from step to step: factors in the order of poses, and the order of elimination.
 
     Attributes:
+        relaxed: the readings as places (x, y), whatever form they were read in: nearly linear in the poses.
         tangent: (n,) column of the arrowhead for each column of the tangent vector.
     """
 
     tree: Tree
     odometry: Odometry
     readings: Readings
+    relaxed: Readings
     prior_sigma: FloatArray
     free: Free
     tangent: IntArray
@@ -76,17 +79,28 @@ class Arrowhead:
         out.calibration[is_free] += step[len(step) - tree.n_calibration :]
         return State(*out)
 
-    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
-        """Poses and tags from one pass in order of time.
+    def starting_values(self, state: State, start_sigma: FloatArray, anchor: IntArray) -> State:
+        """Poses and tags from one pass in order of time, and Gauss-Newton steps on the relaxed readings.
+
+        Range and bearing are far from linear where a start is metres off; places are not.
 
         Args:
             state: its calibration counts, and the pose at the start of each chain.
             start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
+            anchor: (T,) the pose that each tag moves along with.
+
+        Raises:
+            UnderDeterminedError: something is not tied down.
         """
         values = Values(state.poses, state.tags, state.calibration)
         out = Values(np.empty_like(state.poses), np.empty_like(state.tags), np.empty_like(state.calibration))
         starting_pass(self.tree, self.odometry, self.readings, values, np.square(start_sigma), out)
-        return State(*out)
+        found, relaxed = State(*out), replace(self, readings=self.relaxed)
+        system, rows = self.empty_system(), self.empty_rows()
+        for _ in range(_RELAXED_STEPS):
+            relaxed.linearise(found, out=system)
+            found = self.moved(found, -self.factorise(system, out=rows).solve_in_order(system.gradient), anchor)
+        return found
 
     def empty_system(self) -> System:
         """Blocks without values."""
@@ -232,6 +246,15 @@ def build_arrowhead(
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
     slots = [np.flatnonzero(own) for own in uses]
     tree = build_tree(chain_start, pose, tag, n_tags, slots, int(is_free.sum()))
+    sorted_readings = Readings(
+        pose,
+        tag,
+        *_contiguous(
+            readings.value[order], readings.polar[order], readings.whitening[order], readings.mount[order]
+        ),
+        parameters=reading_parameters,
+        slots=slot[users[1][0][:, None], users[1][1]],
+    )
     return Arrowhead(
         tree=tree,
         odometry=Odometry(
@@ -244,15 +267,8 @@ def build_arrowhead(
             ),
             slots=slot[users[0][0][:, None], users[0][1]],
         ),
-        readings=Readings(
-            pose,
-            tag,
-            *_contiguous(
-                readings.value[order], readings.polar[order], readings.whitening[order], readings.mount[order]
-            ),
-            parameters=reading_parameters,
-            slots=slot[users[1][0][:, None], users[1][1]],
-        ),
+        readings=sorted_readings,
+        relaxed=_relaxed(sorted_readings),
         prior_sigma=prior.sigma,
         free=free,
         tangent=_tangent_order(columns),
@@ -261,6 +277,19 @@ def build_arrowhead(
 
 def _contiguous(*arrays: FloatArray | IntArray) -> list[FloatArray | IntArray]:
     return [np.ascontiguousarray(array) for array in arrays]
+
+
+def _relaxed(readings: Readings) -> Readings:
+    """The same as places (x, y), with the covariance that the reading had there."""
+    x, y = readings.value.T
+    range_m, cos, sin = np.maximum(x, 1e-6), np.cos(y), np.sin(y)
+    by_place = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1) / range_m[:, None]], axis=-2)
+    polar = readings.polar[:, None]
+    return readings._replace(
+        value=np.where(polar, np.column_stack([x * cos, x * sin]), readings.value),
+        polar=np.zeros_like(readings.polar),
+        whitening=np.where(polar[..., None], readings.whitening @ by_place, readings.whitening),
+    )
 
 
 def _tangent_order(columns: Columns) -> IntArray:

@@ -31,6 +31,7 @@ _COST_ROUNDING: Final = 1e-14  # relative
 # Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
 # drive, so the first damping must be tiny to leave such modes free.
 _FIRST_DAMPING: Final = 1e-9
+_SURE: Final = 10.0
 _LEAST_DAMPING: Final = 1e-10  # below it a step is Gauss-Newton's
 
 
@@ -197,6 +198,9 @@ def solve(
             state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
             system, spare = spare, system
             costs.append(cost)
+            # What the quadratic model got wrong of this step bounds what another one could bring.
+            if damping == 0.0 and _SURE * expected * abs(1.0 - gain) <= cost_tolerance + relative_tolerance * cost:
+                return ended("converged", converged=True)
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > _LEAST_DAMPING else 0.0
             continue

@@ -44,7 +44,7 @@ def our_start(fleet: Fleet) -> State:
     """The pass in order of time, from dead reckoning."""
     sigma = np.tile(SIGMA_START, (fleet.n_robots, 1))
     sigma[0] = 1e-6  # held
-    return fleet.problem.arrowhead.starting_values(fleet.dead_reckoned, sigma)
+    return fleet.problem.arrowhead.starting_values(fleet.dead_reckoned, sigma, fleet.problem.anchor)
 
 
 def ours(fleet: Fleet) -> tuple[float, float, int, State]:
