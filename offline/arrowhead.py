@@ -88,9 +88,6 @@ class Arrowhead:
             state: its calibration counts, and the pose at the start of each chain.
             start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
             anchor: (T,) the pose that each tag moves along with.
-
-        Raises:
-            UnderDeterminedError: something is not tied down.
         """
         values = Values(state.poses, state.tags, state.calibration)
         out = Values(np.empty_like(state.poses), np.empty_like(state.tags), np.empty_like(state.calibration))
@@ -99,7 +96,11 @@ class Arrowhead:
         system, rows = self.empty_system(), self.empty_rows()
         for _ in range(_RELAXED_STEPS):
             relaxed.linearise(found, out=system)
-            found = self.moved(found, -self.factorise(system, out=rows).solve_in_order(system.gradient), anchor)
+            try:
+                step = -self.factorise(system, out=rows).solve_in_order(system.gradient)
+            except UnderDeterminedError:
+                break  # the pass alone has to do
+            found = self.moved(found, step, anchor)
         return found
 
     def empty_system(self) -> System:

@@ -59,11 +59,12 @@ class Problem:
     columns: Columns
     anchor: IntArray
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: State, *, robust: bool = True) -> float:
         """Half the sum of squared whitened residuals, Huber's loss on the readings."""
+        readings = self.readings.residual(state)
         return 0.5 * float(
             (self.odometry.residual(state) ** 2).sum()
-            + huber_loss(self.readings.residual(state)).sum()
+            + (huber_loss(readings) if robust else readings**2).sum()
             + (self.prior.residual(state) ** 2).sum()
         )
 
@@ -77,11 +78,12 @@ class Problem:
         """How many measured numbers there are, priors apart."""
         return self.odometry.motion.size + self.readings.value.size
 
-    def linearise(self, state: State) -> tuple[sparse.csc_array, FloatArray]:
+    def linearise(self, state: State, *, robust: bool = True) -> tuple[sparse.csc_array, FloatArray]:
         """H = J^T J (n, n) and g = J^T r (n,) at a state, the plain way: one sparse matrix."""
+        readings = self.readings.linearise(state, self.columns)
         kinds = (
             self.odometry.linearise(state, self.columns),
-            _reweighted(self.readings.linearise(state, self.columns)),
+            _reweighted(readings) if robust else readings,
             self.prior.linearise(state, self.columns),
         )
         jacobian, residual = _stacked(kinds, self.columns.n)

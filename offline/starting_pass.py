@@ -68,11 +68,11 @@ def _predict(
     odometry: Odometry, m: int, values: Values, before: FloatArray, after: FloatArray, P: FloatArray, scratch: FloatArray
 ) -> None:
     """T <- T o M(c); P <- Ad P Ad^T + L^-1, Ad that of M^-1, L its information."""
-    K = odometry.jacobian[m]
-    motion = odometry.motion[m].copy()
+    motion = scratch[3, 0]
     for i in range(3):
+        motion[i] = odometry.motion[m, i]
         for a in range(3):
-            motion[i] += K[i, a] * values.calibration[odometry.parameters[m, a]]
+            motion[i] += odometry.jacobian[m, i, a] * values.calibration[odometry.parameters[m, a]]
     cos, sin = np.cos(before[2]), np.sin(before[2])
     after[0] = before[0] + cos * motion[0] - sin * motion[1]
     after[1] = before[1] + sin * motion[0] + cos * motion[1]
@@ -148,7 +148,7 @@ def _read(
     scratch: FloatArray,
 ) -> None:
     """Fuses one reading into pose and tag, or places the tag."""
-    R, A, B, H, turned = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    R, A, B, H = scratch[0], scratch[1], scratch[2], scratch[3]
     read_x, read_y = _place_in_base(readings, m, values, R)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = read_x, read_y
@@ -157,22 +157,16 @@ def _read(
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
     H[0, 0], H[0, 1], H[0, 2] = -1.0, 0.0, y
     H[1, 0], H[1, 1], H[1, 2] = 0.0, -1.0, -x
-    _seen_from(H, P, A, 3)
-    turned[0, 0], turned[0, 1], turned[1, 0], turned[1, 1] = cos, -sin, sin, cos
+    _seen_from(H, P, A)
     if not is_known:
         tag[0], tag[1] = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
-        A[:2, :2] += R[:2, :2]
-        _seen_from(turned, A, V, 2)
+        _placed(A, R, cos, sin, V)
         return
-    B[0, 0], B[0, 1], B[1, 0], B[1, 1] = cos, sin, -sin, cos
-    H_tag = scratch[5]
-    H_tag[:2, :2] = B[:2, :2]
-    _seen_from(H_tag, V, B, 2)
+    _turned(cos, -sin, V, B)
     own, others = A[0, 0] + A[1, 1], B[0, 0] + B[1, 1]
     if others > _CLEARLY * (own + R[0, 0] + R[1, 1]):
         tag[0], tag[1] = pose[0] + cos * read_x - sin * read_y, pose[1] + sin * read_x + cos * read_y
-        A[:2, :2] += R[:2, :2]
-        _seen_from(turned, A, V, 2)
+        _placed(A, R, cos, sin, V)
     elif own > _CLEARLY * others:
         off_x, off_y = read_x - x, read_y - y
         a, b, d = A[0, 0] + B[0, 0] + R[0, 0], A[0, 1] + B[0, 1] + R[0, 1], A[1, 1] + B[1, 1] + R[1, 1]
@@ -186,15 +180,33 @@ def _read(
 
 
 @jitted
-def _seen_from(H: FloatArray, P: FloatArray, out: FloatArray, n: int) -> None:
-    """(2, 2) H P H^T with H (2, n)."""
+def _seen_from(H: FloatArray, P: FloatArray, out: FloatArray) -> None:
+    """(2, 2) H P H^T with H (2, 3), P symmetric."""
+    for i in range(2):
+        h0 = H[i, 0] * P[0, 0] + H[i, 1] * P[1, 0] + H[i, 2] * P[2, 0]
+        h1 = H[i, 0] * P[0, 1] + H[i, 1] * P[1, 1] + H[i, 2] * P[2, 1]
+        h2 = H[i, 0] * P[0, 2] + H[i, 1] * P[1, 2] + H[i, 2] * P[2, 2]
+        out[i, 0] = h0 * H[0, 0] + h1 * H[0, 1] + h2 * H[0, 2]
+        out[i, 1] = h0 * H[1, 0] + h1 * H[1, 1] + h2 * H[1, 2]
+
+
+@jitted
+def _turned(cos: float, sin: float, V: FloatArray, out: FloatArray) -> None:
+    """(2, 2) R V R^T with R the turn, V symmetric."""
+    a, b, d = V[0, 0], V[0, 1], V[1, 1]
+    out[0, 0] = cos * cos * a - 2.0 * cos * sin * b + sin * sin * d
+    out[0, 1] = cos * sin * (a - d) + (cos * cos - sin * sin) * b
+    out[1, 0] = out[0, 1]
+    out[1, 1] = sin * sin * a + 2.0 * cos * sin * b + cos * cos * d
+
+
+@jitted
+def _placed(A: FloatArray, R: FloatArray, cos: float, sin: float, V: FloatArray) -> None:
+    """The covariance in map of a tag that a pose has placed."""
     for i in range(2):
         for j in range(2):
-            total = 0.0
-            for k in range(n):
-                for other in range(n):
-                    total += H[i, k] * P[k, other] * H[j, other]
-            out[i, j] = total
+            A[i, j] += R[i, j]
+    _turned(cos, sin, A, V)
 
 
 @jitted

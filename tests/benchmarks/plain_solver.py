@@ -11,20 +11,20 @@ from offline.solver import Problem
 _MAX_ITERATIONS = 100
 
 
-def plain_solve(problem: Problem, start: State, cost_tolerance: float) -> tuple[State, int]:
+def plain_solve(problem: Problem, start: State, relative_tolerance: float) -> tuple[State, int]:
     """Gauss-Newton, damped tenfold more where the cost goes up and tenfold less where it goes down."""
-    state, cost, damping = start, problem.cost(start), 0.0
-    hessian, gradient = problem.linearise(state)
+    state, cost, damping = start, problem.cost(start, robust=False), 0.0
+    hessian, gradient = problem.linearise(state, robust=False)
     for iteration in range(1, _MAX_ITERATIONS + 1):
         step = plain_step(hessian, gradient, damping)
         expected = -0.5 * float(gradient @ step)
-        if expected <= cost_tolerance:
+        if expected <= relative_tolerance * cost:
             return state, iteration
         candidate = problem.moved(state, step)
-        candidate_cost = problem.cost(candidate)
+        candidate_cost = problem.cost(candidate, robust=False)
         if candidate_cost < cost:
             state, cost, damping = candidate, candidate_cost, 0.1 * damping if damping > 1e-9 else 0.0
-            hessian, gradient = problem.linearise(state)
+            hessian, gradient = problem.linearise(state, robust=False)
         else:
             damping = max(10.0 * damping, 1e-8)
     return state, _MAX_ITERATIONS
