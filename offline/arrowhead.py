@@ -6,6 +6,7 @@ Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissec
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,6 @@ from offline.robust import SQUARES, Loss
 from offline.starting_pass import starting_pass
 
 _CONDITION_STEPS: Final = 12
-_RELAXED_STEPS: Final = 2
 
 
 class UnderDeterminedError(ValueError):
@@ -79,29 +79,34 @@ class Arrowhead:
         out.calibration[is_free] += step[len(step) - tree.n_calibration :]
         return State(*out)
 
-    def starting_values(self, state: State, start_sigma: FloatArray, anchor: IntArray) -> State:
-        """Poses and tags from one pass in order of time, and Gauss-Newton steps on the relaxed readings.
-
-        Range and bearing are far from linear where a start is metres off; places are not.
+    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
+        """Poses and tags from one pass in order of time.
 
         Args:
             state: its calibration counts, and the pose at the start of each chain.
             start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
-            anchor: (T,) the pose that each tag moves along with.
         """
         values = Values(state.poses, state.tags, state.calibration)
         out = Values(np.empty_like(state.poses), np.empty_like(state.tags), np.empty_like(state.calibration))
         starting_pass(self.tree, self.odometry, self.readings, values, np.square(start_sigma), out)
-        found, relaxed = State(*out), replace(self, readings=self.relaxed)
-        system, rows = self.empty_system(), self.empty_rows()
-        for _ in range(_RELAXED_STEPS):
-            relaxed.linearise(found, out=system)
-            try:
-                step = -self.factorise(system, out=rows).solve_in_order(system.gradient)
-            except UnderDeterminedError:
-                break  # the pass alone has to do
-            found = self.moved(found, step, anchor)
-        return found
+        return State(*out)
+
+    def relaxed_step(self, state: State, anchor: IntArray) -> State:
+        """The state after a Gauss-Newton step on the relaxed readings.
+
+        Range and bearing are far from linear where a start is metres off; places are not.
+
+        Raises:
+            UnderDeterminedError: something is not tied down.
+        """
+        system, _, rows = self.scratch
+        replace(self, readings=self.relaxed).linearise(state, out=system)
+        return self.moved(state, -self.factorise(system, out=rows).solve_in_order(system.gradient), anchor)
+
+    @cached_property
+    def scratch(self) -> tuple[System, System, Rows]:
+        """Room for a solve, kept for the next one: memory that is new costs as much as filling it. For one at a time."""
+        return self.empty_system(), self.empty_system(), self.empty_rows()
 
     def empty_system(self) -> System:
         """Blocks without values."""
@@ -195,9 +200,7 @@ class Factorisation:
         free = np.flatnonzero(columns >= 0)
         wanted = self.arrowhead.tangent[columns[free]]
         covariance = np.zeros((len(columns), len(columns)))
-        covariance[np.ix_(free, free)] = joint_covariance(
-            self.arrowhead.tree, self.system, self.rows, self.top, wanted
-        )
+        covariance[np.ix_(free, free)] = joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
         return covariance
 
     def condition(self) -> float:
@@ -250,9 +253,7 @@ def build_arrowhead(
     sorted_readings = Readings(
         pose,
         tag,
-        *_contiguous(
-            readings.value[order], readings.polar[order], readings.whitening[order], readings.mount[order]
-        ),
+        *_contiguous(readings.value[order], readings.polar[order], readings.whitening[order], readings.mount[order]),
         parameters=reading_parameters,
         slots=slot[users[1][0][:, None], users[1][1]],
     )

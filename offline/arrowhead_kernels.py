@@ -494,7 +494,10 @@ def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
                     y[p + i] += system.pose_next[pose, i, j] * x[p + 3 + j]
                     y[p + 3 + j] += system.pose_next[pose, i, j] * x[p + i]
             for a in range(tree.slot_start[chain], tree.slot_start[chain + 1]):
-                c, value = 3 * n_poses + 2 * n_tags + tree.slots[a], system.pose_calibration[pose, i, a - tree.slot_start[chain]]
+                c, value = (
+                    3 * n_poses + 2 * n_tags + tree.slots[a],
+                    system.pose_calibration[pose, i, a - tree.slot_start[chain]],
+                )
                 y[p + i] += value * x[c]
                 y[c] += value * x[p + i]
             for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):

@@ -92,7 +92,12 @@ class _Pieces(NamedTuple):
 
 
 def build_tree(
-    chain_start: IntArray, reading_pose: IntArray, reading_tag: IntArray, n_tags: int, slots: list[IntArray], n_free: int
+    chain_start: IntArray,
+    reading_pose: IntArray,
+    reading_tag: IntArray,
+    n_tags: int,
+    slots: list[IntArray],
+    n_free: int,
 ) -> Tree:
     """The tree of a problem.
 
@@ -131,7 +136,12 @@ def build_tree(
     eliminated = np.array(n_eliminated)
     home_of_reading = node_of[reading_pose, pieces.pose_level[reading_pose]]
     up, reading_at = _places(
-        pieces.parent, front_start, front, home_of_reading, 3 * n_poses + 2 * reading_tag, 3 * n_poses + 2 * n_tags + n_free
+        pieces.parent,
+        front_start,
+        front,
+        home_of_reading,
+        3 * n_poses + 2 * reading_tag,
+        3 * n_poses + 2 * n_tags + n_free,
     )
     up[_within(front_start, eliminated)] = -1
     widest = [int(size[pieces.level == level].max(initial=0)) for level in range(LEVELS)]

@@ -116,8 +116,8 @@ class Solution:
     """Where the solve ended and why.
 
     Attributes:
-        costs: one an accepted step, the start's first.
-        n_linearised: how often all factors were linearised, rejected steps included.
+        costs: one an accepted step, the first before all of them but after relaxed ones.
+        n_linearised: how often all factors were linearised, rejected and relaxed steps included.
         untied: column of the tangent vector that nothing ties down, as the first factorisation without damping found
             it; None where all is tied down.
     """
@@ -162,6 +162,7 @@ def solve(
     cost_tolerance: float = COST_TOLERANCE,
     losses: Losses = DEFAULT_LOSSES,
     relative_tolerance: float = _COST_ROUNDING,
+    relaxed_steps: int = 0,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -171,12 +172,14 @@ def solve(
         cost_tolerance: stop where the next step would lower the cost by less.
         losses: of each kind of factor.
         relative_tolerance: or by less than this share.
+        relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
+            that a start lies in.
     """
     arrowhead = problem.arrowhead
-    spare, rows = arrowhead.empty_system(), arrowhead.empty_rows()
-    state = start
-    system, cost = arrowhead.linearise(state, *losses)
-    costs, n_linearised = [cost], 1
+    system, spare, rows = arrowhead.scratch
+    state, n_linearised = _relaxed(problem, start, relaxed_steps)
+    _, cost = arrowhead.linearise(state, *losses, out=system)
+    costs, n_linearised = [cost], n_linearised + 1
     damping, growth, rejected, untied = 0.0, 2.0, 0, None
 
     def ended(reason: str, *, converged: bool) -> Solution:
@@ -212,6 +215,17 @@ def solve(
         damping = max(damping * growth, _FIRST_DAMPING)
         growth *= 2.0
     return ended(f"stopped after {_MAX_ITERATIONS} steps", converged=False)
+
+
+def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
+    """After some relaxed steps, and how many there were: none where something is not tied down."""
+    state = start
+    for step in range(steps):
+        try:
+            state = problem.arrowhead.relaxed_step(state, problem.anchor)
+        except UnderDeterminedError:
+            return state, step
+    return state, steps
 
 
 def _expected_decrease(system: System, step: FloatArray, damping: float) -> float:

@@ -65,7 +65,13 @@ def starting_pass(
 
 @jitted
 def _predict(
-    odometry: Odometry, m: int, values: Values, before: FloatArray, after: FloatArray, P: FloatArray, scratch: FloatArray
+    odometry: Odometry,
+    m: int,
+    values: Values,
+    before: FloatArray,
+    after: FloatArray,
+    P: FloatArray,
+    scratch: FloatArray,
 ) -> None:
     """T <- T o M(c); P <- Ad P Ad^T + L^-1, Ad that of M^-1, L its information."""
     motion = scratch[3, 0]

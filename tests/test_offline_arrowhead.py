@@ -93,9 +93,8 @@ def test_steps_and_covariances_equal_dense_algebra(
     assert (np.abs(found - covariance) / np.outer(sigma, sigma)).max() <= allowed(condition)
 
 
-@pytest.mark.parametrize("length", [700, 1300])
-def test_long_chains_pass_through_all_levels(length: int) -> None:
-    problem, truth = made_graph(4, [length, 40], 30, reach=0.04)
+def test_long_chains_pass_through_all_levels() -> None:
+    problem, truth = made_graph(4, [700, 40], 30, reach=0.04)
     H, g = problem.linearise(truth)
     arrowhead = arrowhead_of(problem)
     assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == {1, 2, 3}
@@ -139,9 +138,7 @@ def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
     ]
     in_fronts = [tree.front[s : s + n] for s, n in zip(tree.front_start, tree.n_eliminated, strict=False)]
     eliminated = np.sort(np.concatenate([*in_leaves, *in_fronts]))
-    np.testing.assert_array_equal(
-        eliminated, np.arange(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration)
-    )
+    np.testing.assert_array_equal(eliminated, np.arange(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration))
 
 
 def test_what_nothing_ties_down_is_named() -> None:

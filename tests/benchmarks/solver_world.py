@@ -88,7 +88,9 @@ def _driven(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> Flo
     poses: list[FloatArray] = []
     while sum(len(part) for part in poses) < n_keyframes:
         free = [
-            turn for turn in (0, 1, -1, 2) if ((place + ways[(quarter + turn) % 4]) % n_crossings == place + ways[(quarter + turn) % 4]).all()
+            turn
+            for turn in (0, 1, -1, 2)
+            if ((place + ways[(quarter + turn) % 4]) % n_crossings == place + ways[(quarter + turn) % 4]).all()
         ]
         turn = int(rng.choice(free if len(free) == 1 else [t for t in free if t != 2]))
         heading = 0.5 * np.pi * (quarter + turn * np.arange(TURN_STEPS * abs(turn)) / max(1, TURN_STEPS * abs(turn)))
