@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_kernels, linearise_kernels, linearise_readings
+from offline import arrowhead_kernels, arrowhead_substitution, linearise_kernels, linearise_readings
 from offline.arrowhead_covariance import joint_covariance
 from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_tree import Tree, build_tree
@@ -57,7 +57,8 @@ class Arrowhead:
 
         Args:
             state: where.
-            odometry_loss: of each motion; reading_loss: of each tag reading.
+            odometry_loss: of each motion.
+            reading_loss: of each tag reading.
             out: blocks to write into.
         """
         system = out if out is not None else self.empty_system()
@@ -105,7 +106,7 @@ class Arrowhead:
 
     @cached_property
     def scratch(self) -> tuple[System, System, Rows]:
-        """Room for a solve, kept for the next one: memory that is new costs as much as filling it. For one at a time."""
+        """Room for a solve, kept for the next: new memory costs as much as filling it. For one at a time."""
         return self.empty_system(), self.empty_system(), self.empty_rows()
 
     def empty_system(self) -> System:
@@ -184,11 +185,11 @@ class Factorisation:
         """H^-1 vector (3P + 2T + C,), in the arrowhead's own order."""
         tree = self.arrowhead.tree
         solution = vector.copy()
-        arrowhead_kernels.forward(tree, self.system, self.rows, solution)
+        arrowhead_substitution.forward(tree, self.system, self.rows, solution)
         columns = tree.front[tree.front_start[-2] :]
         if len(columns):
             solution[columns], _ = linalg.lapack.dpotrs(self.top, solution[columns], lower=1)
-        arrowhead_kernels.backward(tree, self.system, self.rows, solution)
+        arrowhead_substitution.backward(tree, self.system, self.rows, solution)
         return solution
 
     def solve(self, vector: FloatArray) -> FloatArray:
@@ -211,7 +212,7 @@ class Factorisation:
         largest = smallest = rng.standard_normal(len(held)) * (1.0 - held)
         up = down = 1.0
         for _ in range(_CONDITION_STEPS):
-            largest = arrowhead_kernels.product(self.arrowhead.tree, self.system, largest)
+            largest = arrowhead_substitution.product(self.arrowhead.tree, self.system, largest)
             smallest = self.solve_in_order(smallest)
             up, down = float(np.linalg.norm(largest)), float(np.linalg.norm(smallest))
             largest, smallest = largest / up, smallest / down
@@ -251,22 +252,23 @@ def build_arrowhead(
     slots = [np.flatnonzero(own) for own in uses]
     tree = build_tree(chain_start, pose, tag, n_tags, slots, int(is_free.sum()))
     sorted_readings = Readings(
-        pose,
-        tag,
-        *_contiguous(readings.value[order], readings.polar[order], readings.whitening[order], readings.mount[order]),
+        pose=pose,
+        tag=tag,
+        value=readings.value[order],
+        polar=readings.polar[order],
+        whitening=readings.whitening[order],
+        mount=readings.mount[order],
         parameters=reading_parameters,
         slots=slot[users[1][0][:, None], users[1][1]],
     )
     return Arrowhead(
         tree=tree,
         odometry=Odometry(
-            *_contiguous(
-                odometry.first,
-                odometry.motion,
-                odometry.whitening.swapaxes(-1, -2) @ odometry.whitening,
-                odometry.jacobian,
-                odometry.parameters,
-            ),
+            first=np.ascontiguousarray(odometry.first),
+            motion=np.ascontiguousarray(odometry.motion),
+            information=np.ascontiguousarray(odometry.whitening.swapaxes(-1, -2) @ odometry.whitening),
+            jacobian=np.ascontiguousarray(odometry.jacobian),
+            parameters=np.ascontiguousarray(odometry.parameters),
             slots=slot[users[0][0][:, None], users[0][1]],
         ),
         readings=sorted_readings,
@@ -275,10 +277,6 @@ def build_arrowhead(
         free=free,
         tangent=_tangent_order(columns),
     )
-
-
-def _contiguous(*arrays: FloatArray | IntArray) -> list[FloatArray | IntArray]:
-    return [np.ascontiguousarray(array) for array in arrays]
 
 
 def _relaxed(readings: Readings) -> Readings:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_kernels
+from offline import arrowhead_substitution
 from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_tree import Tree
 
@@ -19,7 +19,9 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
     """(k, k) block of H^-1.
 
     Args:
-        tree, system, rows: the factorisation.
+        tree: the order.
+        system: the blocks.
+        rows: what elimination left of them.
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
     """
@@ -84,9 +86,9 @@ def _through_leaf(
     values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), len(columns)))
     for i, column in enumerate(columns - 3 * first):
         solved[i, column // 3, column % 3] = 1.0
-        arrowhead_kernels.solve_leaf(tree, rows, leaf, solved[i])
+        arrowhead_substitution.solve_leaf(tree, rows, leaf, solved[i])
         outside = np.zeros(end - start)
-        arrowhead_kernels.leaf_to_front(tree, system, leaf, solved[i], outside)
+        arrowhead_substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
         values[tree.up[start:end], i] = -outside
     return solved.reshape(len(columns), 3 * n)[:, columns - 3 * first], values
 

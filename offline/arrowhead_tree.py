@@ -1,9 +1,9 @@
 """In which order the arrowhead system is eliminated: chains cut into nested pieces, tags where their last reading is.
 
-A chain of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and what
-is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators inside of
-it and the tags that are read nowhere else; its front holds them, then what they are coupled to: the separators at both
-ends, the calibration of the chain, tags that others read too.
+A chain of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
+what is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators
+inside of it and the tags that are read nowhere else; its front holds them, then what they are coupled to: the
+separators at both ends, the calibration of the chain, tags that others read too.
 
 Columns are numbered 3 for each pose, 2 for each tag, then the calibration that is free.
 """
@@ -40,8 +40,8 @@ class Tree(NamedTuple):
         tag_start, tags: tags that a node eliminates, in the front's order after the separators.
         rows_start: (N,) where a node's eliminated rows are kept.
         workspace_start: (LEVELS,) where the front of each level is built up.
-        reading_start: (P+1,) readings of each pose; reading_tag: (M,) tag; reading_at: (M,) its place in the front of the
-            node that eliminates the pose.
+        reading_start: (P+1,) readings of each pose; reading_tag: (M,) tag of each; reading_at: (M,) its place in the
+            front of the node that eliminates the pose.
         slot_start, slots: calibration that each chain is coupled to, as indices among what is free.
         chain_start: first pose of each chain, then the number of poses.
         n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest chain list.
@@ -103,7 +103,8 @@ def build_tree(
 
     Args:
         chain_start: (number of chains + 1,) first pose of each, then the number of poses.
-        reading_pose: (M,) rising; reading_tag: (M,).
+        reading_pose: (M,) rising.
+        reading_tag: (M,).
         n_tags: how many there are.
         slots: for each chain the free calibration that it is coupled to.
         n_free: how much calibration is free.

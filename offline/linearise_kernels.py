@@ -74,26 +74,29 @@ def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: Syst
     for pose in range(n_poses):
         for i in range(3):
             if free.poses[pose, i] == 0.0:
-                system.pose[pose, i, :] = 0.0
-                system.pose[pose, :, i] = 0.0
-                system.pose[pose, i, i] = 1.0
+                _hold_one(system.pose[pose], i)
                 system.pose_next[pose, i, :] = 0.0
-                if pose:
-                    system.pose_next[pose - 1, :, i] = 0.0
+                system.pose_next[max(pose - 1, 0), :, i] *= 1.0 if pose == 0 else 0.0
                 system.pose_calibration[pose, i, :] = 0.0
                 system.gradient[3 * pose + i] = 0.0
     for tag in range(len(free.tags)):
         for i in range(2):
             if free.tags[tag, i] == 0.0:
-                system.tag[tag, i, :] = 0.0
-                system.tag[tag, :, i] = 0.0
-                system.tag[tag, i, i] = 1.0
+                _hold_one(system.tag[tag], i)
                 system.tag_calibration[tag, i, :] = 0.0
                 system.gradient[3 * n_poses + 2 * tag + i] = 0.0
     for m in range(len(reading_pose)):
+        pose, tag = free.poses[reading_pose[m]], free.tags[reading_tag[m]]
         for i in range(3):
-            for j in range(2):
-                system.pose_tag[m, i, j] *= free.poses[reading_pose[m], i] * free.tags[reading_tag[m], j]
+            system.pose_tag[m, i, 0] *= pose[i] * tag[0]
+            system.pose_tag[m, i, 1] *= pose[i] * tag[1]
+
+
+@jitted
+def _hold_one(block: FloatArray, i: int) -> None:
+    block[i, :] = 0.0
+    block[:, i] = 0.0
+    block[i, i] = 1.0
 
 
 @jitted
@@ -249,7 +252,7 @@ def _add_wheels(odometry: Odometry, m: int, free: Free, scratch: FloatArray, sys
 @jitted
 def _wrapped(angle: float) -> float:
     """In [-pi, pi]."""
-    return angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi))
+    return float(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
 
 
 @jitted
@@ -284,7 +287,7 @@ def _half_angle_cotangent(omega: float) -> float:
     if abs(omega) < 0.2:
         s = omega * omega
         return 1.0 - s / 12.0 * (1.0 + s / 60.0 * (1.0 + s / 42.0 * (1.0 + s / 40.0 * (1.0 + s * 5.0 / 198.0))))
-    return 0.5 * omega * np.cos(0.5 * omega) / np.sin(0.5 * omega)
+    return float(0.5 * omega * np.cos(0.5 * omega) / np.sin(0.5 * omega))
 
 
 @jitted

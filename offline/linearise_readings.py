@@ -80,7 +80,7 @@ def _add_mount_and_scale(
 
 @jitted
 def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J: FloatArray) -> None:
-    """r = W (predicted - read) and its derivatives; see `factors.ReadingFactors`."""
+    """Sets r = W (predicted - read) and its derivatives; see `factors.ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
     theta = values.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)

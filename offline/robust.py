@@ -47,7 +47,7 @@ def graduated(threshold: float, control: float) -> Loss:
 
 @jitted
 def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
-    """rho and rho' of a squared length."""
+    """Loss rho and weight rho' of a squared length."""
     c2 = loss.threshold * loss.threshold
     if loss.form == _HUBER:
         if square <= c2:

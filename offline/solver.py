@@ -186,7 +186,7 @@ def solve(
         return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised, untied)
 
     for _ in range(_MAX_ITERATIONS):
-        candidate_cost, expected = np.inf, np.inf
+        candidate, candidate_cost, expected = state, np.inf, np.inf
         try:
             step = -arrowhead.factorise(system, damping, rows).solve_in_order(system.gradient)
         except UnderDeterminedError as error:

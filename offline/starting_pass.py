@@ -1,9 +1,9 @@
 """Starting values from one pass in order of time over all chains, like a filter that keeps no cross terms.
 
 Each chain carries its newest pose with a 3 x 3 covariance, each tag a place with a 2 x 2 one, both of all that drifted
-since the frame. Errors of pose and tag are correlated in ways that nobody keeps book of. So whichever is known clearly
-better teaches the other, and near equals teach each other nothing: a tag that the pose itself has just placed leaves the
-pose's covariance honest, an older one pulls the pose back. What comes out is not the optimum, but a long drive comes out
+since the frame. Errors of pose and tag are correlated in ways that nobody books. So whichever is known clearly better
+teaches the other, and near equals teach each other nothing: a tag that the pose itself has just placed leaves its
+covariance honest, an older one pulls the pose back. What comes out is not the optimum, but a long drive comes out
 unbent.
 """
 
@@ -30,7 +30,8 @@ def starting_pass(
 
     Args:
         tree: the chains and who reads what.
-        odometry, readings: the measurements; calibration is taken from `start`.
+        odometry: the motions; calibration is taken from `start`.
+        readings: of tags.
         start: its poses count at the start of each chain only.
         start_variance: (number of chains, 3) of each start's right tangent.
         out: takes the result.

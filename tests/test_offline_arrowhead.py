@@ -23,7 +23,7 @@ def weights(loss: Loss, residual: FloatArray) -> FloatArray:
     """rho'(s), written out once more."""
     s, c2 = (residual**2).sum(axis=1), loss.threshold**2
     by_form = [np.ones_like(s), np.minimum(1.0, loss.threshold / np.sqrt(s)), c2 / (c2 + s), (c2 / (c2 + s)) ** 2]
-    return by_form[loss.form]
+    return np.asarray(by_form[loss.form])
 
 
 def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Loss) -> tuple[FloatArray, FloatArray]:
@@ -125,7 +125,7 @@ def test_gradient_is_the_costs_derivative(seed: int, loss: Loss) -> None:
     way /= np.linalg.norm(way)
     ahead, behind = (arrowhead.linearise(problem.moved(start, h * way), loss, loss)[1] for h in (1e-6, -1e-6))
     slope = float(system.gradient[arrowhead.tangent] @ way)
-    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=1e-4, abs=1e-4 * np.linalg.norm(system.gradient))
+    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=1e-4, abs=1e-4 * float(np.linalg.norm(system.gradient)))
 
 
 @given(seed=st.integers(0, 1000), lengths=st.lists(st.integers(1, 2000), min_size=1, max_size=4))

@@ -4,8 +4,8 @@
 
 Each measurement is a process of its own on one core, solvers taking turns; the least of the repeats counts. Writes
 build/benchmarks/solver.jsonl. GTSAM has to be installed to be compared with; it keeps its default stop rule.
-`ours` counts from dead reckoning, the pass in order of time included; `gtsam_our_start` and `splu` get what comes out of
-that pass for nothing.
+`ours` counts from dead reckoning, the pass in order of time included; `gtsam_our_start` and `splu` get what comes out
+of that pass for nothing.
 """
 
 import argparse
@@ -135,7 +135,7 @@ def measure(case: str, solver: str, seed: int) -> dict[str, Any]:
     """One line of the table; in a process of its own."""
     warm_up()
     if solver.startswith("gtsam"):
-        import gtsam as _  # noqa: F401  (imports are not counted as memory)
+        import gtsam as _  # imports are not counted as memory
     before_mib = memory_mib("VmRSS")
     n_robots, n_keyframes = map(int, case.split("x"))
     fleet = made_fleet(seed, n_robots, n_keyframes, TAGS[case])
@@ -225,11 +225,12 @@ def _row(line: dict[str, Any], lines: list[dict[str, Any]]) -> str:
         ),
         line,
     )
+    total, each = (line[key] / mine[key] for key in ("seconds", "seconds_per_iteration"))
     return (
-        f"{line['robots']:3d} x {line['keyframes']:6d} {line['tags']:4d} tags  seed {line['seed']}  {line['solver']:16s}"
+        f"{line['robots']:3d} x {line['keyframes']:6d} {line['tags']:4d} tags seed {line['seed']} {line['solver']:16s}"
         f"{line['seconds']:10.4f} s {line['seconds_per_iteration']:9.5f} s/it {line['iterations']:4d} it"
         f"  cost {line['cost']:.8g} (x{line['cost'] / mine['cost']:.7f})  {line['peak_mib']:7.0f} MiB"
-        f"  x{line['seconds'] / mine['seconds']:.1f} total x{line['seconds_per_iteration'] / mine['seconds_per_iteration']:.1f} an iteration\n"
+        f"  x{total:.1f} total x{each:.1f} an iteration\n"
     )
 
 

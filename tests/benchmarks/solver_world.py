@@ -37,7 +37,7 @@ class Fleet:
     n_robots: int
 
 
-def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int) -> Fleet:
+def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossings: int | None = None) -> Fleet:
     """Robots that drive at random over roads with tags.
 
     Args:
@@ -45,9 +45,10 @@ def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int) -> Fleet
         n_robots: each one chain.
         n_keyframes: of each robot.
         n_tags: in the world; those that nobody reads are left out.
+        n_crossings: along each side of the grid; as many as give tags every few metres where none is said.
     """
     rng = np.random.default_rng(seed)
-    n_crossings = max(3, round(np.sqrt(n_tags / 3.0)) + 1)
+    n_crossings = n_crossings or max(3, round(np.sqrt(n_tags / 3.0)) + 1)
     tags = _placed_tags(rng, n_crossings, n_tags)
     poses = np.concatenate([_driven(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
     first = np.flatnonzero(np.arange(len(poses)) % n_keyframes != n_keyframes - 1)
