@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -247,6 +248,9 @@ def main() -> int:
         case, solver, seed = arguments.measure
         sys.stdout.write(json.dumps(measure(case, solver, int(seed))) + "\n")
         return 0
+    if find_spec("gtsam") is None:
+        sys.stdout.write("gtsam is not installed: left out (pip install gtsam)\n")
+        arguments.solvers = [solver for solver in arguments.solvers if not solver.startswith("gtsam")]
     sys.stdout.write(f"compiled code ready after {warm_up():.1f} s\n")
     lines = compare(arguments.cases, arguments.solvers, arguments.repeats, arguments.seeds)
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
