@@ -14,9 +14,10 @@ from offline.run import Detections, Positions, Run, TagKey
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
 KEYFRAME_DISTANCE_M: Final = 0.04
 KEYFRAME_TURN_RAD: Final = np.radians(2.0)
-# it is one more look from the same standing pose when it has moved less than this.
-_STANDING_DISTANCE_M: Final = 0.002
-_STANDING_TURN_RAD: Final = np.radians(0.1)
+# it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
+# look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
+_STANDING_TICKS: Final = 1.5
+_STANDING_M: Final = 1e-7  # rounding
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:
         chain = _chain(name, run, track, noise)
         where = f"{name}: " if several else f"{run.name}: "
         chains.append(replace(chain, warnings=tuple(where + warning for warning in chain.warnings)))
+    lost = sorted(set(run.tags) - {tag for chain in chains for tag in chain.tags})
+    if lost:
+        names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
+        warning = f"{run.name}: tag {names} was detected, but no reading of it can be used; this run does not place it"
+        chains[0] = replace(chains[0], warnings=(*chains[0].warnings, warning))
     return chains
 
 
@@ -117,11 +123,12 @@ def _choose_keyframes(
     left_m, right_m = track.at(stamps_ns)
     distance_m, turn_rad = 0.5 * (left_m + right_m), (right_m - left_m) / track_m
     keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
+    standing_m = _STANDING_TICKS * track.quantum_m + _STANDING_M
     chosen: list[int] = []
     for i, (distance, turn) in enumerate(zip(distance_m.tolist(), turn_rad.tolist(), strict=True)):
         moved_m = abs(distance - distance_m[chosen[-1]]) if chosen else np.inf
         turned_rad = abs(turn - turn_rad[chosen[-1]]) if chosen else np.inf
-        standing = moved_m <= _STANDING_DISTANCE_M and turned_rad <= _STANDING_TURN_RAD
+        standing = moved_m + 0.5 * track_m * turned_rad <= standing_m  # the wheel that moved more
         moved = moved_m >= KEYFRAME_DISTANCE_M or turned_rad >= KEYFRAME_TURN_RAD
         if moved or (not standing and tags_at[i] - tags_at[chosen[-1]]):
             chosen.append(i)
@@ -146,7 +153,7 @@ def _readings(
     )
     keyframe = _keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
-    imported = read_positions(
+    imported, more_warnings = read_positions(
         Positions(
             positions.stamps_ns[kept],
             positions.tag[kept],
@@ -158,7 +165,7 @@ def _readings(
         keyframe[kept],
         noise,
     )
-    return joined(from_corners, imported), warnings
+    return joined(from_corners, imported), warnings + more_warnings
 
 
 def _keyframe_at(wanted_ns: IntArray, stamps_ns: IntArray, keyframe_of: IntArray) -> IntArray:

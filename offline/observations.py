@@ -12,6 +12,7 @@ from scipy.special import chdtri
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.errors import CalibError
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
 from offline.run import Detections, Positions, Run
@@ -21,13 +22,18 @@ from offline.tag_pose import general_readings, upright_readings
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
 # Nearer than this a reading is a phantom, and its covariance would wreck the condition of the solve.
 MIN_RANGE_M: Final = 0.1
+# Farther than this no tag is read; numbers beyond come from broken files.
+MAX_RANGE_M: Final = 1000.0
+_LEAST_VARIANCE: Final = 1e-12
 # More than this share of readings left out is worth a sentence.
 MAX_SHARE_LEFT_OUT: Final = 0.05
 _UPRIGHT_DOF: Final = 2
+_MEDIAN_CHI2: Final = float(2.0 * np.log(2.0))  # of two degrees of freedom
 _FALSE_ALARM: Final = 1e-6
-# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its fellows is
-# said to hang askew.
-_ASKEW_FACTOR: Final = 4.0
+# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its own general
+# pose, which has as many degrees of freedom, is said to hang askew. A camera whose roll is a degree off stays below it;
+# a tag that leans by half a right angle and is seen from a few metres does not.
+_ASKEW_FACTOR: Final = 2.5
 
 
 @dataclass(frozen=True)
@@ -86,14 +92,23 @@ def read_detections(
     camera = run.camera
     if camera is None or not len(detections.tag):
         return _no_readings(), []
-    keyframe, tag, corners_px = _averaged(keyframe, detections.tag, detections.corners_px)
-    sides_m = np.array([run.robot.tag_size_m(*key)[0] for key in run.tags])[tag]
+    # A corner that is no number would spoil the mean of its standing pose.
+    known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
+    keyframe, tag, corners_px = _averaged(keyframe[known], detections.tag[known], detections.corners_px[known])
+    if not len(tag):
+        return _no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
+    seen, index = np.unique(tag, return_inverse=True)
+    sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
     rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
     found = upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px)
-    askew, spoilt = _judged(tag, found.chi2)
+    doubted = np.isin(tag, _doubted(tag, found.chi2))
+    general = found.replaced(
+        doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, noise.sigma_corner_px)
+    )
+    askew = _askew(tag, found.chi2, general.chi2, doubted)
     is_askew = np.isin(tag, askew)
-    general = general_readings(corners_px[is_askew], sides_m[is_askew], camera, rotation, noise.sigma_corner_px)
-    found = found.replaced(is_askew, general)
+    spoilt = _spoilt(found.chi2, is_askew)
+    found = found.replaced(is_askew, general.where(is_askew))
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in askew
@@ -121,21 +136,41 @@ def read_detections(
     )
 
 
-def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> Readings:
-    """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's."""
-    unknown = ~np.isfinite(positions.covariance).all((-1, -2))
-    value, polar = positions.value.copy(), positions.polar | unknown
-    x, y = positions.value[:, 0], positions.value[:, 1]
+def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
+    """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's.
+
+    Returns:
+        The readings, and a sentence if some were left out.
+    """
+    first, second = positions.value[:, 0], positions.value[:, 1]
+    range_m = np.where(positions.polar, first, np.hypot(first, second))
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(second) & (range_m > MIN_RANGE_M) & (range_m < MAX_RANGE_M)
+    unknown = np.isnan(positions.covariance).all((-1, -2))
     convert = unknown & ~positions.polar
-    value[convert] = np.stack([np.hypot(x, y), np.arctan2(y, x)], axis=-1)[convert]
+    value = positions.value.copy()
+    value[convert] = np.stack([range_m, np.arctan2(second, first)], axis=-1)[convert]
     covariance = positions.covariance.copy()
-    range_variance = noise.sigma_range_m**2 + (noise.sigma_range_per_m * value[unknown, 0]) ** 2
-    covariance[unknown] = 0.0
-    covariance[unknown, 0, 0] = range_variance
-    covariance[unknown, 1, 1] = noise.sigma_bearing_rad**2
-    range_m = np.where(polar, value[:, 0], np.hypot(value[:, 0], value[:, 1]))
-    good = np.isfinite(value).all(-1) & (range_m > MIN_RANGE_M)
-    return Readings(keyframe, positions.tag, value, covariance, polar, positions.in_camera).where(good)
+    modelled = unknown & good
+    covariance[modelled] = 0.0
+    covariance[modelled, 0, 0] = noise.sigma_range_m**2 + (noise.sigma_range_per_m * range_m[modelled]) ** 2
+    covariance[modelled, 1, 1] = noise.sigma_bearing_rad**2
+    good &= _are_covariances(covariance)
+    readings = Readings(keyframe, positions.tag, value, covariance, positions.polar | unknown, positions.in_camera)
+    if good.all():
+        return readings, []
+    left_out = (
+        f"{int((~good).sum())} of {len(good)} tag positions left out: nearer than {MIN_RANGE_M} m, farther than "
+        f"{MAX_RANGE_M:.0f} m, or with a covariance that is none"
+    )
+    return readings.where(good), [left_out]
+
+
+def _are_covariances(matrices: FloatArray) -> BoolArray:
+    """(M,) which of (M, 2, 2) are positive definite, and of a size to compute with."""
+    sane = np.asarray((np.abs(matrices) < MAX_RANGE_M**2).all((-1, -2)))
+    smallest = np.linalg.eigvalsh(np.where(sane[:, None, None], matrices, 0.0))[:, 0]
+    return np.asarray(smallest > _LEAST_VARIANCE)
 
 
 def joined(a: Readings, b: Readings) -> Readings:
@@ -169,7 +204,10 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
     for run in runs:
         for index in np.unique(run.detections.tag):
             key = run.tags[index]
-            size_m = run.robot.tag_size_m(*key)[0]
+            try:
+                size_m = run.robot.tag_size_m(*key)[0]
+            except CalibError as error:
+                raise OfflineError(f"{run.log}: {error}") from error
             other_m, other = known.setdefault(key, (size_m, run))
             if abs(other_m - size_m) > 1e-6:
                 raise OfflineError(
@@ -178,19 +216,35 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
                 )
 
 
-def _judged(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, BoolArray]:
-    """From the upright model's residuals: the tags that hang askew, and (M,) the readings of others that are spoilt."""
-    n_tags = int(tag.max()) + 1
-    # Capped, so that one spoilt picture does not speak for its tag.
+def _mean_chi2(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, FloatArray]:
+    """(T,) readings of each tag, and their mean per degree of freedom; capped: one spoilt picture counts little."""
     capped = np.where(np.isfinite(chi2), np.minimum(chi2, 100.0), 100.0)
-    count = np.bincount(tag, minlength=n_tags)
+    count = np.bincount(tag)
+    return count, np.bincount(tag, capped) / (_UPRIGHT_DOF * np.maximum(count, 1))
+
+
+def _doubted(tag: IntArray, chi2: FloatArray) -> IntArray:
+    """Tags that the upright model does not explain."""
+    count, mean = _mean_chi2(tag, chi2)
     dof = _UPRIGHT_DOF * np.maximum(count, 1)
-    mean = np.bincount(tag, capped, n_tags) / dof
-    level = max(1.0, float(np.median(mean[count > 0])))
-    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof) * level
-    askew = np.flatnonzero((count > 0) & (mean > limit))
-    spoilt = ~np.isin(tag, askew) & ~(chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM))
-    return askew, spoilt
+    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof)
+    return np.flatnonzero((count > 0) & (mean > limit))
+
+
+def _askew(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, doubted: BoolArray) -> IntArray:
+    """Those of the doubted tags that hanging askew explains far better: bad corners alone spoil both poses."""
+    if not doubted.any():
+        return np.zeros(0, dtype=np.int64)
+    _, upright = _mean_chi2(tag[doubted], upright_chi2[doubted])
+    _, general = _mean_chi2(tag[doubted], general_chi2[doubted])
+    return np.flatnonzero(upright > _ASKEW_FACTOR * np.maximum(general, 1.0))
+
+
+def _spoilt(upright_chi2: FloatArray, is_askew: BoolArray) -> BoolArray:
+    """(M,) readings of upright tags whose corners no tag has, by the level of the run's residuals."""
+    finite = upright_chi2[np.isfinite(upright_chi2) & ~is_askew]
+    level = max(1.0, float(np.median(finite)) / _MEDIAN_CHI2) if len(finite) else 1.0
+    return np.asarray(~is_askew & ~(upright_chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM)))
 
 
 def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

@@ -105,10 +105,10 @@ def compose_odometry(
     to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
 
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
-    variance = _piece_variance(left_m, right_m, track_m, duration_s, step_of_piece, noise)
+    noise_of_piece = _piece_covariance(left_m, right_m, track_m, duration_s, step_of_piece, noise)
     tangent = se2.right_tangent_from_coordinates(pieces)
     jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
-    covariance = np.einsum("nij,nj,nkj->nik", to_step_end, variance, to_step_end)
+    covariance = to_step_end @ noise_of_piece @ to_step_end.swapaxes(-1, -2)
     return ChainOdometry(
         motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
         covariance=_summed(covariance, ends) + np.diag(_quantisation_variance(track.quantum_m, track_m)),
@@ -126,7 +126,7 @@ def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
     return np.stack([x, y, se2.wrap_angle(theta)], axis=-1)
 
 
-def _piece_variance(
+def _piece_covariance(
     left_m: FloatArray,
     right_m: FloatArray,
     track_m: float,
@@ -134,8 +134,9 @@ def _piece_variance(
     step_of_piece: IntArray,
     noise: NoiseParameters,
 ) -> FloatArray:
-    """(N, 3) variances of the pieces' right tangents."""
-    distance_m = np.abs(0.5 * (left_m + right_m))
+    """(N, 3, 3) of the pieces' right tangents, for noise that comes in all along a piece."""
+    forward_m = 0.5 * (left_m + right_m)
+    distance_m = np.abs(forward_m)
     turn_rad = (right_m - left_m) / track_m
     # The turn of a whole step, spread over its pieces: quantised readings taken one by one would add up a turn that
     # never was.
@@ -144,14 +145,16 @@ def _piece_variance(
     step_duration = np.bincount(step_of_piece, duration_s, n_steps)
     net_turn_rad = step_turn[step_of_piece] * duration_s / step_duration[step_of_piece]
     in_gap = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
-    return np.stack(
-        [
-            noise.sigma_distance_m_per_sqrt_m**2 * distance_m + in_gap,
-            noise.sigma_lateral_m_per_sqrt_m**2 * distance_m + in_gap,
-            noise.sigma_heading_rad_per_sqrt_m**2 * distance_m + noise.sigma_heading_rad_per_sqrt_rad**2 * net_turn_rad,
-        ],
-        axis=-1,
+    heading = (
+        noise.sigma_heading_rad_per_sqrt_m**2 * distance_m + noise.sigma_heading_rad_per_sqrt_rad**2 * net_turn_rad
     )
+    covariance = np.zeros((len(distance_m), 3, 3))
+    covariance[:, 0, 0] = noise.sigma_distance_m_per_sqrt_m**2 * distance_m + in_gap
+    # A heading error made u before the end moves the end sideways by u times it: means of u^2 and u over the piece.
+    covariance[:, 1, 1] = noise.sigma_lateral_m_per_sqrt_m**2 * distance_m + in_gap + heading * forward_m**2 / 3.0
+    covariance[:, 1, 2] = covariance[:, 2, 1] = heading * forward_m / 2.0
+    covariance[:, 2, 2] = heading
+    return covariance
 
 
 def _by_wheel_parameters(

@@ -155,10 +155,15 @@ def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
 
 
 def _reasons_apart(maps: Sequence[LocalMap], groups: Sequence[Group], pairs: Sequence[PairAlignment]) -> list[str]:
-    """For each component after the first: why it is one of its own."""
+    """For each component after the first: why it is one of its own, told of the run that is nearest to joining it."""
     reasons = []
     for i, members in enumerate(groups[1:], start=1):
-        others = [m for g in groups for m in g.members if g is not members]
-        told = [reason_apart(maps[m].chain.name, others, m, maps, pairs) for m in members.members[:1]]
-        reasons += [f"component {i}: {reason}" for reason in told]
+        others = {m for g in groups for m in g.members if g is not members}
+
+        def n_shared(member: int, others: set[int] = others) -> int:
+            ends = [(pair.b if pair.a == member else pair.a, pair) for pair in pairs if member in (pair.a, pair.b)]
+            return max((pair.n_shared for end, pair in ends if end in others), default=0)
+
+        nearest = max(members.members, key=n_shared)
+        reasons.append(f"component {i}: {reason_apart(maps[nearest].chain.name, sorted(others), nearest, maps, pairs)}")
     return reasons

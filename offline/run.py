@@ -10,9 +10,11 @@ import numpy as np
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel, read_camera_yaml
+from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
+from offline.plausible import check_file_name, check_numbers, check_speed
 from onboard.log_head import camera_from_message
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
@@ -175,6 +177,8 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     info = collected.info
     if info is None:
         raise OfflineError(f"{log}: no /run message, so whose run it is cannot be told; is it a groundsbot log?")
+    check_file_name(info.robot_id, f"{log}: /run: robot_id")
+    check_file_name(info.run_id, f"{log}: /run: run_id")
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = _stretches(collected, robot, log)
@@ -203,16 +207,18 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
 
 def _stretches(collected: _Collected, robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
     if collected.wheels:
-        return _encoder_stretches(collected.wheels, robot)
+        return _encoder_stretches(collected.wheels, robot, log)
     if collected.odometry:
-        return _imported_stretch(collected.odometry, robot)
+        return _imported_stretch(collected.odometry, robot, log)
     raise OfflineError(
         f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
         "was the encoder port connected? `groundsbot-onboard check` tells"
     )
 
 
-def _encoder_stretches(readings: list[tuple[int, int, int, int]], robot: Robot) -> tuple[list[WheelTrack], list[str]]:
+def _encoder_stretches(
+    readings: list[tuple[int, int, int, int]], robot: Robot, log: Path
+) -> tuple[list[WheelTrack], list[str]]:
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
@@ -223,6 +229,9 @@ def _encoder_stretches(readings: list[tuple[int, int, int, int]], robot: Robot) 
         ordered, dropped = _strictly_later(part)
         if dropped:
             warnings.append(f"{dropped} wheel readings are not later than the one before them; left out")
+        # As floats first: counts far enough apart would wrap round in whole numbers.
+        counted = np.asarray(ordered[:, 2:], dtype=np.float64)
+        check_speed(ordered[:, 0], counted * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
         left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
         quantum_m = max(m_per_tick_left, m_per_tick_right)
         stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
@@ -234,17 +243,16 @@ def _encoder_stretches(readings: list[tuple[int, int, int, int]], robot: Robot) 
     return stretches, warnings
 
 
-def _imported_stretch(readings: list[PlanarOdometry], robot: Robot) -> tuple[list[WheelTrack], list[str]]:
-    stamps, left, right = [], [], []
-    for reading in readings:
-        stamps.append(reading.stamp_ns)
-        left.append(reading.wheels.left_m)
-        right.append(reading.wheels.right_m)
+def _imported_stretch(readings: list[PlanarOdometry], robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
     warnings: list[str] = []
-    stamps_ns = np.array(stamps, dtype=np.int64)
-    left_m, right_m = np.array(left), np.array(right)
+    where = f"{log}: /odometry"
+    stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+    left_m = np.array([reading.wheels.left_m for reading in readings])
+    right_m = np.array([reading.wheels.right_m for reading in readings])
+    check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)
     if readings[0].WhichOneof("motion") == "pose":
         poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
+        check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
         left_m, right_m, sideways = wheel_distances(poses, robot.wheels.track_m)
         if sideways > 0.05:
             warnings.append(
@@ -255,6 +263,7 @@ def _imported_stretch(readings: list[PlanarOdometry], robot: Robot) -> tuple[lis
     if dropped:
         warnings.append(f"{dropped} odometry readings are not later than the one before them; left out")
     keep = table[:, 1]
+    check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
     return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep])], warnings
 
 
@@ -315,7 +324,10 @@ def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> Came
     calibration, size = collected.calibration, collected.picture_size
     camera, source = given, "the camera file given with --robot"
     if camera is None and calibration is not None:
-        camera, source = camera_from_message(calibration), "/camera/calibration"
+        try:
+            camera, source = camera_from_message(calibration), "/camera/calibration"
+        except GroundsbotError as error:
+            raise OfflineError(f"{log}: {error}") from error
     if camera is None and collected.sightings:
         raise OfflineError(
             f"{log}: tags were detected but /camera/calibration has 0 messages; "

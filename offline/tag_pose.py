@@ -54,6 +54,10 @@ class TagReadings:
     chi2: FloatArray
     valid: BoolArray
 
+    def where(self, mask: BoolArray) -> "TagReadings":
+        """Those of the mask."""
+        return TagReadings(*(getattr(self, f.name)[mask] for f in dataclass_fields(self)))
+
     def replaced(self, mask: BoolArray, others: "TagReadings") -> "TagReadings":
         """These, with those of the mask replaced by others (as many as the mask has)."""
         fields = []

@@ -1,7 +1,27 @@
 """What holds for every test."""
 
+import sys
+
+import pytest
 from hypothesis import settings
+
+from tests.programs import Outcome, Run
 
 # A busy machine must not fail a property test.
 settings.register_profile("groundsbot", deadline=None)
 settings.load_profile("groundsbot")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """`groundsbot-offline ARGUMENTS`, as the program."""
+    from offline import cli
+
+    def call(*arguments: object) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["groundsbot-offline", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        captured = capsys.readouterr()
+        return Outcome(int(caught.value.code or 0), captured.out, captured.err)
+
+    return call

@@ -166,7 +166,7 @@ def write_drive(
         picture = TagDetections(stamp_ns=stamp, width_px=eye.width_px, height_px=eye.height_px, detections=found)
         entries.append((stamp, "/tags/detections", picture))
     log = folder / robot.robot_id / run_id
-    text = yaml.safe_dump(robot.model_dump(mode="json"))
+    text = yaml.safe_dump(robot.model_dump())
     head = log_head(robot, text, camera, run_id, START_NS, 0)
     with LogWriter(log, head, START_NS, durable=False) as writer:
         for stamp, topic, message in sorted(entries, key=lambda entry: entry[0]):

@@ -41,10 +41,10 @@ def test_how_finely_readings_are_spaced_makes_no_difference() -> None:
     np.testing.assert_allclose(coarse.motion, fine.motion, atol=1e-12)
     np.testing.assert_allclose(coarse.jacobian, fine.jacobian, atol=1e-9)
     np.testing.assert_allclose(coarse.distance_m, fine.distance_m, atol=1e-12)
-    # A step's covariance is a sum over its readings: one of an integral.
+    # Noise is taken along each piece's chord: a few percent where the robot turns on the spot or sharply.
     scale = np.sqrt(np.einsum("nii->ni", fine.covariance))
     np.testing.assert_allclose(
-        (coarse.covariance - fine.covariance) / scale[:, :, None] / scale[:, None, :], 0, atol=0.1
+        (coarse.covariance - fine.covariance) / scale[:, :, None] / scale[:, None, :], 0, atol=0.03
     )
 
 

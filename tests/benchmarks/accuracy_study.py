@@ -19,6 +19,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from fixtures.simulate import TRUTH_FILE, simulate
+from fixtures.world import World
 from offline.evaluation import evaluate
 from offline.pipeline import map_logs
 from offline.truth import read_truth
@@ -46,7 +47,7 @@ class Figures:
     nees_start: float
 
 
-def study_seed(seed: int, world: str | Path, *, exact_calibration: bool, render: bool) -> Figures:
+def study_seed(seed: int, world: World | str | Path, *, exact_calibration: bool, render: bool) -> Figures:
     """Simulates, maps and compares one seed.
 
     Raises:
@@ -98,7 +99,7 @@ def missed_bounds(figures: Sequence[Figures], *, exact_calibration: bool, render
 
 
 def run_study(
-    world: str | Path, seeds: Sequence[int], *, exact_calibration: bool, render: bool, jobs: int = 1
+    world: World | str | Path, seeds: Sequence[int], *, exact_calibration: bool, render: bool, jobs: int = 1
 ) -> list[Figures]:
     """All seeds, several at a time where asked for; rows go to the standard output as they come."""
     one = partial(study_seed, world=world, exact_calibration=exact_calibration, render=render)

@@ -1,0 +1,57 @@
+"""The paper's own two runs, from CSV to one map. Bounds come from the data's description; nothing is tuned on them."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from offline.cli import app
+
+ROOT = Path(__file__).parents[1]
+RECORDINGS = ROOT.parent / "shared" / "data" / "nsh_first_floor"
+MEASURED_BY_HAND_M = 38.05
+
+pytestmark = pytest.mark.skipif(
+    not RECORDINGS.is_dir(), reason=f"the paper's recordings carry no licence and are not at {RECORDINGS}"
+)
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("paper")
+    for run in ("hallway", "loop"):
+        _succeeds("import", RECORDINGS / run, "-o", folder / "logs", "--state-rate-hz", 4.2, "--track-width-m", 0.508)
+    _succeeds("map", folder / "logs", "-o", folder / "map")
+    found: dict[str, object] = json.loads((folder / "map" / "map.json").read_text())
+    return found
+
+
+def test_the_two_runs_merge_into_one_map_of_all_tags(merged: dict[str, list[dict[str, object]]]) -> None:
+    assert len(merged["components"]) == 1
+    assert len(merged["tags"]) == 43
+    (alignment,) = merged["alignments"]
+    assert alignment["n_shared"] == 12
+    assert isinstance(alignment["n_inliers"], int)
+    assert alignment["n_inliers"] >= 10
+
+
+def test_readme_quotes_the_distance_found(merged: dict[str, list[dict[str, float]]]) -> None:
+    (pair,) = merged["start_to_start"]
+    quoted = re.search(
+        r"\*\*([\d.]+) m\*\* \(sigma ([\d.]+) m\); measured by hand ([\d.]+) m", (ROOT / "README.md").read_text()
+    )
+    assert quoted is not None
+    assert float(quoted[1]) == pytest.approx(pair["distance_m"], abs=0.005)
+    assert float(quoted[2]) == pytest.approx(pair["sigma_m"], abs=0.005)
+    assert float(quoted[3]) == MEASURED_BY_HAND_M
+
+
+def test_that_wheels_and_tags_disagree_about_the_metre_is_said(merged: dict[str, list[str]]) -> None:
+    assert any("tag_scale" in warning and "contradict" in warning for warning in merged["warnings"])
+
+
+def _succeeds(*words: object) -> None:
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
