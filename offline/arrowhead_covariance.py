@@ -62,6 +62,8 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
 
 def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
     """Nodes that eliminate what is wanted, and the indices of what they do."""
+    if not len(wanted):
+        return []
     home = np.full(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration, -1)
     for node in np.flatnonzero(tree.n_eliminated):
         start = tree.front_start[node]

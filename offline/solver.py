@@ -203,9 +203,10 @@ def solve(
             state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
             system, spare = spare, system
             costs.append(cost)
-            # Where the model is off by a share, the next gradient is off by that share of this one, and what another
-            # step could bring by its square.
-            if damping == 0.0 and _SURE * expected * (1.0 - gain) ** 2 <= cost_tolerance + relative_tolerance * cost:
+            # Where the model is off by a share, the next gradient is that share of this one, and what another step could
+            # bring its square. By chance a model is right too early: not for those who want the last digit.
+            left = _SURE * expected * (1.0 - gain) ** 2
+            if relative_tolerance > _COST_ROUNDING and damping == 0.0 and left <= relative_tolerance * cost:
                 return ended("converged", converged=True)
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > _LEAST_DAMPING else 0.0
