@@ -203,7 +203,7 @@ def solve(
             state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
             system, spare = spare, system
             costs.append(cost)
-            # Where the model is off by a share, the next gradient is that share of this one, and what another step could
+            # Where the model is off by a share, the next gradient is that share of this one, what another step could
             # bring its square. By chance a model is right too early: not for who wants the last digit.
             left = _SURE * expected * (1.0 - gain) ** 2
             if relative_tolerance > _COST_ROUNDING and damping == 0.0 and left <= relative_tolerance * cost:
