@@ -37,6 +37,8 @@ format: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m tests.benchmarks.solver_bench
+	$(BIN)/python -m tests.benchmarks.solver_scaling
 
 # Writes requirements.lock anew: exact versions and hashes for every platform.
 lock: $(READY)

@@ -1,20 +1,24 @@
-"""Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the sparse normal equations.
+"""Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
 
-Linearise all factors of a kind at once, add up H = J^T J and g = J^T r, factorise, substitute. Dellaert and Kaess,
+Linearise all factors, eliminate the chains, meet in the border, substitute back: see `arrowhead`. Dellaert and Kaess,
 "Square Root SAM" (2006); step rule after Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems"
 (2004). Readings carry Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
 """
 
 from dataclasses import dataclass, field
-from typing import Final
+from functools import cached_property
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from calib import se2
 from calib.arrays import FloatArray, IntArray
+from offline.arrowhead import Arrowhead, Factorisation, UnderDeterminedError, build_arrowhead
+from offline.arrowhead_kernels import System
 from offline.factors import CalibrationPrior, Columns, Linearised, OdometryFactors, ReadingFactors, State
+from offline.linearise_kernels import diagonal_square
+from offline.robust import SQUARES, Loss, huber
 
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0
@@ -27,7 +31,18 @@ _COST_ROUNDING: Final = 1e-14  # relative
 # Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
 # drive, so the first damping must be tiny to leave such modes free.
 _FIRST_DAMPING: Final = 1e-9
+_SURE: Final = 10.0
 _LEAST_DAMPING: Final = 1e-10  # below it a step is Gauss-Newton's
+
+
+class Losses(NamedTuple):
+    """Of each kind of factor."""
+
+    odometry: Loss
+    readings: Loss
+
+
+DEFAULT_LOSSES: Final = Losses(SQUARES, huber(HUBER_THRESHOLD))
 
 
 @dataclass(frozen=True)
@@ -44,24 +59,31 @@ class Problem:
     columns: Columns
     anchor: IntArray
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: State, *, robust: bool = True) -> float:
         """Half the sum of squared whitened residuals, Huber's loss on the readings."""
+        readings = self.readings.residual(state)
         return 0.5 * float(
             (self.odometry.residual(state) ** 2).sum()
-            + huber_loss(self.readings.residual(state)).sum()
+            + (huber_loss(readings) if robust else readings**2).sum()
             + (self.prior.residual(state) ** 2).sum()
         )
+
+    @cached_property
+    def arrowhead(self) -> Arrowhead:
+        """The order of elimination, settled once."""
+        return build_arrowhead(self.odometry, self.readings, self.prior, self.columns)
 
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
         return self.odometry.motion.size + self.readings.value.size
 
-    def linearise(self, state: State) -> tuple[sparse.csc_array, FloatArray]:
-        """H = J^T J (n, n) and g = J^T r (n,) at a state."""
+    def linearise(self, state: State, *, robust: bool = True) -> tuple[sparse.csc_array, FloatArray]:
+        """H = J^T J (n, n) and g = J^T r (n,) at a state, the plain way: one sparse matrix."""
+        readings = self.readings.linearise(state, self.columns)
         kinds = (
             self.odometry.linearise(state, self.columns),
-            _reweighted(self.readings.linearise(state, self.columns)),
+            _reweighted(readings) if robust else readings,
             self.prior.linearise(state, self.columns),
         )
         jacobian, residual = _stacked(kinds, self.columns.n)
@@ -91,64 +113,127 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the solve ended and why."""
+    """Where the solve ended and why.
+
+    Attributes:
+        costs: one an accepted step, the first before all of them but after relaxed ones.
+        n_linearised: how often all factors were linearised, rejected and relaxed steps included.
+        untied: column of the tangent vector that nothing ties down, as the first factorisation without damping found
+            it; None where all is tied down.
+    """
 
     state: State
-    costs: tuple[float, ...]  # one an accepted step, the start's first
+    costs: tuple[float, ...]
     reason: str
     converged: bool
     problem: Problem = field(repr=False)
+    losses: Losses = field(repr=False, default_factory=lambda: DEFAULT_LOSSES)
+    n_linearised: int = 0
+    untied: int | None = None
 
     @property
     def cost(self) -> float:
         """At the end."""
         return self.costs[-1]
 
+    @cached_property
+    def factorisation(self) -> Factorisation:
+        """Of H at the end.
+
+        Raises:
+            UnderDeterminedError: something is not tied down.
+        """
+        arrowhead = self.problem.arrowhead
+        system, _ = arrowhead.linearise(self.state, *self.losses)
+        return arrowhead.factorise(system)
+
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns of the tangent vector, exact to first order; 0 where held (-1)."""
-        hessian, _ = self.problem.linearise(self.state)
-        factor = _factorised(hessian)
-        free = np.flatnonzero(columns >= 0)
-        unit = np.zeros((self.problem.columns.n, len(free)))
-        unit[columns[free], np.arange(len(free))] = 1.0
-        covariance = np.zeros((len(columns), len(columns)))
-        covariance[np.ix_(free, free)] = factor.solve(unit)[columns[free]]
-        return 0.5 * (covariance + covariance.T)
+        return self.factorisation.covariance(columns)
+
+    def condition(self) -> float:
+        """Estimate of H's condition number at the end."""
+        return self.factorisation.condition()
 
 
-def solve(problem: Problem, start: State, cost_tolerance: float = COST_TOLERANCE) -> Solution:
+def solve(
+    problem: Problem,
+    start: State,
+    cost_tolerance: float = COST_TOLERANCE,
+    losses: Losses = DEFAULT_LOSSES,
+    relative_tolerance: float = _COST_ROUNDING,
+    relaxed_steps: int = 0,
+) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
     Args:
         problem: the factors.
         start: values to begin from.
         cost_tolerance: stop where the next step would lower the cost by less.
+        losses: of each kind of factor.
+        relative_tolerance: or by less than this share.
+        relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
+            that a start lies in.
     """
-    state, cost = start, problem.cost(start)
-    costs = [cost]
-    damping, growth, rejected = 0.0, 2.0, 0
-    hessian, gradient = problem.linearise(state)
+    arrowhead = problem.arrowhead
+    system, spare, rows = arrowhead.scratch
+    state, n_linearised = _relaxed(problem, start, relaxed_steps)
+    _, cost = arrowhead.linearise(state, *losses, out=system)
+    costs, n_linearised = [cost], n_linearised + 1
+    damping, growth, rejected, untied = 0.0, 2.0, 0, None
+
+    def ended(reason: str, *, converged: bool) -> Solution:
+        return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised, untied)
+
     for _ in range(_MAX_ITERATIONS):
-        step = _damped_step(hessian, gradient, damping)
-        expected = -float(gradient @ step) - 0.5 * float(step @ (hessian @ step))
-        if expected <= cost_tolerance + _COST_ROUNDING * cost:
-            return Solution(state, tuple(costs), "converged", converged=True, problem=problem)
-        candidate = problem.moved(state, step)
-        candidate_cost = problem.cost(candidate)
+        candidate, candidate_cost, expected = state, np.inf, np.inf
+        try:
+            step = -arrowhead.factorise(system, damping, rows).solve_in_order(system.gradient)
+        except UnderDeterminedError as error:
+            untied = error.column if damping == 0.0 else untied
+        else:
+            expected = _expected_decrease(system, step, damping)
+            if expected <= cost_tolerance + relative_tolerance * cost:
+                return ended("converged", converged=True)
+            candidate = arrowhead.moved(state, step, problem.anchor)
+            spare, candidate_cost = arrowhead.linearise(candidate, *losses, out=spare)
+            n_linearised += 1
         if candidate_cost < cost:
             gain = (cost - candidate_cost) / expected
             state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
+            system, spare = spare, system
             costs.append(cost)
+            # Where the model is off by a share, the next gradient is that share of this one, what another step could
+            # bring its square. By chance a model is right too early: not for who wants the last digit.
+            left = _SURE * expected * (1.0 - gain) ** 2
+            if relative_tolerance > _COST_ROUNDING and damping == 0.0 and left <= relative_tolerance * cost:
+                return ended("converged", converged=True)
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > _LEAST_DAMPING else 0.0
-            hessian, gradient = problem.linearise(state)
             continue
         rejected += 1
         if rejected > _MAX_REJECTED:
-            return Solution(state, tuple(costs), "no step lowers the cost", converged=False, problem=problem)
+            return ended("no step lowers the cost", converged=False)
         damping = max(damping * growth, _FIRST_DAMPING)
         growth *= 2.0
-    return Solution(state, tuple(costs), f"stopped after {_MAX_ITERATIONS} steps", converged=False, problem=problem)
+    return ended(f"stopped after {_MAX_ITERATIONS} steps", converged=False)
+
+
+def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
+    """After some relaxed steps, and how many there were: none where something is not tied down."""
+    state = start
+    for step in range(steps):
+        try:
+            state = problem.arrowhead.relaxed_step(state, problem.anchor)
+        except UnderDeterminedError:
+            return state, step
+    return state, steps
+
+
+def _expected_decrease(system: System, step: FloatArray, damping: float) -> float:
+    """-g s - s H s / 2 of a step with (H + damping D) s = -g."""
+    along = -float(system.gradient @ step)
+    return 0.5 * (along + damping * diagonal_square(system, step)) if damping else 0.5 * along
 
 
 def huber_loss(residual: FloatArray) -> FloatArray:
@@ -194,21 +279,3 @@ def _stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_
         first_row += m * n
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)
-
-
-def _damped_step(hessian: sparse.csc_array, gradient: FloatArray, damping: float) -> FloatArray:
-    if not len(gradient):
-        return gradient
-    damped = hessian + sparse.diags_array(damping * hessian.diagonal(), format="csc") if damping else hessian
-    step: FloatArray = -_factorised(damped).solve(gradient)
-    return step
-
-
-def _factorised(hessian: sparse.csc_array) -> sparse_linalg.SuperLU:
-    """H is symmetric and positive definite: the diagonal is a good pivot."""
-    return sparse_linalg.splu(
-        sparse.csc_matrix(hessian),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )

@@ -1,0 +1,109 @@
+"""Exact joint covariances of any columns, from the square root that elimination left.
+
+With E the wanted columns of the identity, E^T H^-1 E = Z^T Z where R^T Z = E. A column of Z is zero but along the path
+from its node to the top: so a tag in the border costs one triangular solve there, and a pose a few small ones more.
+"""
+
+import heapq
+
+import numpy as np
+from scipy import linalg
+
+from calib.arrays import FloatArray, IntArray
+from offline import arrowhead_substitution
+from offline.arrowhead_kernels import Rows, System
+from offline.arrowhead_tree import Tree
+
+
+def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: IntArray) -> FloatArray:
+    """(k, k) block of H^-1.
+
+    Args:
+        tree: the order.
+        system: the blocks.
+        rows: what elimination left of them.
+        top: lower triangular R^T of the top.
+        wanted: (k,) columns in the arrowhead's order.
+    """
+    covariance = np.zeros((len(wanted), len(wanted)))
+    # What is on its way at each node: which of the wanted, and the right-hand sides (front, q) for them.
+    waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+    queue: list[int] = []
+
+    def send(node: int, who: IntArray, values: FloatArray) -> None:
+        if node not in waiting:
+            heapq.heappush(queue, node)
+        waiting.setdefault(node, []).append((who, values))
+
+    for node, who in _by_node(tree, wanted):
+        if tree.level[node] == 0:
+            square, values = _through_leaf(tree, system, rows, node, wanted[who])
+            covariance[np.ix_(who, who)] += square
+            send(int(tree.parent[node]), who, values)
+        else:
+            front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
+            sorter = np.argsort(front)
+            units = np.zeros((len(front), len(who)))
+            units[sorter[np.searchsorted(front, wanted[who], sorter=sorter)], np.arange(len(who))] = 1.0
+            send(node, who, units)
+    while queue:
+        node = heapq.heappop(queue)
+        arrived = waiting.pop(node)
+        who = np.concatenate([members for members, _ in arrived])
+        values = np.concatenate([sent for _, sent in arrived], axis=1)
+        if node == len(tree.level) - 1:
+            Z = linalg.solve_triangular(top, values, lower=True, check_finite=False) if len(top) else values
+        else:
+            Z, left = _through_front(tree, rows, node, values)
+            send(int(tree.parent[node]), who, left)
+        covariance[np.ix_(who, who)] += Z.T @ Z
+    return 0.5 * (covariance + covariance.T)
+
+
+def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
+    """Nodes that eliminate what is wanted, and the indices of what they do."""
+    if not len(wanted):
+        return []
+    home = np.full(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration, -1)
+    for node in np.flatnonzero(tree.n_eliminated):
+        start = tree.front_start[node]
+        home[tree.front[start : start + tree.n_eliminated[node]]] = node
+    leaves = np.flatnonzero(tree.level == 0)
+    in_leaf = np.flatnonzero(home[wanted] < 0)
+    home_of = home[wanted]
+    home_of[in_leaf] = leaves[np.searchsorted(tree.first[leaves], wanted[in_leaf] // 3, side="right") - 1]
+    order = np.argsort(home_of, kind="stable")
+    nodes, first = np.unique(home_of[order], return_index=True)
+    return list(zip(nodes.tolist(), np.split(order, first[1:]), strict=True))
+
+
+def _through_leaf(
+    tree: Tree, system: System, rows: Rows, leaf: int, columns: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """E^T A^-1 E of some columns of a leaf's poses, and what they leave in the parent's front."""
+    first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
+    start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
+    parent = int(tree.parent[leaf])
+    solved = np.zeros((len(columns), n, 3))
+    values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), len(columns)))
+    for i, column in enumerate(columns - 3 * first):
+        solved[i, column // 3, column % 3] = 1.0
+        arrowhead_substitution.solve_leaf(tree, rows, leaf, solved[i])
+        outside = np.zeros(end - start)
+        arrowhead_substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
+        values[tree.up[start:end], i] = -outside
+    return solved.reshape(len(columns), 3 * n)[:, columns - 3 * first], values
+
+
+def _through_front(tree: Tree, rows: Rows, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Z (n_eliminated, q), and what it leaves in the parent's front, of right-hand sides (front, q)."""
+    start, end, n = int(tree.front_start[node]), int(tree.front_start[node + 1]), int(tree.n_eliminated[node])
+    R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * (end - start)].reshape(n, end - start)
+    Z = values[:0]
+    if n:
+        Z = linalg.solve_triangular(R[:, :n], values[:n], trans="T", check_finite=False)
+    left = values[n:] - R[:, n:].T @ Z
+    parent = int(tree.parent[node])
+    above = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), values.shape[1]))
+    above[tree.up[start + n : end]] = left
+    return Z, above

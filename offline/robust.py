@@ -1,0 +1,62 @@
+"""Losses that bound what one wrong measurement can do, as weights of plain squares.
+
+With s the squared length of a whitened residual, a loss rho(s) has the weight rho'(s) in the normal equations.
+Barron, "A general and adaptive robust loss function" (2019); for graduated non-convexity Yang, Antonante, Tzoumas and
+Carlone, "Graduated non-convexity for robust spatial perception" (2020).
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from offline.jit import jitted
+
+_SQUARES: Final = 0
+_HUBER: Final = 1
+_CAUCHY: Final = 2
+_GEMAN_MCCLURE: Final = 3
+
+
+class Loss(NamedTuple):
+    """Which loss, and from what length of the whitened residual on it differs from the square."""
+
+    form: int
+    threshold: float
+
+
+SQUARES: Final = Loss(_SQUARES, 1.0)
+
+
+def huber(threshold: float) -> Loss:
+    """Squares up to the threshold, then linear: constant force."""
+    return Loss(_HUBER, threshold)
+
+
+def cauchy(threshold: float) -> Loss:
+    """c^2 log(1 + s / c^2): a force that dies away with distance."""
+    return Loss(_CAUCHY, threshold)
+
+
+def graduated(threshold: float, control: float) -> Loss:
+    """Geman and McClure's c^2 s / (c^2 + s), surrogate with c^2 = control threshold^2.
+
+    Nearly squares for a large control. Solve with a falling one, each from the solution of the last, down to 1.
+    """
+    return Loss(_GEMAN_MCCLURE, threshold * float(np.sqrt(control)))
+
+
+@jitted
+def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
+    """Loss rho and weight rho' of a squared length."""
+    c2 = loss.threshold * loss.threshold
+    if loss.form == _HUBER:
+        if square <= c2:
+            return square, 1.0
+        length = np.sqrt(square)
+        return loss.threshold * (2.0 * length - loss.threshold), loss.threshold / length
+    if loss.form == _CAUCHY:
+        return c2 * np.log1p(square / c2), c2 / (c2 + square)
+    if loss.form == _GEMAN_MCCLURE:
+        share = c2 / (c2 + square)
+        return share * square, share * share
+    return square, 1.0

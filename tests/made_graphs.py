@@ -1,0 +1,126 @@
+"""Random graphs long enough to be cut into nested pieces, with every kind of factor and all calibration."""
+
+from typing import Final
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray, IntArray
+from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
+from offline.solver import Problem
+
+_ROBOT_SIGMA: Final = (0.004, 0.007, 0.01, 0.01, 0.01, 0.01)  # wheels, then mount
+_BATCH_SIGMA: Final = (0.005, 0.005)
+N_ROBOTS: Final = 2
+
+
+def made_graph(
+    seed: int, lengths: list[int], n_tags: int, *, calibrated: bool = True, reach: float = 0.3
+) -> tuple[Problem, State]:
+    """A problem and the state that its measurements are of, but for their noise.
+
+    Args:
+        seed: of everything.
+        lengths: poses of each chain; chains of even and of odd number share a robot.
+        n_tags: each read along some part of the first chain, and of others.
+        calibrated: calibration is free, else it is held.
+        reach: the longest share of a chain along which a tag is read.
+    """
+    rng = np.random.default_rng(seed)
+    sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
+    poses, first, chain_of = _driven(rng, lengths)
+    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * rng.standard_normal(len(sigma)))
+    readings = _readings(rng, truth, lengths, chain_of, reach)
+    problem = Problem(
+        odometry=_odometry(rng, truth, first, chain_of),
+        readings=readings,
+        prior=CalibrationPrior(sigma),
+        columns=_columns(len(poses), n_tags, sigma > 0.0),
+        anchor=readings.pose[np.unique(readings.tag, return_index=True)[1]],
+    )
+    return problem, truth
+
+
+def reordered(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The same with the readings in another order."""
+    order = rng.permutation(len(problem.readings.pose))
+    readings = problem.readings
+    mixed = ReadingFactors(
+        *(
+            getattr(readings, name)[order]
+            for name in (
+                "pose", "tag", "value", "polar", "whitening", "mount", "mount_parameters", "scale_parameter",
+            )
+        )
+    )  # fmt: skip
+    return Problem(problem.odometry, mixed, problem.prior, problem.columns, problem.anchor)
+
+
+def _driven(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, IntArray, IntArray]:
+    poses: list[FloatArray] = []
+    first = []
+    for length in lengths:
+        poses.append(np.r_[rng.uniform(-2.0, 2.0, 2), rng.uniform(-3.0, 3.0)])
+        for _ in range(length - 1):
+            first.append(len(poses) - 1)
+            poses.append(se2.compose(poses[-1], [rng.uniform(0.1, 0.3), rng.normal(0, 0.02), rng.normal(0, 0.4)]))
+    return np.array(poses), np.array(first, dtype=np.int64), np.repeat(np.arange(len(lengths)), lengths)
+
+
+def _odometry(rng: np.random.Generator, truth: State, first: IntArray, chain_of: IntArray) -> OdometryFactors:
+    n = len(first)
+    root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
+    jacobian = 0.2 * rng.standard_normal((n, 3, 3))
+    parameters = (1 + 6 * (chain_of[first] % N_ROBOTS))[:, None] + np.arange(3)
+    moved = se2.between(truth.poses[first], truth.poses[first + 1])
+    error = np.einsum("nij,nj->ni", root, rng.standard_normal((n, 3)))
+    by_calibration = np.einsum("nij,nj->ni", jacobian, truth.calibration[parameters])
+    motion = se2.compose(se2.compose(moved, se2.exp(error)), se2.inverse(se2.exp(by_calibration)))
+    return OdometryFactors(first, motion, whitening(root @ root.swapaxes(-1, -2)), jacobian, parameters)
+
+
+def _readings(
+    rng: np.random.Generator, truth: State, lengths: list[int], chain_of: IntArray, reach: float
+) -> ReadingFactors:
+    pose, tag = _who_reads_what(rng, lengths, len(truth.tags), reach)
+    n = len(pose)
+    polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
+    mount = np.where(mounted[:, None], [0.2, -0.1, 0.3], 0.0)
+    robot_mount = (4 + 6 * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
+    mount_parameters = np.where(mounted[:, None], robot_mount, 0)
+    scale_parameter = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
+    root = 0.05 * (np.eye(2) + 0.3 * rng.standard_normal((n, 2, 2)))
+    sensor = se2.compose(truth.poses[pose], mount + truth.calibration[mount_parameters])
+    place = se2.apply(se2.inverse(sensor), truth.tags[tag]) / (1.0 + truth.calibration[scale_parameter])[:, None]
+    as_polar = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
+    value = np.where(polar[:, None], as_polar, place)
+    value += np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
+    value[rng.random(n) < 0.05] += 1.0
+    covariance = root @ root.swapaxes(-1, -2)
+    return ReadingFactors(pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter)
+
+
+def _who_reads_what(
+    rng: np.random.Generator, lengths: list[int], n_tags: int, reach: float
+) -> tuple[IntArray, IntArray]:
+    """Each chain reads the tags of two, and each tag is read along a part of some chain; some poses read one twice."""
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    pose, tag = [], []
+    for t in range(n_tags):
+        for chain, length in enumerate(lengths):
+            if t >= 2 and t % len(lengths) != chain and rng.random() < 0.5:
+                continue
+            n = max(2, int(reach * rng.random() * length))
+            first = int(rng.integers(0, max(1, length - n)))
+            at = first + rng.integers(0, min(n, length), max(3, n // 3))
+            pose.append(starts[chain] + np.minimum(at, length - 1))
+            tag.append(np.full(len(at), t))
+    return np.concatenate(pose), np.concatenate(tag)
+
+
+def _columns(n_poses: int, n_tags: int, free: IntArray) -> Columns:
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    n = 3 * n_poses - 3
+    calibration = np.where(free, n + 2 * n_tags + np.cumsum(free) - 1, -1)
+    return Columns(poses, n + np.arange(2 * n_tags).reshape(n_tags, 2), calibration, n + 2 * n_tags + int(free.sum()))

@@ -1,0 +1,162 @@
+"""Elimination in nested pieces: steps, covariances and costs are those of plain dense algebra."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib.arrays import FloatArray
+from offline.arrowhead import Arrowhead, UnderDeterminedError, build_arrowhead
+from offline.factors import Linearised, State
+from offline.robust import SQUARES, Loss, cauchy, graduated, huber
+from offline.solver import Problem
+from tests.made_graphs import made_graph
+
+LOSSES = st.sampled_from([SQUARES, huber(1.5), cauchy(1.5), graduated(2.0, 4.0)])
+
+
+def arrowhead_of(problem: Problem) -> Arrowhead:
+    return build_arrowhead(problem.odometry, problem.readings, problem.prior, problem.columns)
+
+
+def weights(loss: Loss, residual: FloatArray) -> FloatArray:
+    """rho'(s), written out once more."""
+    s, c2 = (residual**2).sum(axis=1), loss.threshold**2
+    by_form = [np.ones_like(s), np.minimum(1.0, loss.threshold / np.sqrt(s)), c2 / (c2 + s), (c2 / (c2 + s)) ** 2]
+    return np.asarray(by_form[loss.form])
+
+
+def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Loss) -> tuple[FloatArray, FloatArray]:
+    """H (n, n) and g (n,), one factor at a time, with the robust weights of the state."""
+    columns, n = problem.columns, problem.columns.n
+    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+
+    def add(kind: Linearised, weight: FloatArray) -> None:
+        for m, residual in enumerate(kind.residual):
+            jacobian = np.zeros((len(residual), n + 1))
+            for block_columns, derivative in kind.blocks:
+                for k, column in enumerate(block_columns[m]):
+                    jacobian[:, column] += derivative[m][:, k]  # -1, held: the last one
+            J = jacobian[:, :n]
+            hessian[:] += weight[m] * J.T @ J
+            gradient[:] += weight[m] * J.T @ residual
+
+    odometry, readings = problem.odometry.linearise(state, columns), problem.readings.linearise(state, columns)
+    prior = problem.prior.linearise(state, columns)
+    add(odometry, weights(odometry_loss, odometry.residual))
+    add(readings, weights(reading_loss, readings.residual))
+    add(prior, np.ones(len(prior.residual)))
+    return hessian, gradient
+
+
+def allowed(condition: float) -> float:
+    return 1e-9 if condition < 1e6 else 100.0 * np.finfo(float).eps * condition
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    lengths=st.lists(st.integers(1, 130), min_size=1, max_size=3),
+    n_tags=st.integers(1, 8),
+    calibrated=st.booleans(),
+    reach=st.sampled_from([0.05, 0.3, 1.0]),
+    odometry_loss=LOSSES,
+    reading_loss=LOSSES,
+    damping=st.sampled_from([0.0, 1e-3]),
+)
+@settings(max_examples=25, deadline=None)
+def test_steps_and_covariances_equal_dense_algebra(
+    seed: int,
+    lengths: list[int],
+    n_tags: int,
+    calibrated: bool,
+    reach: float,
+    odometry_loss: Loss,
+    reading_loss: Loss,
+    damping: float,
+) -> None:
+    problem, truth = made_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach)
+    H, g = dense(problem, truth, odometry_loss, reading_loss)
+    H += damping * np.diag(H.diagonal())
+    if not len(g):
+        return
+    condition = float(np.linalg.cond(H))
+    if condition > 1e12:
+        return
+    system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, reading_loss)
+    factorisation = arrowhead_of(problem).factorise(system, damping)
+    step, expected = factorisation.solve(g), np.linalg.solve(H, g)
+    assert np.linalg.norm(step - expected) <= allowed(condition) * np.linalg.norm(expected)
+    wanted = np.random.default_rng(seed).permutation(len(g))[:40]
+    covariance = np.linalg.inv(H)[np.ix_(wanted, wanted)]
+    sigma = np.sqrt(covariance.diagonal())
+    found = factorisation.covariance(wanted)
+    assert (np.abs(found - covariance) / np.outer(sigma, sigma)).max() <= allowed(condition)
+
+
+def test_long_chains_pass_through_all_levels() -> None:
+    problem, truth = made_graph(4, [700, 40], 30, reach=0.04)
+    H, g = problem.linearise(truth)
+    arrowhead = arrowhead_of(problem)
+    assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == {1, 2, 3}
+    system, cost = arrowhead.linearise(truth, reading_loss=huber(3.0))
+    step = arrowhead.factorise(system).solve(g)
+    assert cost == pytest.approx(problem.cost(truth), rel=1e-13)
+    assert np.linalg.norm(H @ step - g) <= 1e-9 * np.linalg.norm(g)
+    # A joint covariance of what is eliminated in leaves, between them and at the top.
+    wanted = np.r_[-1, 5:9, 91:99, 1500:1503, len(g) - 30 : len(g) : 3]
+    unit = np.zeros((len(g), len(wanted)))
+    unit[wanted[1:], np.arange(1, len(wanted))] = 1.0
+    expected = np.linalg.solve(H.toarray(), unit)[wanted] * (wanted >= 0)[:, None]
+    sigma = np.sqrt(np.where(wanted >= 0, expected.diagonal(), 1.0))
+    found = arrowhead.factorise(system).covariance(wanted)
+    assert (np.abs(found - expected) / np.outer(sigma, sigma)).max() <= allowed(float(np.linalg.cond(H.toarray())))
+
+
+@given(seed=st.integers(0, 10**6), loss=LOSSES)
+@settings(max_examples=20, deadline=None)
+def test_gradient_is_the_costs_derivative(seed: int, loss: Loss) -> None:
+    """Far from the optimum too: residuals, Jacobians and losses belong together."""
+    problem, truth = made_graph(seed, [20, 9], 4)
+    rng = np.random.default_rng(seed)
+    start = problem.moved(truth, 0.1 * rng.standard_normal(problem.columns.n))
+    arrowhead = arrowhead_of(problem)
+    system, _ = arrowhead.linearise(start, loss, loss)
+    way = rng.standard_normal(problem.columns.n)
+    way /= np.linalg.norm(way)
+    ahead, behind = (arrowhead.linearise(problem.moved(start, h * way), loss, loss)[1] for h in (1e-6, -1e-6))
+    slope = float(system.gradient[arrowhead.tangent] @ way)
+    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=1e-4, abs=1e-4 * float(np.linalg.norm(system.gradient)))
+
+
+@given(seed=st.integers(0, 1000), lengths=st.lists(st.integers(1, 2000), min_size=1, max_size=4))
+@settings(max_examples=10, deadline=None)
+def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
+    problem, _ = made_graph(seed, lengths, 5, reach=0.02)
+    tree = arrowhead_of(problem).tree
+    in_leaves = [
+        np.arange(3 * tree.first[node], 3 * tree.end[node]) for node in np.flatnonzero(tree.level == 0).tolist()
+    ]
+    in_fronts = [tree.front[s : s + n] for s, n in zip(tree.front_start, tree.n_eliminated, strict=False)]
+    eliminated = np.sort(np.concatenate([*in_leaves, *in_fronts]))
+    np.testing.assert_array_equal(eliminated, np.arange(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration))
+
+
+def test_what_nothing_ties_down_is_named() -> None:
+    problem, truth = made_graph(1, [50, 50], 3)
+    loose = problem.columns.tags[2, 0]
+    arrowhead = arrowhead_of(problem)
+    system, _ = arrowhead.linearise(truth)
+    system.pose_tag[arrowhead.readings.tag == 2] = 0.0
+    system.tag[2] = 0.0
+    system.tag_calibration[2] = 0.0
+    with pytest.raises(UnderDeterminedError) as raised:
+        arrowhead.factorise(system)
+    assert raised.value.column == loose
+
+
+def test_condition_is_estimated() -> None:
+    problem, truth = made_graph(2, [60, 30], 5)
+    arrowhead = arrowhead_of(problem)
+    system, _ = arrowhead.linearise(truth, reading_loss=huber(3.0))
+    true = np.linalg.cond(problem.linearise(truth)[0].toarray())
+    assert 0.5 * true < arrowhead.factorise(system).condition() < 1.001 * true
