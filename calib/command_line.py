@@ -1,17 +1,30 @@
 """How every program of ours starts and ends."""
 
+import signal
 import sys
-from typing import NoReturn
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Final, NoReturn
 
 import typer
 
 from calib.errors import GroundsbotError
 
-EXIT_DONE = 0
-EXIT_REFUSED = 1
-EXIT_USAGE = 2
-EXIT_WITH_LOSSES = 3
-EXIT_INTERRUPTED = 130
+EXIT_DONE: Final = 0
+EXIT_REFUSED: Final = 1
+EXIT_WITH_LOSSES: Final = 3
+
+_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_EXIT_SIGNALLED: Final = 128  # plus the signal's number, as shells have it
+
+
+class _Interrupted(BaseException):
+    """Raised by a signal, so that whatever is half done is cleaned up; Typer would swallow a KeyboardInterrupt."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 def new_app(help_text: str) -> typer.Typer:
@@ -27,13 +40,38 @@ def new_app(help_text: str) -> typer.Typer:
 
 
 def run(app: typer.Typer) -> NoReturn:
-    """Runs a program: a known error is one line and exit 1, an unknown one a traceback."""
+    """Runs a program: a known error is one line and exit 1, an unknown one a traceback.
+
+    SIGINT (Ctrl-C) and SIGTERM unwind it, one line and exit 130 or 143, unless its command handles them itself.
+    """
     try:
-        app()
+        with _unwound_by_signals():
+            app()
     except GroundsbotError as error:
         sys.stderr.write(f"error: {' '.join(str(error).split())}\n")
         sys.exit(EXIT_REFUSED)
-    except KeyboardInterrupt:
+    except _Interrupted as interrupted:
         sys.stderr.write("interrupted\n")
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(_EXIT_SIGNALLED + interrupted.number)
     sys.exit(EXIT_DONE)
+
+
+@contextmanager
+def _unwound_by_signals() -> Iterator[None]:
+    """Signals that end the program raise in the block; what it was started to ignore stays ignored."""
+    before = {each: signal.getsignal(each) for each in _ENDING_SIGNALS}
+    taken = [each for each, handler in before.items() if handler is not signal.SIG_IGN]
+    for each in taken:
+        signal.signal(each, _unwind)
+    try:
+        yield
+    finally:
+        for each in taken:
+            if signal.getsignal(each) is _unwind:  # not where a command set its own
+                signal.signal(each, before[each])
+
+
+def _unwind(number: int, _frame: FrameType | None) -> None:
+    for each in _ENDING_SIGNALS:  # a second one must not stop the cleaning up
+        signal.signal(each, signal.SIG_IGN)
+    raise _Interrupted(number)
