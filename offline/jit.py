@@ -1,9 +1,14 @@
 """Compiled inner loops: numba with its cache on disk, and without where nothing may be written."""
 
+import hashlib
+import os
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
+from numba.core import event
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -19,3 +24,53 @@ def jitted(function: _F) -> _F:
     except RuntimeError:  # numba found no folder that it may write to
         compiled = numba.njit(error_model="numpy", fastmath={"contract"})(function)
     return cast("_F", compiled)
+
+
+class _Announcer(event.Listener):
+    """Tells of the first compilation, and only of that."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell: Callable[[str], None] | None = tell
+
+    def on_start(self, event: object) -> None:
+        """Called by numba when it begins to compile; not when it loads from the cache."""
+        if self._tell is not None:
+            self._tell("compiling the solver, this once; some half a minute")
+            self._tell = None
+
+    def on_end(self, event: object) -> None:
+        """Called by numba when it is done."""
+
+
+def announce_compilation(tell: Callable[[str], None]) -> None:
+    """Has the first compilation of this process told of; a process that finds all in the cache stays silent."""
+    event.register("numba:compile", _Announcer(tell))  # type: ignore[no-untyped-call] # numba's own
+
+
+def _kernel_hash() -> str:
+    """Of all files with compiled functions: numba's cache looks only at the file of the function called."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        source = path.read_bytes()
+        if b"offline.jit" in source:
+            digest.update(source)
+    return digest.hexdigest()[:16]
+
+
+def _keep_cache_apart() -> None:
+    """A cache folder for these sources alone, so that an edit of one file is never met by code of the old one."""
+    beside = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "groundsbot"
+    for root in (beside, home):
+        folder = root / f"solver-{_kernel_hash()}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            continue
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined] # numba fills its config at run time
+        return
+
+
+_keep_cache_apart()
