@@ -76,6 +76,8 @@ def test_base_gives_what_is_not_given_again(tmp_path: Path) -> None:
         (TINY.replace("x_m: 2.0", "x_m: far"), r"tiny: robots\[0\].route.waypoints\[0\].x_m is 'far' but must be"),
         (TINY + "wals: []\n", r"tiny: wals .*is not a field; did you mean walls\?"),
         (TINY + "pictures: {gamma: 0}\n", "tiny: pictures.gamma is 0 but must be greater than 0"),
+        (TINY + "pictures: {rate_hz: 1001}\n", "pictures.rate_hz is 1001 but must be less than or equal to 1000"),
+        (TINY + "wheel_link: {rate_hz: 1.0e+6}\n", "wheel_link.rate_hz is .* must be less than or equal to 10000"),
         (TINY + TINY.split("robots:\n")[1], r"id a is given twice"),
         ("name: x\nbase: nowhere\n", "world nowhere: neither a file nor one of"),
     ],
