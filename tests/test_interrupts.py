@@ -1,0 +1,109 @@
+"""Ctrl-C and SIGTERM: one line, the exit code shells know, nothing half-written, no process left."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from calib.command_line import new_app, run
+
+LIMIT_S = 30.0  # only a program that hangs comes near
+
+# `map`, but the map never gets finished.
+ENDLESS_MAP = """
+import sys, time
+from offline import cli, map_command
+def write(_result, folder):
+    (folder / "map.json").write_text("half")
+    time.sleep(60)
+map_command.find_logs = lambda logs: logs
+map_command.map_logs = lambda *_: None
+map_command.write_map = write
+cli.main()
+"""
+
+SIGNALS = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+
+
+@contextmanager
+def program(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """A Python process with a group of its own, as from a terminal."""
+    process = subprocess.Popen(
+        ["env", "--default-signal=INT,TERM", sys.executable, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def end_of(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, str]:
+    """Signals as a terminal (all of the group) or as `kill` does; the output ends with the last process that has it."""
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)
+    else:
+        process.send_signal(number)
+    said, _ = process.communicate(timeout=LIMIT_S)
+    return process.returncode, said
+
+
+@SIGNALS
+@pytest.mark.parametrize("rendering", [False, True], ids=["processes starting", "rendering"])
+def test_an_interrupted_simulation_leaves_nothing(
+    tmp_path: Path, number: signal.Signals, code: int, rendering: bool
+) -> None:
+    output = tmp_path / "logs"
+    awaited = "*.partial/*/*/*.mcap*" if rendering else "*.partial"
+    long = ("--world", "room", "--frame-rate-hz", 1000)  # minutes, were its processes waited for
+    with program("-m", "fixtures", "simulate", *long, "--output", output) as process:
+        wait_until(lambda: any(output.glob(awaited)), process)
+        assert end_of(process, number) == (code, "interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@SIGNALS
+@pytest.mark.parametrize("existing", [False, True], ids=["new folder", "overwrite"])
+def test_an_interrupted_map_leaves_what_was_there(
+    tmp_path: Path, number: signal.Signals, code: int, existing: bool
+) -> None:
+    output = tmp_path / "map"
+    if existing:
+        output.mkdir()
+        (output / "map.json").write_text("earlier")
+    before = sorted(tmp_path.rglob("*"))
+    with program("-c", ENDLESS_MAP, "map", tmp_path / "log", "-o", output, "--overwrite") as process:
+        wait_until(lambda: any(tmp_path.glob(".*.partial/map.json")), process)
+        assert end_of(process, number) == (code, "interrupted\n")
+    assert sorted(tmp_path.rglob("*")) == before
+    assert not existing or (output / "map.json").read_text() == "earlier"
+
+
+def test_signal_handlers_are_as_before_when_a_program_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    app = new_app("Does nothing.")
+    app.command()(lambda: None)
+    monkeypatch.setattr(sys, "argv", ["nothing"])
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(SystemExit) as caught:
+        run(app)
+    assert caught.value.code == 0
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
