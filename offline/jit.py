@@ -3,12 +3,15 @@
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Final, TypeVar, cast
 
 import numba
 from numba.core import event
+
+COMPILING: Final = "compiling the solver, this once; some half a minute"
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -35,16 +38,22 @@ class _Announcer(event.Listener):
     def on_start(self, event: object) -> None:
         """Called by numba when it begins to compile; not when it loads from the cache."""
         if self._tell is not None:
-            self._tell("compiling the solver, this once; some half a minute")
+            self._tell(COMPILING)
             self._tell = None
 
     def on_end(self, event: object) -> None:
         """Called by numba when it is done."""
 
 
-def announce_compilation(tell: Callable[[str], None]) -> None:
-    """Has the first compilation of this process told of; a process that finds all in the cache stays silent."""
-    event.register("numba:compile", _Announcer(tell))  # type: ignore[no-untyped-call] # numba's own
+@contextmanager
+def compilation_announced(tell: Callable[[str], None]) -> Iterator[None]:
+    """Has the block's first compilation told of; a block that finds all in the cache stays silent."""
+    announcer = _Announcer(tell)
+    event.register("numba:compile", announcer)  # type: ignore[no-untyped-call] # numba's own
+    try:
+        yield
+    finally:
+        event.unregister("numba:compile", announcer)  # type: ignore[no-untyped-call] # numba's own
 
 
 def _kernel_hash() -> str:

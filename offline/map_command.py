@@ -13,7 +13,7 @@ from pathlib import Path
 from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from calib.noise import read_noise_yaml
 from offline.errors import OfflineError
-from offline.jit import announce_compilation
+from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
 from offline.picture import write_picture
 from offline.pipeline import Progress, map_logs
@@ -48,8 +48,7 @@ def make_map(options: MapOptions) -> MapResult:
             raise OfflineError(f"--robot {path}: robot_id {given.robot.robot_id!r} is given twice; leave one out")
         robot_files[given.robot.robot_id] = given
     noise = read_noise_yaml(options.noise) if options.noise else None
-    announce_compilation(_say)
-    with _progress_bar() as progress:
+    with compilation_announced(_say), _progress_bar() as progress:
         result = map_logs(logs, robot_files, noise, progress)
     with _all_or_nothing(options.output) as folder:
         write_map(result, folder)

@@ -16,12 +16,14 @@ settings.load_profile("groundsbot")
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """`groundsbot-offline ARGUMENTS`, as the program."""
     from offline import cli
+    from offline.jit import COMPILING
 
     def call(*arguments: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["groundsbot-offline", *map(str, arguments)])
         with pytest.raises(SystemExit) as caught:
             cli.main()
         captured = capsys.readouterr()
-        return Outcome(int(caught.value.code or 0), captured.out, captured.err)
+        # Whichever test comes first on a fresh machine has the solver compiled.
+        return Outcome(int(caught.value.code or 0), captured.out, captured.err.replace(f"{COMPILING}\n", ""))
 
     return call
