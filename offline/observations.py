@@ -4,7 +4,7 @@ A reading is a tag's place on the floor as (range, bearing) or (x, y), about the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,11 +12,12 @@ from scipy.special import chdtri
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.camera_model import CameraModel
 from calib.errors import CalibError
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
 from offline.run import Detections, Positions, Run
-from offline.tag_pose import general_readings, upright_readings
+from offline.tag_pose import TagReadings, general_readings, upright_readings
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -97,28 +98,17 @@ def read_detections(
     keyframe, tag, corners_px = _averaged(keyframe[known], detections.tag[known], detections.corners_px[known])
     if not len(tag):
         return _no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
-    seen, index = np.unique(tag, return_inverse=True)
-    sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
-    rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
-    found = upright_readings(corners_px, sides_m, camera, rotation, noise.sigma_corner_px)
-    doubted = np.isin(tag, _doubted(tag, found.chi2))
-    general = found.replaced(
-        doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, noise.sigma_corner_px)
-    )
-    askew = _askew(tag, found.chi2, general.chi2, doubted)
-    is_askew = np.isin(tag, askew)
-    spoilt = _spoilt(found.chi2, is_askew)
-    found = found.replaced(is_askew, general.where(is_askew))
+    found, is_askew = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
-        for t in askew
+        for t in np.unique(tag[is_askew])
     ]
     range_m = found.range_bearing[:, 0]
     # From base's axes to the camera's yaw, about which all readings in_camera are.
     value = np.stack([range_m, se2.wrap_angle(found.range_bearing[:, 1] - run.robot.mount.yaw_rad)], axis=-1)
     with np.errstate(invalid="ignore"):
         sure = found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
-        good = found.valid & ~spoilt & (range_m > MIN_RANGE_M) & (sure | is_askew)
+        good = found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew)
     if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
         warnings.append(
             f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
@@ -134,6 +124,24 @@ def read_detections(
         ),
         warnings,
     )
+
+
+def _upright_or_askew(
+    run: Run, camera: CameraModel, tag: IntArray, corners_px: FloatArray, sigma_corner_px: float
+) -> tuple[TagReadings, BoolArray]:
+    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; and (M,) which those are."""
+    seen, index = np.unique(tag, return_inverse=True)
+    sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
+    rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
+    upright = upright_readings(corners_px, sides_m, camera, rotation, sigma_corner_px)
+    doubted = np.isin(tag, _doubted(tag, upright.chi2))
+    general = upright.replaced(
+        doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, sigma_corner_px)
+    )
+    is_askew = np.isin(tag, _askew(tag, upright.chi2, general.chi2, doubted))
+    spoilt = _spoilt(upright.chi2, is_askew)
+    found = upright.replaced(is_askew, general.where(is_askew))
+    return replace(found, valid=found.valid & ~spoilt), is_askew
 
 
 def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
