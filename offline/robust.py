@@ -9,12 +9,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from calib.arrays import FloatArray
 from offline.jit import jitted
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
 _CAUCHY: Final = 2
 _GEMAN_MCCLURE: Final = 3
+_TRUNCATED: Final = 4
+
+# What is cut off keeps this share of its force: a tag of which no reading fits is still somewhere, a thousand times
+# less certain than they say.
+_TRUNCATED_WEIGHT: Final = 1e-6
 
 
 class Loss(NamedTuple):
@@ -38,11 +44,24 @@ def cauchy(threshold: float) -> Loss:
 
 
 def graduated(threshold: float, control: float) -> Loss:
-    """Geman and McClure's c^2 s / (c^2 + s), surrogate with c^2 = control threshold^2.
+    """Geman and McClure's c^2 s / (c^2 + s), surrogate with c^2 = control threshold^2; the loss itself at control 1.
 
-    Nearly squares for a large control. Solve with a falling one, each from the solution of the last, down to 1.
+    Nearly squares for a large control. `graduated.solve_graduated` solves with a falling one.
     """
     return Loss(_GEMAN_MCCLURE, threshold * float(np.sqrt(control)))
+
+
+def truncated(threshold: float) -> Loss:
+    """Squares up to the threshold, then as good as constant: what lies beyond has no say.
+
+    Only for a start near the solution: what is cut off where the solve begins will not be heard again.
+    """
+    return Loss(_TRUNCATED, threshold)
+
+
+def forgets(loss: Loss) -> bool:
+    """Whether what is far off loses its say altogether, so that where the solve begins decides what is believed."""
+    return loss.form in (_GEMAN_MCCLURE, _TRUNCATED)
 
 
 @jitted
@@ -59,4 +78,15 @@ def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
     if loss.form == _GEMAN_MCCLURE:
         share = c2 / (c2 + square)
         return share * square, share * share
+    if loss.form == _TRUNCATED and square > c2:
+        return c2 + _TRUNCATED_WEIGHT * (square - c2), _TRUNCATED_WEIGHT
     return square, 1.0
+
+
+@jitted
+def losses_and_weights(loss: Loss, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(M,) losses and (M,) weights of whitened residuals (M, n)."""
+    losses, weights = np.empty(len(residual)), np.empty(len(residual))
+    for m in range(len(residual)):
+        losses[m], weights[m] = loss_and_weight(loss, np.square(residual[m]).sum())
+    return losses, weights

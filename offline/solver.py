@@ -10,15 +10,14 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead, Factorisation, UnderDeterminedError, build_arrowhead
 from offline.arrowhead_kernels import System
-from offline.factors import CalibrationPrior, Columns, Linearised, OdometryFactors, ReadingFactors, State
+from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
-from offline.robust import SQUARES, Loss, huber
+from offline.robust import SQUARES, Loss, huber, losses_and_weights
 
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0
@@ -42,7 +41,9 @@ class Losses(NamedTuple):
     readings: Loss
 
 
+# Readings carry Huber's loss: a tag that moved, or a phantom, bends the map with bounded force only.
 DEFAULT_LOSSES: Final = Losses(SQUARES, huber(HUBER_THRESHOLD))
+PLAIN_SQUARES: Final = Losses(SQUARES, SQUARES)
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,11 @@ class Problem:
     columns: Columns
     anchor: IntArray
 
-    def cost(self, state: State, *, robust: bool = True) -> float:
-        """Half the sum of squared whitened residuals, Huber's loss on the readings."""
-        readings = self.readings.residual(state)
-        return 0.5 * float(
-            (self.odometry.residual(state) ** 2).sum()
-            + (huber_loss(readings) if robust else readings**2).sum()
-            + (self.prior.residual(state) ** 2).sum()
-        )
+    def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
+        """Half the sum of all losses: F(x) = 1/2 (sum rho(|r|^2) over odometry and readings + sum c^2 / sigma^2)."""
+        odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
+        readings, _ = losses_and_weights(losses.readings, self.readings.residual(state))
+        return 0.5 * float(odometry.sum() + readings.sum() + (self.prior.residual(state) ** 2).sum())
 
     @cached_property
     def arrowhead(self) -> Arrowhead:
@@ -77,17 +75,6 @@ class Problem:
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
         return self.odometry.motion.size + self.readings.value.size
-
-    def linearise(self, state: State, *, robust: bool = True) -> tuple[sparse.csc_array, FloatArray]:
-        """H = J^T J (n, n) and g = J^T r (n,) at a state, the plain way: one sparse matrix."""
-        readings = self.readings.linearise(state, self.columns)
-        kinds = (
-            self.odometry.linearise(state, self.columns),
-            _reweighted(readings) if robust else readings,
-            self.prior.linearise(state, self.columns),
-        )
-        jacobian, residual = _stacked(kinds, self.columns.n)
-        return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
 
     def moved(self, state: State, step: FloatArray) -> State:
         """The state after a step (n,) in the tangent space.
@@ -234,48 +221,3 @@ def _expected_decrease(system: System, step: FloatArray, damping: float) -> floa
     """-g s - s H s / 2 of a step with (H + damping D) s = -g."""
     along = -float(system.gradient @ step)
     return 0.5 * (along + damping * diagonal_square(system, step)) if damping else 0.5 * along
-
-
-def huber_loss(residual: FloatArray) -> FloatArray:
-    """(M,) loss of whitened residuals (M, n) by their length: its square up to the threshold, then linear."""
-    length: FloatArray = np.linalg.norm(residual, axis=-1)
-    return np.where(length <= HUBER_THRESHOLD, length**2, HUBER_THRESHOLD * (2.0 * length - HUBER_THRESHOLD))
-
-
-def huber_weight(residual: FloatArray) -> FloatArray:
-    """(M,) weight of each residual (M, n) in the normal equations."""
-    length: FloatArray = np.linalg.norm(residual, axis=-1)
-    weight: FloatArray = HUBER_THRESHOLD / np.maximum(length, HUBER_THRESHOLD)
-    return weight
-
-
-def _reweighted(kind: Linearised) -> Linearised:
-    """Readings under Huber's loss as plain squares with the same gradient.
-
-    The weight's own change is left out. Putting part of it in (Triggs and others, "Bundle adjustment - a modern
-    synthesis", 2000, section 4.3) was tried: on recordings with many outliers it took more steps, not fewer.
-    """
-    root = np.sqrt(huber_weight(kind.residual))
-    return Linearised(
-        kind.residual * root[:, None],
-        tuple((columns, derivative * root[:, None, None]) for columns, derivative in kind.blocks),
-    )
-
-
-def _stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
-    """One sparse Jacobian (m, n) and its residuals (m,)."""
-    rows, columns, values, residuals = [], [], [], []
-    first_row = 0
-    for kind in kinds:
-        m, n = kind.residual.shape
-        row = first_row + np.arange(m * n).reshape(m, n, 1)
-        for block_columns, derivative in kind.blocks:
-            full = np.broadcast_to(block_columns[:, None, :], derivative.shape)
-            free = full >= 0
-            rows.append(np.broadcast_to(row, derivative.shape)[free])
-            columns.append(full[free])
-            values.append(derivative[free])
-        residuals.append(kind.residual.reshape(-1))
-        first_row += m * n
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)

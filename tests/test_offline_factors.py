@@ -9,7 +9,9 @@ import pytest
 from calib import se2
 from calib.arrays import FloatArray
 from offline.factors import Linearised, State, whitening
-from offline.solver import HUBER_THRESHOLD, Problem, huber_loss, huber_weight
+from offline.robust import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
+from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
+from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_problems import CALIBRATION_SIGMA, made_problem, random_state
 
 KINDS = ("odometry", "readings", "prior")
@@ -70,7 +72,7 @@ def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
     if n_outliers:
         lengths = np.linalg.norm(made.problem.readings.residual(state), axis=-1)
         assert (lengths > HUBER_THRESHOLD).sum() >= n_outliers
-    _, gradient = made.problem.linearise(state)
+    _, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
     h = 1e-6
     expected = [
         (made.problem.cost(made.problem.moved(state, step)) - made.problem.cost(made.problem.moved(state, -step)))
@@ -137,11 +139,23 @@ def test_whitening_makes_unit_covariances() -> None:
     np.testing.assert_allclose(W @ covariance @ W.swapaxes(-1, -2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-6)
 
 
-def test_huber_is_square_then_linear_and_its_weight_its_slope() -> None:
+def test_huber_is_square_then_linear() -> None:
     length = np.linspace(0.01, 20.0, 500)
-    residual = length[:, None] * [0.6, -0.8]
-    loss = huber_loss(residual)
-    inside = length <= HUBER_THRESHOLD
+    loss, _ = losses_and_weights(huber(3.0), length[:, None] * [0.6, -0.8])
+    inside = length <= 3.0
     np.testing.assert_allclose(loss[inside], length[inside] ** 2)
-    np.testing.assert_allclose(np.diff(loss[~inside]), 2 * HUBER_THRESHOLD * np.diff(length[~inside]))
-    np.testing.assert_allclose(huber_weight(residual) * 2 * length, np.gradient(loss, length), atol=0.05)
+    np.testing.assert_allclose(np.diff(loss[~inside]), 6.0 * np.diff(length[~inside]))
+
+
+@pytest.mark.parametrize("loss", [SQUARES, huber(3.0), cauchy(2.0), graduated(3.0, 2.0), truncated(5.0)], ids=repr)
+def test_weights_are_the_slopes_of_the_losses(loss: Loss) -> None:
+    square = np.setdiff1d(np.geomspace(1e-4, 1e4, 300), [loss.threshold**2])
+    h = 1e-6 * square
+
+    def at(square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return losses_and_weights(loss, np.sqrt(square)[:, None] * [0.6, -0.8])
+
+    slope = (at(square + h)[0] - at(square - h)[0]) / (2 * h)
+    np.testing.assert_allclose(at(square)[1], slope, rtol=1e-4)
+    assert (np.diff(at(square)[0]) > 0.0).all()
+    assert (at(square)[0] <= square * (1 + 1e-12)).all()

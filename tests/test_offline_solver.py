@@ -10,8 +10,10 @@ from offline.chain import chains_of
 from offline.factors import State
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import WheelTrack, chained
+from offline.robust import losses_and_weights
 from offline.run import TagKey
-from offline.solver import Problem, huber_weight, solve
+from offline.solver import DEFAULT_LOSSES, Problem, solve
+from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, START_NS, made_positions, made_robot, made_run
 from tests.made_problems import made_problem, random_state
 
@@ -22,7 +24,7 @@ def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, 
     """H and g from finite differences of the residuals alone."""
 
     def residual(at: State) -> FloatArray:
-        weight = np.sqrt(huber_weight(problem.readings.residual(state)))[:, None]
+        weight = np.sqrt(losses_and_weights(DEFAULT_LOSSES.readings, problem.readings.residual(state))[1])[:, None]
         kinds = (problem.odometry.residual(at), weight * problem.readings.residual(at), problem.prior.residual(at))
         return np.concatenate([kind.reshape(-1) for kind in kinds])
 
@@ -46,7 +48,7 @@ def distance(problem: Problem, a: State, b: State) -> float:
 def test_normal_equations_are_those_of_dense_algebra(seed: int, n_outliers: int) -> None:
     made = made_problem(seed, n_outliers=n_outliers)
     state = random_state(seed, made.truth, spread=0.02)
-    hessian, gradient = made.problem.linearise(state)
+    hessian, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
     expected_hessian, expected_gradient = dense_normal_equations(made.problem, state)
     np.testing.assert_allclose(hessian.toarray(), expected_hessian, rtol=1e-5, atol=1e-6 * expected_hessian.max())
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-5 * float(np.abs(expected_gradient).max()))

@@ -5,26 +5,27 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from calib.arrays import FloatArray
-from offline.factors import State
-from offline.solver import Problem
+from offline.factors import Linearised, State
+from offline.robust import SQUARES, Loss, losses_and_weights
+from offline.solver import PLAIN_SQUARES, Losses, Problem
 
 _MAX_ITERATIONS = 100
 
 
 def plain_solve(problem: Problem, start: State, relative_tolerance: float) -> tuple[State, int]:
     """Gauss-Newton, damped tenfold more where the cost goes up and tenfold less where it goes down."""
-    state, cost, damping = start, problem.cost(start, robust=False), 0.0
-    hessian, gradient = problem.linearise(state, robust=False)
+    state, cost, damping = start, problem.cost(start, PLAIN_SQUARES), 0.0
+    hessian, gradient = plain_normal_equations(problem, state)
     for iteration in range(1, _MAX_ITERATIONS + 1):
         step = plain_step(hessian, gradient, damping)
         expected = -0.5 * float(gradient @ step)
         if expected <= relative_tolerance * cost:
             return state, iteration
         candidate = problem.moved(state, step)
-        candidate_cost = problem.cost(candidate, robust=False)
+        candidate_cost = problem.cost(candidate, PLAIN_SQUARES)
         if candidate_cost < cost:
             state, cost, damping = candidate, candidate_cost, 0.1 * damping if damping > 1e-9 else 0.0
-            hessian, gradient = problem.linearise(state, robust=False)
+            hessian, gradient = plain_normal_equations(problem, state)
         else:
             damping = max(10.0 * damping, 1e-8)
     return state, _MAX_ITERATIONS
@@ -40,3 +41,46 @@ def plain_step(hessian: sparse.csc_array, gradient: FloatArray, damping: float) 
         options={"SymmetricMode": True},
     )
     return np.asarray(-factor.solve(gradient))
+
+
+def plain_normal_equations(
+    problem: Problem, state: State, losses: Losses = PLAIN_SQUARES
+) -> tuple[sparse.csc_array, FloatArray]:
+    """H = J^T J (n, n) and g = J^T r (n,) at a state, weights of robust losses included, from `factors` alone."""
+    kinds = (
+        _reweighted(problem.odometry.linearise(state, problem.columns), losses.odometry),
+        _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),
+        problem.prior.linearise(state, problem.columns),
+    )
+    jacobian, residual = _stacked(kinds, problem.columns.n)
+    return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
+
+
+def _reweighted(kind: Linearised, loss: Loss) -> Linearised:
+    """Factors under a robust loss as plain squares with the same gradient."""
+    if loss == SQUARES:
+        return kind
+    root = np.sqrt(losses_and_weights(loss, kind.residual)[1])
+    return Linearised(
+        kind.residual * root[:, None],
+        tuple((columns, derivative * root[:, None, None]) for columns, derivative in kind.blocks),
+    )
+
+
+def _stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
+    """One sparse Jacobian (m, n) and its residuals (m,)."""
+    rows, columns, values, residuals = [], [], [], []
+    first_row = 0
+    for kind in kinds:
+        m, n = kind.residual.shape
+        row = first_row + np.arange(m * n).reshape(m, n, 1)
+        for block_columns, derivative in kind.blocks:
+            full = np.broadcast_to(block_columns[:, None, :], derivative.shape)
+            free = full >= 0
+            rows.append(np.broadcast_to(row, derivative.shape)[free])
+            columns.append(full[free])
+            values.append(derivative[free])
+        residuals.append(kind.residual.reshape(-1))
+        first_row += m * n
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)

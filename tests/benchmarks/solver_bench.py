@@ -24,15 +24,13 @@ import numpy as np
 from calib.arrays import FloatArray
 from calib.files import written_whole
 from offline.factors import State
-from offline.robust import SQUARES
-from offline.solver import Losses, Problem, solve
-from tests.benchmarks.plain_solver import plain_solve, plain_step
+from offline.solver import PLAIN_SQUARES, Problem, solve
+from tests.benchmarks.plain_solver import plain_normal_equations, plain_solve, plain_step
 from tests.benchmarks.solver_world import SIGMA_START, Fleet, made_fleet
 
 TAGS: Final = {"2x1000": 50, "10x1000": 100, "2x10000": 200, "10x10000": 500, "50x2000": 500}
 SOLVERS: Final = ("ours", "gtsam", "gtsam_our_start", "splu")
 OUTPUT: Final = Path("build/benchmarks/solver.jsonl")
-_PLAIN: Final = Losses(SQUARES, SQUARES)
 # Where the next step would lower the cost by a smaller share the solve has arrived.
 _RELATIVE_TOLERANCE: Final = 1e-7
 _RELAXED_STEPS: Final = 2
@@ -51,7 +49,7 @@ def ours(fleet: Fleet) -> tuple[float, float, int, State]:
     began = time.perf_counter()
     start = our_start(fleet)
     solution = solve(
-        fleet.problem, start, losses=_PLAIN, relative_tolerance=_RELATIVE_TOLERANCE, relaxed_steps=_RELAXED_STEPS
+        fleet.problem, start, losses=PLAIN_SQUARES, relative_tolerance=_RELATIVE_TOLERANCE, relaxed_steps=_RELAXED_STEPS
     )
     seconds = time.perf_counter() - began
     arrowhead = fleet.problem.arrowhead
@@ -71,7 +69,7 @@ def splu(fleet: Fleet) -> tuple[float, float, int, State]:
     began = time.perf_counter()
     state, iterations = plain_solve(fleet.problem, start, _RELATIVE_TOLERANCE)
     seconds = time.perf_counter() - began
-    each = least_seconds(lambda: plain_step(*fleet.problem.linearise(start, robust=False), 0.0), 1)
+    each = least_seconds(lambda: plain_step(*plain_normal_equations(fleet.problem, start), 0.0), 1)
     return seconds, each, iterations, state
 
 
@@ -158,7 +156,7 @@ def measure(case: str, solver: str, seed: int) -> dict[str, Any]:
         "seconds": seconds,
         "seconds_per_iteration": each,
         "iterations": iterations,
-        "cost": fleet.problem.cost(state, robust=False),
+        "cost": fleet.problem.cost(state, PLAIN_SQUARES),
         "peak_mib": memory_mib("VmHWM") - before_mib,
     }
 
