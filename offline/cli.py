@@ -66,19 +66,22 @@ def map_command(
     ] = None,
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters; the others keep defaults.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
+    ] = False,
     json_output: JsonFlag = False,
 ) -> None:
     """Turns the drives in logs into one map of all tags and trajectories, in the frame of the first log's start.
 
     Exit 3: the runs do not all hang together; the map has several components, and the reasons are printed.
     """
-    from offline.map_command import MapOptions, as_json, exit_code, make_map, summary
+    from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
-    result = make_map(MapOptions(logs, output, robot or (), noise, overwrite))
+    result, costs = make_map(MapOptions(logs, output, robot or (), noise, overwrite))
     if json_output:
-        typer.echo(as_json(result))
+        typer.echo(as_json(result, costs if verbose else None))
     else:
-        for line in summary(result, output):
+        for line in [*summary(result, output), *(stage_lines(costs) if verbose else [])]:
             typer.echo(line)
     raise typer.Exit(exit_code(result))
 

@@ -13,19 +13,23 @@ from offline.merge import Group
 from offline.result import CalibrationResult, Component, RunResult, StartToStart, TagResult
 from offline.run import TagKey
 from offline.solver import Solution, solve
+from offline.stages import Stages
 
 
-def solve_global_map(maps: Sequence[LocalMap], group: Group) -> tuple[Graph, Solution]:
+def solve_global_map(maps: Sequence[LocalMap], group: Group, stages: Stages) -> tuple[Graph, Solution]:
     """Solves the members of a group together, from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
-    graph = build_graph([member.chain for member in members])
-    if len(members) == 1:
-        return graph, members[0].solution
-    poses = np.concatenate(
-        [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
-    )
-    solution = solve(graph.problem, graph.start(poses, _mean_tags(members, group), _mean_calibration(members)))
-    return graph, solution
+    with stages.stage("building the graph"):
+        graph = build_graph([member.chain for member in members])
+        if len(members) == 1:
+            return graph, members[0].solution
+        poses = np.concatenate(
+            [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
+        )
+        start = graph.start(poses, _mean_tags(members, group), _mean_calibration(members))
+        _ = graph.problem.arrowhead  # the order of elimination is part of it, and made when first asked for
+    with stages.stage("solving all runs together"):
+        return graph, solve(graph.problem, start)
 
 
 def component_of(graph: Graph, solution: Solution) -> Component:

@@ -16,9 +16,10 @@ from offline.errors import OfflineError
 from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
 from offline.picture import write_picture
-from offline.pipeline import Progress, map_logs
+from offline.pipeline import map_logs
 from offline.result import AlignmentResult, Component, MapResult
 from offline.run import RobotFile, read_robot_file
+from offline.stages import Progress, StageCost, Stages
 from onboard.log_reader import find_logs
 
 
@@ -33,27 +34,39 @@ class MapOptions:
     overwrite: bool = False
 
 
-def make_map(options: MapOptions) -> MapResult:
+def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     """Maps the logs and writes map.json, map.npz, tags.csv, trajectories and map.png.
+
+    Returns:
+        The map, and what each stage of making it took.
 
     Raises:
         GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
     """
     logs = find_logs(list(options.logs))
     _check_output(options.output, logs, overwrite=options.overwrite)
+    robot_files = _read_robot_files(options.robots)
+    noise = read_noise_yaml(options.noise) if options.noise else None
+    with compilation_announced(_say), _progress_bar() as show:
+        stages = Stages(show)
+        result = map_logs(logs, robot_files, noise, stages)
+        with _all_or_nothing(options.output) as folder:
+            with stages.stage("writing files"):
+                write_map(result, folder)
+            with stages.stage("drawing the picture"):
+                write_picture(result, folder / "map.png")
+    return result, stages.costs
+
+
+def _read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
+    """By robot id, of which each file must have its own."""
     robot_files: dict[str, RobotFile] = {}
-    for path in options.robots:
+    for path in paths:
         given = read_robot_file(path)
         if given.robot.robot_id in robot_files:
             raise OfflineError(f"--robot {path}: robot_id {given.robot.robot_id!r} is given twice; leave one out")
         robot_files[given.robot.robot_id] = given
-    noise = read_noise_yaml(options.noise) if options.noise else None
-    with compilation_announced(_say), _progress_bar() as progress:
-        result = map_logs(logs, robot_files, noise, progress)
-    with _all_or_nothing(options.output) as folder:
-        write_map(result, folder)
-        write_picture(result, folder / "map.png")
-    return result
+    return robot_files
 
 
 def _say(text: str) -> None:
@@ -80,9 +93,20 @@ def summary(result: MapResult, output: Path) -> list[str]:
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
 
 
-def as_json(result: MapResult) -> str:
-    """The content of map.json."""
-    return json.dumps(map_as_json(result), indent=2, allow_nan=False)
+def stage_lines(costs: Sequence[StageCost]) -> list[str]:
+    """What each stage took, as a table."""
+    lines = [f"{'stage':<28}{'seconds':>8}  peak MiB"]
+    for name, seconds, peak_mib in costs:
+        lines.append(f"{name:<28}{seconds:8.2f}" + ("" if peak_mib is None else f"{peak_mib:10.0f}"))
+    return lines
+
+
+def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
+    """The content of map.json, and what the stages took where that is given."""
+    data = map_as_json(result)
+    if costs is not None:
+        data["stages"] = [cost._asdict() for cost in costs]
+    return json.dumps(data, indent=2, allow_nan=False)
 
 
 def _component_lines(component: Component, *, several: bool) -> list[str]:
@@ -155,18 +179,22 @@ def _progress_bar() -> Iterator[Progress]:
         yield lambda _what, _done, _total: None
         return
     from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
-    from rich.progress import TaskID
 
-    with Bar(console=Console(stderr=True), transient=True) as bar:
-        tasks: dict[str, TaskID] = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+        current = ""
 
         def show(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                for task in tasks.values():
-                    bar.remove_task(task)
-                tasks.clear()
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
+            nonlocal current
+            if what != current:
+                bar.reset(task)
+                current = what
+            if total == 1:
+                bar.update(task, description=what, total=None)  # a bar that moves and tells no share
+            else:
+                bar.update(task, description=f"{what} {done}/{total}", completed=done, total=total)
 
         yield show

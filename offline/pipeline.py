@@ -1,6 +1,6 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -13,22 +13,17 @@ from offline.merge import Group, PairAlignment, align_pairs, group, reason_apart
 from offline.observations import check_tag_sizes
 from offline.result import AlignmentResult, CalibrationResult, Component, MapResult
 from offline.run import RobotFile, Run, load_run
+from offline.stages import Stages
 
 # A good calibration goes beyond this once in 16,000 times.
 MAX_PRIOR_SIGMAS: Final = 4.0
-
-Progress = Callable[[str, int, int], None]  # what is being done, how many are done, of how many
-
-
-def _silent(_what: str, _done: int, _total: int) -> None:
-    """Progress for nobody."""
 
 
 def map_logs(
     logs: Sequence[Path],
     robot_files: Mapping[str, RobotFile] | None = None,
     noise: NoiseParameters | None = None,
-    progress: Progress = _silent,
+    stages: Stages | None = None,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
 
@@ -36,15 +31,17 @@ def map_logs(
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
         noise: sigmas of wheels and readings; defaults where None.
-        progress: told what is being done.
+        stages: told what is being done, and keeps what it took.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
     """
+    stages = stages or Stages()
     runs = []
-    for i, log in enumerate(logs):
-        progress("reading", i, len(logs))
-        runs.append(load_run(log, robot_files))
+    with stages.stage("reading logs", len(logs)) as done:
+        for log in logs:
+            runs.append(load_run(log, robot_files))
+            done()
     recorded = {run.robot_id for run in runs}
     for robot_id in robot_files or {}:
         if robot_id not in recorded:
@@ -52,29 +49,34 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return map_runs(runs, noise or NoiseParameters(), progress)
+    return map_runs(runs, noise or NoiseParameters(), stages)
 
 
-def map_runs(runs: Sequence[Run], noise: NoiseParameters, progress: Progress = _silent) -> MapResult:
+def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> MapResult:
     """As `map_logs`, from runs already read."""
     _check_distinct(runs)
     check_tag_sizes(runs)
-    chains = [chain for run in runs for chain in chains_of(run, noise)]
+    chains: list[Chain] = []
+    with stages.stage("keyframes and readings", len(runs)) as done:
+        for run in runs:
+            chains += chains_of(run, noise)
+            done()
     maps = []
-    for i, chain in enumerate(chains):
-        progress("local maps", i, len(chains))
-        maps.append(solve_local_map(chain))
-    progress("merging", 0, 1)
-    pairs = align_pairs(maps)
-    groups = group(maps, pairs)
+    with stages.stage("local maps", len(chains)) as done:
+        for chain in chains:
+            maps.append(solve_local_map(chain))
+            done()
+    with stages.stage("aligning local maps"):
+        pairs = align_pairs(maps)
+        groups = group(maps, pairs)
     components: list[Component] = []
     calibration: list[CalibrationResult] = []
     warnings = [w for run in runs for w in run.warnings] + [w for chain in chains for w in chain.warnings]
     for i, members in enumerate(groups):
-        progress("solving all runs together", i, len(groups))
-        graph, solution = solve_global_map(maps, members)
-        components.append(component_of(graph, solution))
-        calibration.extend(calibration_of(graph, solution, i))
+        graph, solution = solve_global_map(maps, members, stages)
+        with stages.stage("covariances"):
+            components.append(component_of(graph, solution))
+            calibration.extend(calibration_of(graph, solution, i))
         if not solution.converged:
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
     warnings += _calibration_warnings(calibration)

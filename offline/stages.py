@@ -1,0 +1,61 @@
+"""What the mapping is doing: told while it works, and the seconds and memory of each stage when it is done."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, NamedTuple
+
+Progress = Callable[[str, int, int], None]  # what is being done, how many are done, of how many
+Tick = Callable[[], None]  # one more is done
+
+_STATUS: Final = Path("/proc/self/status")
+
+
+class StageCost(NamedTuple):
+    """What one stage took."""
+
+    name: str
+    seconds: float
+    peak_mib: float | None  # the most memory that the process held until the stage's end; None where no kernel tells
+
+
+class Stages:
+    """Tells somebody of each stage as it begins and goes on, and keeps what each took."""
+
+    def __init__(self, tell: Progress | None = None) -> None:
+        """Args: tell: told at a stage's beginning and whenever one of its parts is done; None: nobody is."""
+        self._tell = tell or (lambda _what, _done, _total: None)
+        self._costs: dict[str, StageCost] = {}
+
+    @contextmanager
+    def stage(self, name: str, total: int = 1) -> Iterator[Tick]:
+        """Times the block as (another part of) a stage of `total` parts; yields what to call when a part is done."""
+        done = 0
+
+        def tick() -> None:
+            nonlocal done
+            done += 1
+            self._tell(name, done, total)
+
+        self._tell(name, 0, total)
+        began_s = time.perf_counter()
+        try:
+            yield tick
+        finally:
+            before_s = self._costs[name].seconds if name in self._costs else 0.0
+            self._costs[name] = StageCost(name, before_s + time.perf_counter() - began_s, _peak_mib())
+
+    @property
+    def costs(self) -> tuple[StageCost, ...]:
+        """Each stage so far, in order of their beginnings."""
+        return tuple(self._costs.values())
+
+
+def _peak_mib() -> float | None:
+    """The kernel's high-water mark of this process's memory, which Linux alone tells without what its parent held."""
+    try:
+        lines = _STATUS.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:")), None)

@@ -1,0 +1,119 @@
+"""Stages of mapping: told as they go on, timed, and shown to the person who waits."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from offline import stages as stages_module
+from offline.stages import Stages
+from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+from tests.programs import Run
+
+ALL = [
+    "reading logs",
+    "keyframes and readings",
+    "local maps",
+    "aligning local maps",
+    "building the graph",
+    "solving all runs together",
+    "covariances",
+    "writing files",
+    "drawing the picture",
+]
+
+
+def test_beginning_and_progress_are_told() -> None:
+    told: list[tuple[str, int, int]] = []
+    stages = Stages(lambda *news: told.append(news))
+    with stages.stage("first", 2) as done:
+        done()
+        done()
+    with stages.stage("second"):
+        pass
+    assert told == [("first", 0, 2), ("first", 1, 2), ("first", 2, 2), ("second", 0, 1)]
+
+
+def test_a_stage_in_parts_is_one_stage_and_failures_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([1.0, 3.5, 10.0, 10.25, 20.0, 21.0])
+    monkeypatch.setattr(stages_module.time, "perf_counter", lambda: next(clock))
+    stages = Stages()
+    with stages.stage("graph"):
+        pass
+    with stages.stage("solve"):
+        pass
+    with pytest.raises(ZeroDivisionError), stages.stage("graph"):
+        raise ZeroDivisionError
+    assert [(name, seconds) for name, seconds, _ in stages.costs] == [("graph", 3.5), ("solve", 0.25)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells")
+def test_the_peak_is_of_this_process_and_never_falls() -> None:
+    stages = Stages()
+    with stages.stage("before"):
+        pass
+    with stages.stage("large"):
+        np.ones(8_000_000)  # 61 MiB, gone at once
+    with stages.stage("after"):
+        pass
+    before, large, after = (cost.peak_mib or 0.0 for cost in stages.costs)
+    assert before + 40.0 < large <= after
+
+
+def test_no_peak_where_the_kernel_tells_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(stages_module, "_STATUS", tmp_path / "none")
+    stages = Stages()
+    with stages.stage("any"):
+        pass
+    assert stages.costs[0].peak_mib is None
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    tags = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 2.0, 0.4), np.pi), MadeTag(2, (6.0, -1.0, 0.6), np.pi)]
+    for name, start in (("a", [0.0, 0.0, 0.2]), ("b", [0.5, 1.0, -0.1])):
+        write_drive(tmp_path / "logs", made_drive(start, [(0.5, 0.52, 3.0)]), tags, made_robot(name))
+    return tmp_path / "logs"
+
+
+def test_verbose_prints_each_stage(run: Run, logs: Path, tmp_path: Path) -> None:
+    outcome = run("map", logs, "-o", tmp_path / "map", "-v")
+    assert (outcome.code, outcome.err) == (0, "")
+    table = outcome.out[outcome.out.index("stage  ") :].splitlines()[1:]
+    assert [line[:28].rstrip() for line in table] == ALL
+
+
+def test_verbose_json_holds_the_stages_and_the_map_file_does_not(run: Run, logs: Path, tmp_path: Path) -> None:
+    outcome = run("map", logs, "-o", tmp_path / "map", "--verbose", "--json")
+    printed = json.loads(outcome.out)
+    stages = printed.pop("stages")
+    assert [stage["name"] for stage in stages] == ALL
+    assert all(stage["seconds"] >= 0.0 for stage in stages)
+    assert printed == json.loads((tmp_path / "map" / "map.json").read_text())
+    assert "stages" not in json.loads(run("map", logs, "-o", tmp_path / "again", "--json").out)
+
+
+def test_a_terminal_shows_the_stages_and_is_left_clean(logs: Path, tmp_path: Path) -> None:
+    outer, inner = pty.openpty()
+    command = [sys.executable, "-m", "offline.cli", "map", str(logs), "-o", str(tmp_path / "map")]
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=inner, env=environment) as program:
+        os.close(inner)
+        shown = b""
+        while True:
+            try:
+                shown += os.read(outer, 65536)
+            except OSError:  # the other end is closed
+                break
+        assert program.stdout is not None
+        printed = program.stdout.read().decode()
+    os.close(outer)
+    assert program.returncode == 0
+    assert b"drawing the picture" in shown
+    assert shown.endswith(b"\x1b[2K")  # the bar's line is wiped
+    assert "stage " not in printed
