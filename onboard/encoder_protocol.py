@@ -9,6 +9,7 @@ Nothing here knows of a port or a clock.
 
 import binascii
 import re
+from collections import deque
 from typing import Final, NamedTuple
 
 PROTOCOL_VERSION: Final = 1
@@ -18,6 +19,13 @@ _U16: Final = 1 << 16
 _U32: Final = 1 << 32
 _I32: Final = 1 << 31
 _NEWLINE: Final = b"\n"
+_REJECTED_KEPT: Final = 4
+_REMEMBERED_LINES: Final = 1024  # to tell a repeated line from an overtaken one
+# A controller that began anew under its old boot_id: so many lines in a row, one after the other, that are all so much
+# older than the newest. Lines that were overtaken or repeated on their way are neither that many nor that old.
+_RESTART_LINES: Final = 50
+_RESTART_US: Final = 2_000_000
+_NEXT_LIFE: Final = 0x9E3779B1  # added to the boot_id of a controller that keeps it: no other start will have that one
 _LINE: Final = re.compile(
     rb"\$(GBW,%d,(\d{1,10}),(\d{1,10}),(\d{1,10}),(-?\d{1,10}),(-?\d{1,10}),(\d{1,5}))\*([0-9A-F]{4})\r"
     % PROTOCOL_VERSION
@@ -69,13 +77,13 @@ class EncoderParser:
         accepted: lines returned so far.
         rejected: pieces between line ends that were, or began with, something else than an intact line. What comes
             before the first line end after the start is not counted: whoever connects comes in mid-line.
-        last_rejected: the bytes of the newest of these, at most `LINE_LIMIT_BYTES`.
+        last_rejected: the bytes of the newest few of these, each at most its last `LINE_LIMIT_BYTES`.
     """
 
     def __init__(self) -> None:
         self.accepted = 0
         self.rejected = 0
-        self.last_rejected = b""
+        self.last_rejected: deque[bytes] = deque(maxlen=_REJECTED_KEPT)
         self._rest = b""
         self._overlong = False
         self._in_step = False
@@ -114,7 +122,7 @@ class EncoderParser:
         if not self._in_step:
             return
         self.rejected += 1
-        self.last_rejected = piece[-LINE_LIMIT_BYTES:]
+        self.last_rejected.append(piece[-LINE_LIMIT_BYTES:])
 
 
 def parse_line(piece: bytes) -> WheelLine | None:
@@ -134,45 +142,78 @@ class WheelUnwrapper:
     """Makes counters that wrap around into ones that do not.
 
     Attributes:
-        repeated: lines dropped because their sequence number was not newer than the last one's.
-        epochs: boots seen.
+        repeated: lines left out because they had come before.
+        overtaken: lines left out because newer ones had come before them.
+        epochs: lives of the controller seen.
     """
 
     def __init__(self) -> None:
         self.repeated = 0
+        self.overtaken = 0
         self.epochs = 0
         self._last: WheelReading | None = None
         self._last_host_ns = 0
+        self._recent: deque[int] = deque(maxlen=_REMEMBERED_LINES)  # sequence numbers taken
+        self._old: WheelLine | None = None  # the newest of the old lines in a row
+        self._old_in_a_row = 0
+        self._lives = 0  # under one boot_id
+        self._wire_boot_id = -1
 
     def unwrap(self, line: WheelLine, host_ns: int) -> WheelReading | None:
-        """The reading, or None for a duplicated or overtaken line.
+        """The reading, or None for a repeated or overtaken line.
 
         Args:
             line: as parsed.
             host_ns: when it arrived; tells how often the microseconds wrapped around in a long silence.
         """
         last = self._last
-        if last is None or line.boot_id != last.boot_id:
-            self.epochs += 1
-            reading = WheelReading(*line, new_epoch=True, lost=0)
-        else:
-            sequence = _nearest(line.sequence, last.sequence)
-            if sequence <= last.sequence:
+        if last is None or line.boot_id != self._wire_boot_id:
+            return self._new_epoch(line, host_ns, lives=0)
+        sequence = _nearest(line.sequence, last.sequence)
+        expected_us = last.device_time_us + (host_ns - self._last_host_ns) // 1000
+        device_time_us = _nearest(line.t_us, expected_us)
+        if sequence > last.sequence and device_time_us <= last.device_time_us - _RESTART_US:
+            return self._new_epoch(line, host_ns, lives=self._lives + 1)  # its clock went back, its count did not
+        if sequence <= last.sequence:
+            if self._restarted(line, last, device_time_us):
+                return self._new_epoch(line, host_ns, lives=self._lives + 1)
+            if sequence in self._recent:
                 self.repeated += 1
-                return None
-            elapsed_us = (host_ns - self._last_host_ns) // 1000
-            reading = WheelReading(
-                line.boot_id,
-                sequence,
-                _nearest(line.t_us, last.device_time_us + elapsed_us),
-                _nearest(line.ticks_left, last.ticks_left),
-                _nearest(line.ticks_right, last.ticks_right),
-                line.flags,
-                new_epoch=False,
-                lost=sequence - last.sequence - 1,
-            )
+            else:
+                self.overtaken += 1
+            return None
+        reading = WheelReading(
+            last.boot_id,
+            sequence,
+            device_time_us,
+            _nearest(line.ticks_left, last.ticks_left),
+            _nearest(line.ticks_right, last.ticks_right),
+            line.flags,
+            new_epoch=False,
+            lost=sequence - last.sequence - 1,
+        )
+        return self._taken(reading, host_ns)
+
+    def _new_epoch(self, line: WheelLine, host_ns: int, lives: int) -> WheelReading:
+        self.epochs += 1
+        self._lives = lives
+        self._wire_boot_id = line.boot_id
+        self._recent.clear()
+        boot_id = (line.boot_id + lives * _NEXT_LIFE) % _U32
+        return self._taken(WheelReading(boot_id, *line[1:], new_epoch=True, lost=0), host_ns)
+
+    def _taken(self, reading: WheelReading, host_ns: int) -> WheelReading:
         self._last, self._last_host_ns = reading, host_ns
+        self._recent.append(reading.sequence)
+        self._old, self._old_in_a_row = None, 0
         return reading
+
+    def _restarted(self, line: WheelLine, last: WheelReading, device_time_us: int) -> bool:
+        """Whether old lines keep coming in good order, as from a controller that began anew."""
+        follows = self._old is not None and self._old.sequence < line.sequence and self._old.t_us < line.t_us
+        self._old_in_a_row = self._old_in_a_row + 1 if follows else 1
+        self._old = line
+        return self._old_in_a_row >= _RESTART_LINES and device_time_us <= last.device_time_us - _RESTART_US
 
 
 def _nearest(wrapped: int, expected: int) -> int:

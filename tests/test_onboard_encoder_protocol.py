@@ -62,7 +62,7 @@ def test_cut_and_glued_lines_cost_themselves_only() -> None:
     )
     assert parser.feed(data) == [good[0], good[1], good[3]]
     assert parser.rejected == 2  # what came before the first line end is nobody's loss
-    assert parser.last_rejected == format_line(good[2]).rstrip()
+    assert parser.last_rejected[-1] == format_line(good[2]).rstrip()
 
 
 @given(LINES, st.data())
@@ -93,7 +93,7 @@ def test_megabytes_of_noise_take_no_memory_and_make_no_reading() -> None:
         assert parser.feed(chance.randbytes(4096)) == []
         assert parser.feed(b"x$" * 2048) == []
         assert len(parser._rest) <= LINE_LIMIT_BYTES
-    assert len(parser.last_rejected) <= LINE_LIMIT_BYTES
+    assert all(len(each) <= LINE_LIMIT_BYTES for each in parser.last_rejected)
     assert parser.feed(b"\r\n" + format_line(LINE)) == [LINE]
 
 
@@ -151,7 +151,7 @@ def test_repeated_and_overtaken_lines_are_left_out() -> None:
     numbers = [5, 6, 6, 4, 7]
     readings = [unwrapper.unwrap(LINE._replace(sequence=number), 0) for number in numbers]
     assert [reading.sequence for reading in readings if reading is not None] == [5, 6, 7]
-    assert unwrapper.repeated == 2
+    assert (unwrapper.repeated, unwrapper.overtaken) == (1, 1)
 
 
 def test_a_new_boot_begins_anew() -> None:
@@ -161,3 +161,44 @@ def test_a_new_boot_begins_anew() -> None:
     assert reading is not None
     assert (reading.new_epoch, reading.lost, reading.ticks_left) == (True, 0, 0)
     assert unwrapper.epochs == 2
+
+
+def lines_of_a_life(n: int, boot_id: int = 9, start_us: int = 0) -> list[WheelLine]:
+    return [WheelLine(boot_id, index, start_us + index * 10_000, 7 * index, 8 * index, 0) for index in range(n)]
+
+
+def test_a_controller_that_keeps_its_boot_id_over_a_reset_begins_a_new_epoch_all_the_same() -> None:
+    unwrapper = WheelUnwrapper()
+    for index, line in enumerate(lines_of_a_life(1000)):
+        unwrapper.unwrap(line, index * 10_000_000)
+    again = [unwrapper.unwrap(line, (1100 + i) * 10_000_000) for i, line in enumerate(lines_of_a_life(300))]
+    taken = [reading for reading in again if reading is not None]
+    assert taken[0].new_epoch
+    assert not any(reading.new_epoch for reading in taken[1:])
+    assert len(taken) > 200
+    assert {reading.boot_id for reading in taken}.isdisjoint({9})
+    assert unwrapper.epochs == 2
+
+
+def test_a_count_that_goes_on_while_the_clock_goes_back_is_a_reset_too() -> None:
+    unwrapper = WheelUnwrapper()
+    for index, line in enumerate(lines_of_a_life(1000)):  # ten seconds
+        unwrapper.unwrap(line, index * 10_000_000)
+    unheard = lines_of_a_life(1100)[1001:]  # a new life of which the first lines were missed
+    late = [line._replace(t_us=line.t_us - 9_000_000) for line in unheard]
+    first = unwrapper.unwrap(late[0], 20_000_000_000)
+    assert first is not None
+    assert first.new_epoch
+
+
+def test_a_replay_of_a_second_and_a_host_that_slept_are_no_reset() -> None:
+    unwrapper = WheelUnwrapper()
+    lines = lines_of_a_life(2000)
+    for index, line in enumerate(lines[:1000]):
+        unwrapper.unwrap(line, index * 10_000_000)
+    for line in lines[900:1000]:
+        assert unwrapper.unwrap(line, 10_000_000_000) is None
+    asleep_ns = 60_000_000_000
+    readings = [unwrapper.unwrap(line, asleep_ns) for line in lines[1000:]]
+    assert all(reading is not None and not reading.new_epoch for reading in readings)
+    assert (unwrapper.epochs, unwrapper.repeated, unwrapper.overtaken) == (1, 100, 0)
