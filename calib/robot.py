@@ -141,6 +141,10 @@ class RecorderOptions(_Section):
     detector: DetectorName = "pupil-apriltags"
     quad_decimate: Annotated[float, Field(ge=1.0, le=8.0)] = 2.0
     families: Annotated[list[TagFamily], Field(min_length=1)] = ["tag36h11"]
+    segment_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 600.0
+    segment_mb: Annotated[int, Field(ge=1)] = 500
+    keep_free_mb: Annotated[int, Field(ge=0)] = 500
+    remove_old_pictures: bool = False
 
 
 class Robot(_Section):

@@ -14,7 +14,8 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from onboard.errors import LogError
-from onboard.log_writer import ACTIVE_SUFFIX, PICTURE_TOPIC
+from onboard.log_file import ACTIVE_SUFFIX
+from onboard.log_segments import PICTURE_TOPIC
 from onboard.messages import TOPICS, RunInfo
 
 # A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.

@@ -211,7 +211,7 @@ def flipped(data: bytes, at: int) -> bytes:
         (lambda data: b"", "is empty"),
         (lambda data: b"t_s,tag_id\n1,2\n" * 9, "is not an MCAP file"),
         (lambda data: data[:8], "ends at byte 8"),
-        (lambda data: data[: len(data) // 2], "does not fit in the file|cut short"),
+        (lambda data: data[: len(data) // 4], "does not fit in the file|cut short"),
         (lambda data: data[:2000] + b"\0" * 6000, "damaged|cut short|not fit"),
     ],
 )

@@ -1,0 +1,174 @@
+"""A run's files in order: a new pair after some time or size, each with the run's head, so that it opens alone.
+
+Measurements and pictures lie in files of their own, so that pictures can go first where room is short.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from operator import attrgetter
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from onboard.log_file import ACTIVE_SUFFIX, LogFile, Record
+from onboard.messages import TOPICS
+from onboard.storage import Storage
+
+PICTURE_TOPIC: Final = "/camera/image"
+CORE_SUFFIX: Final = ".core.mcap"
+CAMERA_SUFFIX: Final = ".camera.mcap"
+
+_NS_PER_S: Final = 1_000_000_000
+_HEADS: Final = tuple(name for name, topic in TOPICS.items() if topic.every_file)
+_CORE_TOPICS: Final = tuple(name for name in TOPICS if name != PICTURE_TOPIC)
+
+
+class SegmentLimits(NamedTuple):
+    """When new files are begun."""
+
+    duration_ns: int = 600 * _NS_PER_S  # of log time
+    size_bytes: int = 512 << 20  # of one file
+
+
+class LogSegments:
+    """Writes records into files; raises OSError, and can go on in new files then.
+
+    Attributes:
+        n_written: records appended to a file so far.
+    """
+
+    def __init__(
+        self,
+        storage: Storage,
+        files_of: Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]],
+        head: Sequence[Record],
+        limits: SegmentLimits | None,
+    ) -> None:
+        """Creates nothing yet.
+
+        Args:
+            storage: where.
+            files_of: the files of a segment, by its number, and each one's topics.
+            head: what stands at the head of every file.
+            limits: when a new segment begins; None: there is only one.
+        """
+        self.n_written = 0
+        self._storage = storage
+        self._files_of = files_of
+        self._head = head
+        self._limits = limits
+        self._next = 0
+        self._start_ns = 0
+        self._files: dict[Path, LogFile] = {}
+        self._by_topic: dict[str, LogFile] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there are files to write into."""
+        return bool(self._files)
+
+    @property
+    def names(self) -> str:
+        """The open files, for a person."""
+        return ", ".join(path.name for path in self._files)
+
+    def open(self, start_ns: int) -> None:
+        """Begins the next segment: creates its files, writes their heads and waits until they are on the disk."""
+        self._start_ns = start_ns
+        try:
+            for path, topics in self._files_of(self._next):
+                file = LogFile(self._storage, path, topics, compressed=not path.name.endswith(CAMERA_SUFFIX))
+                self._files[path] = file
+                self._by_topic |= dict.fromkeys(topics, file)
+                for record in self._head:
+                    file.append(record._replace(log_time_ns=start_ns))
+                file.unsafe.clear()  # every file has them anyway
+            self.commit()
+            self.sync()
+            for folder in {path.parent for path in self._files}:
+                self._storage.sync_folder(folder)
+        except OSError as error:
+            self.discard()
+            if isinstance(error, FileExistsError):  # what failed before may have been left there
+                self._next += 1
+            raise
+        self._next += 1
+
+    def append(self, record: Record) -> None:
+        """Takes a record; begins a new segment before it where that is due."""
+        if self._limits is not None and self._is_full(record.log_time_ns, self._limits):
+            self.finish()
+            self.open(record.log_time_ns)
+        self._by_topic[record.topic].append(record)
+        self.n_written += 1
+
+    def commit(self) -> None:
+        """Writes all that was appended, in whole chunks."""
+        for file in self._files.values():
+            file.commit()
+
+    def sync(self) -> None:
+        """Returns once all that is committed is on the disk."""
+        for file in self._files.values():
+            file.sync()
+
+    def finish(self) -> None:
+        """Finishes the files and gives them their names. Call it again if it raises."""
+        for path in list(self._files):
+            self._files[path].finish()
+            del self._files[path]
+        self._by_topic = {}
+
+    def abandon(self) -> list[Record]:
+        """Leaves the files as they stand, called `.active`; returns the records that are not safe in them."""
+        unsafe = list(heapq.merge(*(file.unsafe for file in self._files.values()), key=attrgetter("log_time_ns")))
+        self._close(LogFile.abandon)
+        return unsafe
+
+    def discard(self) -> None:
+        """Removes the open files."""
+        self._close(LogFile.discard)
+
+    def _close(self, close: Callable[[LogFile], None]) -> None:
+        for file in self._files.values():
+            with suppress(OSError):
+                close(file)
+        self._files, self._by_topic = {}, {}
+
+    def _is_full(self, log_time_ns: int, limits: SegmentLimits) -> bool:
+        return log_time_ns - self._start_ns >= limits.duration_ns or any(
+            file.size_bytes >= limits.size_bytes for file in self._files.values()
+        )
+
+
+def files_of_run(
+    storage: Storage, folder: Path, keep_pictures: bool
+) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
+    """Names `0000.core.mcap` and, with pictures, `0000.camera.mcap` and so on in a run's folder."""
+
+    def of(number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
+        storage.make_folder(folder)
+        core = folder / f"{number:04d}{CORE_SUFFIX}", _CORE_TOPICS
+        return [core, (folder / f"{number:04d}{CAMERA_SUFFIX}", (*_HEADS, PICTURE_TOPIC))] if keep_pictures else [core]
+
+    return of
+
+
+def single_file(storage: Storage, path: Path) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
+    """Names one file for all topics."""
+
+    def of(_number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
+        storage.make_folder(path.parent)
+        return [(path, tuple(TOPICS))]
+
+    return of
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether the file is one under way, or one whose writing was cut short."""
+    return path.name.endswith(ACTIVE_SUFFIX)
+
+
+def of_pictures(files: Iterable[Path]) -> list[Path]:
+    """Those that hold pictures."""
+    return [path for path in files if path.name.removesuffix(ACTIVE_SUFFIX).endswith(CAMERA_SUFFIX)]

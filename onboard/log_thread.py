@@ -1,0 +1,71 @@
+"""A thread in which a log's disk may take its time."""
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from google.protobuf.message import Message
+
+from onboard.log_keeper import LogKeeper, LogStatus
+from onboard.log_writer import LogNote
+from onboard.messages import EventKind, Severity
+
+_PERIOD_S: Final = 0.5  # with the time that the disk takes, what is older than a second is safe
+_END_LIMIT_S: Final = 3.0
+
+
+class LogThread:
+    """A run's log whose disk works in a thread of its own."""
+
+    def __init__(self, keeper: LogKeeper, period_s: float = _PERIOD_S) -> None:
+        """Starts the thread, which opens the files."""
+        self._keeper = keeper
+        self._period_s = period_s
+        self._stop = threading.Event()
+        self._stepped_s = time.monotonic()
+        self._given_up: list[LogNote] = []
+        self._thread = threading.Thread(target=self._work, name="log", daemon=True)
+        self._thread.start()
+
+    @property
+    def last_log_time_ns(self) -> int:
+        """The newest log time taken."""
+        return self._keeper.last_log_time_ns
+
+    @property
+    def status(self) -> LogStatus:
+        """How the log does."""
+        return self._keeper.status
+
+    @property
+    def stalled_s(self) -> float:
+        """How long the disk has not come back: a healthy one does so twice a second. For a watchdog."""
+        return time.monotonic() - self._stepped_s
+
+    def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
+        """As `LogKeeper.write`."""
+        return self._keeper.write(topic, message, log_time_ns, publish_time_ns)
+
+    def take_notes(self) -> Sequence[LogNote]:
+        """As `LogKeeper.take_notes`; and once a thread that did not end when it was told to."""
+        given_up, self._given_up = self._given_up, []
+        return [*self._keeper.take_notes(), *given_up]
+
+    def close(self) -> None:
+        """Finishes the files, or gives up on a disk that does not answer. A second call does nothing."""
+        if self._stop.is_set():
+            return
+        self._stop.set()
+        self._thread.join(_END_LIMIT_S)
+        if self._thread.is_alive():
+            text = f"the disk did not answer for {_END_LIMIT_S:g} s: the files stay unfinished"
+            self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"finished file": 1}))
+
+    def _work(self) -> None:
+        while True:
+            self._keeper.step(time.monotonic())
+            self._stepped_s = time.monotonic()
+            if self._stop.wait(self._period_s):
+                break
+        self._keeper.finish(time.monotonic())
