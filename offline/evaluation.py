@@ -1,11 +1,10 @@
 """A map against ground truth: how far off it is, and whether it knows.
 
 Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" are of the map as it
-stands. NEES is e' C^-1 e per dimension: 1 on average where the covariances are right (Bar-Shalom, Li, Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, section 5.4).
+stands. Whether it knows is told by `nees`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.errors import OfflineError
+from offline.nees import errors_along_arcs, nees_per_dim, turns_rad
 from offline.result import Component, MapResult, RunResult, TagResult
 from offline.truth import TrueRun, Truth
 
@@ -181,15 +181,15 @@ def _unknown(component: Component) -> ComponentErrors:
 
 def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> ComponentErrors:
     notes = _notes(component, truth)
-    starts, nees_start = _start_errors(component, truth, T_world_map)
+    places = _start_places(component, truth, T_world_map)
+    starts = tuple(_start_error(a, b, places) for a, b in combinations(places, 2))
     known = [i for i, tag in enumerate(component.tags) if _knows(truth, tag)]
     tags = [component.tags[i] for i in known]
     found = np.array([tag.position_m for tag in tags]).reshape(-1, 2)
     world = np.array([truth.tags_m[_name(tag)] for tag in tags]).reshape(-1, 2)
     true = se2.apply(se2.inverse(T_world_map), world)
     errors = found - true
-    rows = np.array([(2 * i, 2 * i + 1) for i in known], dtype=np.int64).reshape(-1)
-    nees_tags = _nees_per_dim(errors.reshape(-1), component.tag_covariance[np.ix_(rows, rows)])
+    nees_start, nees_tags = _nees(component, truth, T_world_map, places, known, true)
     for name, value, wanted in (("tags", nees_tags, len(tags)), ("start", nees_start, len(starts))):
         if wanted and value is None:
             notes.append(f"nees_{name}_per_dim: the covariance is not positive definite, so there is no figure")
@@ -221,23 +221,42 @@ def aligned(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
     return moved
 
 
-def _start_errors(
+def _start_places(
     component: Component, truth: Truth, T_world_map: FloatArray
-) -> tuple[tuple[StartError, ...], float | None]:
-    """Every pair of starts, and the NEES of all starts jointly as seen from the frame's."""
-    places: dict[str, tuple[FloatArray, FloatArray]] = {}  # found, true
-    rows: list[int] = []
-    for index, run in enumerate(component.runs):
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Where each run starts, found and true (2,); later stretches apart, whose start is no start of a drive."""
+    places = {}
+    for run in component.runs:
         T_world_start = _true_start(run, truth) if run.run == run.name else None
-        if T_world_start is None:
-            continue
-        places[run.name] = run.T_map_start[:2], se2.between(T_world_map, T_world_start)[:2]
-        if run.name != component.frame_run:
-            rows += [3 * index, 3 * index + 1]
-    pairs = tuple(_start_error(a, b, places) for a, b in combinations(places, 2))
-    vector = [found - true for name, (found, true) in places.items() if name != component.frame_run]
-    errors = np.array(vector).reshape(-1)
-    return pairs, _nees_per_dim(errors, component.joint_covariance[np.ix_(rows, rows)])
+        if T_world_start is not None:
+            places[run.name] = run.T_map_start[:2], se2.between(T_world_map, T_world_start)[:2]
+    return places
+
+
+def _nees(
+    component: Component,
+    truth: Truth,
+    T_world_map: FloatArray,
+    places: Mapping[str, tuple[FloatArray, FloatArray]],
+    known: Sequence[int],
+    true_tags_m: FloatArray,
+) -> tuple[float | None, float | None]:
+    """Of all starts jointly as seen from the frame's, and of all tags (indices `known`) jointly."""
+    names = [run.name for run in component.runs]
+    starts = [name for name in places if name != component.frame_run]
+    rows = [3 * names.index(name) + axis for name in starts for axis in (0, 1)]
+    rows += [3 * len(names) + 2 * i + axis for i in known for axis in (0, 1)]
+    covariance = component.joint_covariance[np.ix_(rows, rows)]
+    found_m = np.array([places[name][0] for name in starts] + [component.tags[i].position_m for i in known])
+    true_m = np.concatenate([np.array([places[name][1] for name in starts]).reshape(-1, 2), true_tags_m])
+    if not len(rows) or not np.isfinite(covariance).all():
+        return None, None
+    errors = errors_along_arcs(found_m, true_m, turns_rad(component, truth, T_world_map, found_m), covariance)
+    n = len(starts)
+    return (
+        nees_per_dim(errors[:n].reshape(-1), covariance[: 2 * n, : 2 * n]),
+        nees_per_dim(errors[n:].reshape(-1), covariance[2 * n :, 2 * n :]),
+    )
 
 
 def _start_error(a: str, b: str, places: dict[str, tuple[FloatArray, FloatArray]]) -> StartError:
@@ -308,15 +327,3 @@ def _tag_error(tag: TagResult, error_m: FloatArray) -> TagError:
 def _rms(errors_m: FloatArray) -> float | None:
     """Root mean square of the lengths of (N, 2) errors; None of none."""
     return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else None
-
-
-def _nees_per_dim(error: FloatArray, covariance: FloatArray) -> float | None:
-    """E' C^-1 e / dim; None without dimensions or where C is not positive definite."""
-    if not len(error):
-        return None
-    try:
-        factor = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return None
-    whitened = np.linalg.solve(factor, error)
-    return float(whitened @ whitened) / len(error)
