@@ -1,0 +1,111 @@
+"""What the factors tie down, and what could still move without any of them noticing: from who reads which tag.
+
+Odometry makes each chain one rigid body; a tag is a pin that each chain which reads it holds at a place of its own. A
+chain that shares no tag can move in three ways, one that shares a single tag can turn about it, and so on. The rank
+follows from these few bodies, so it does not suffer from the rounding of a long chain's normal equations.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy import linalg, sparse
+
+from calib.arrays import FloatArray, IntArray
+from offline.factors import Columns, OdometryFactors, ReadingFactors, State
+
+# Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.
+_FREE: Final = 1e-12
+_MOVES: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Untied:
+    """What nothing ties down.
+
+    Attributes:
+        n_directions: dimensions in which the variables can move at no cost.
+        chains: those that can move against what is held; a chain is a row of poses that odometry joins, numbered in
+            the order of poses.
+        tags: those that no reading is of.
+    """
+
+    n_directions: int
+    chains: tuple[int, ...]
+    tags: tuple[int, ...]
+
+
+def untied_parts(odometry: OdometryFactors, readings: ReadingFactors, columns: Columns, state: State) -> Untied:
+    """Looks for motions of whole chains, and for tags, that change no residual; priors hold all calibration.
+
+    Args:
+        odometry: each of full rank.
+        readings: each of full rank in its tag.
+        columns: what is held.
+        state: where chains and tags lie.
+    """
+    chain_of = chains_of_poses(odometry, len(columns.poses))
+    n_chains = int(chain_of.max(initial=-1)) + 1
+    centre, scale_m = _extent(state)
+    rows = [
+        _of_held_poses(columns, chain_of, n_chains, (state.poses[:, :2] - centre) / scale_m, state.poses[:, 2]),
+        *_of_tags(readings, columns, chain_of, n_chains, (state.tags - centre) / scale_m),
+    ]
+    resisted, motions = linalg.eigh(sum(row.T @ row for row in rows[:-1]) - rows[-1].T @ rows[-1])
+    free = resisted <= _FREE * max(1.0, float(resisted.max(initial=0.0)))
+    moves = np.linalg.norm(motions[:, free].reshape(n_chains, -1), axis=1) > _MOVES
+    unread = np.bincount(readings.tag, minlength=len(columns.tags)) == 0
+    n_unread = int((columns.tags[unread] >= 0).sum())
+    tags = np.flatnonzero(unread & (columns.tags >= 0).any(axis=1))
+    return Untied(int(free.sum()) + n_unread, tuple(np.flatnonzero(moves).tolist()), tuple(tags.tolist()))
+
+
+def chains_of_poses(odometry: OdometryFactors, n_poses: int) -> IntArray:
+    """(P,) number of the chain that each pose belongs to."""
+    starts = np.ones(n_poses, dtype=np.int64)
+    starts[odometry.first + 1] = 0
+    return np.cumsum(starts) - 1
+
+
+def _extent(state: State) -> tuple[FloatArray, float]:
+    """Middle and size of the whole, so that turns and shifts are numbers of one size."""
+    places = np.concatenate([state.poses[:, :2], state.tags])
+    centre = places.mean(axis=0)
+    return centre, float(np.abs(places - centre).max(initial=0.0)) or 1.0
+
+
+def _of_held_poses(
+    columns: Columns, chain_of: IntArray, n_chains: int, place: FloatArray, theta: FloatArray
+) -> FloatArray:
+    """How each held direction of a pose moves with its chain's (x, y, turn) about the middle: none of it may."""
+    pose, direction = np.nonzero(columns.poses < 0)
+    cos, sin, (x, y) = np.cos(theta[pose]), np.sin(theta[pose]), place[pose].T
+    along = np.stack([cos, sin, sin * x - cos * y], axis=-1)
+    across = np.stack([-sin, cos, cos * x + sin * y], axis=-1)
+    turn = np.broadcast_to([0.0, 0.0, 1.0], along.shape)
+    return _spread(np.choose(direction[:, None], [along, across, turn]), chain_of[pose], n_chains)
+
+
+def _of_tags(
+    readings: ReadingFactors, columns: Columns, chain_of: IntArray, n_chains: int, place: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """B and S with B^T B - S^T S the square of how far tags, moved with the chains that read them, come apart."""
+    chain, tag = np.unique(np.stack([chain_of[readings.pose], readings.tag]), axis=1)
+    together, apart = [], []
+    count = np.bincount(tag, minlength=len(place))
+    for axis, turned in enumerate((-place[:, 1], place[:, 0])):
+        moved = np.zeros((len(tag), 3))
+        moved[:, axis], moved[:, 2] = 1.0, turned[tag]
+        together.append(_spread(moved, chain, n_chains))
+        # The best place for a tag is the mean of where its chains take it; a held one stays.
+        free = columns.tags[tag, axis] >= 0
+        mean = sparse.csr_array((free / np.sqrt(count[tag]), (tag, np.arange(len(tag)))), shape=(len(place), len(tag)))
+        apart.append(np.asarray(mean @ together[-1]))
+    return np.concatenate(together), np.concatenate(apart)
+
+
+def _spread(rows: FloatArray, chain: IntArray, n_chains: int) -> FloatArray:
+    """Rows (N, 3) by the motion of one chain each, as rows (N, 3 n_chains) by those of all."""
+    spread = np.zeros((len(rows), n_chains, 3))
+    spread[np.arange(len(rows)), chain] = rows
+    return spread.reshape(len(rows), 3 * n_chains)
