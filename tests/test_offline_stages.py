@@ -41,7 +41,7 @@ def test_beginning_and_progress_are_told() -> None:
 
 def test_a_stage_in_parts_is_one_stage_and_failures_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([1.0, 3.5, 10.0, 10.25, 20.0, 21.0])
-    monkeypatch.setattr(stages_module.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr("offline.stages.time.perf_counter", lambda: next(clock))
     stages = Stages()
     with stages.stage("graph"):
         pass
