@@ -20,6 +20,7 @@ from offline.arrowhead_tree import Tree, build_tree
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import Free, Odometry, Readings, Values
 from offline.robust import SQUARES, Loss
+from offline.rolled_step import rolled
 from offline.starting_pass import starting_pass
 
 _CONDITION_STEPS: Final = 12
@@ -78,6 +79,14 @@ class Arrowhead:
         linearise_kernels.moved(values, step, anchor, out)
         is_free = self.free.calibration >= 0
         out.calibration[is_free] += step[len(step) - tree.n_calibration :]
+        return State(*out)
+
+    def rolled(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
+        """The state after the same step as `moved`, taken motion by motion along each chain."""
+        values = Values(before.poses, before.tags, before.calibration)
+        by_pose = Values(moved.poses, moved.tags, moved.calibration)
+        out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
+        rolled(values, step, anchor, self.tree.chain_start, by_pose, out)
         return State(*out)
 
     def starting_values(self, state: State, start_sigma: FloatArray) -> State:
