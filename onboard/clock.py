@@ -12,6 +12,11 @@ _BUCKET_NS: Final = 500_000_000
 _WINDOW_BUCKETS: Final = 120  # a minute
 _MAX_RATE_ERROR: Final = 0.01  # ceramic resonators are within 0.5 %
 
+_STEP_NS: Final = 10_000_000
+_STEPS_REMEMBERED: Final = 8
+_RECENT_NS: Final = 5_000_000_000
+_AHEAD_NS: Final = 100_000_000
+
 _TIMEX_BYTES: Final = 512  # more than struct timex needs on any Linux
 _TIME_ERROR: Final = 5
 
@@ -35,6 +40,7 @@ class RunClock:
     def __init__(self) -> None:
         reading = read_clocks()
         self.run_epoch_ns = reading.realtime_ns - reading.monotonic_ns
+        self._offsets_ns = deque([self.run_epoch_ns], maxlen=_STEPS_REMEMBERED)  # realtime minus monotonic
 
     def now_ns(self) -> int:
         """Now, on the run's line."""
@@ -45,9 +51,23 @@ class RunClock:
         return monotonic_ns + self.run_epoch_ns
 
     def from_realtime(self, realtime_ns: int) -> int:
-        """A recent wall-clock time on the run's line: the wall clock's present offset is taken out."""
+        """A recent wall-clock time on the run's line, also if the wall clock has stepped since.
+
+        The wall clock's offset at that time is the newest of those seen by which it is of the last few seconds; the
+        present one if there is none.
+        """
         reading = read_clocks()
-        return realtime_ns - reading.realtime_ns + reading.monotonic_ns + self.run_epoch_ns
+        offset_ns = reading.realtime_ns - reading.monotonic_ns
+        if abs(offset_ns - self._offsets_ns[-1]) < _STEP_NS:
+            self._offsets_ns[-1] = offset_ns
+        else:
+            self._offsets_ns.append(offset_ns)
+        now_ns = self.from_monotonic(reading.monotonic_ns)
+        for each_ns in reversed(self._offsets_ns):
+            at_ns = realtime_ns - each_ns + self.run_epoch_ns
+            if -_AHEAD_NS <= now_ns - at_ns <= _RECENT_NS:
+                return at_ns
+        return realtime_ns - offset_ns + self.run_epoch_ns
 
 
 def read_clocks() -> ClockReading:

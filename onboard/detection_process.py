@@ -1,10 +1,12 @@
 """Tag detection in a process of its own: in the recorder's it would hold up the wheel readings by tens of ms."""
 
+import ctypes
 import multiprocessing
 import queue
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Final, NamedTuple
@@ -19,8 +21,9 @@ from onboard.tag_detector import Detection, TagDetector
 Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
 
 _START_LIMIT_S: Final = 30.0
-_JOB_LIMIT_S: Final = 10.0
-_END_LIMIT_S: Final = 2.0
+_JOB_LIMIT_S: Final = 5.0
+_END_LIMIT_S: Final = 0.5
+_PR_SET_PDEATHSIG: Final = 1
 
 
 @dataclass(frozen=True)
@@ -57,14 +60,27 @@ class ChildDetector:
         restarts: children replaced.
     """
 
-    def __init__(self, settings: DetectorSettings) -> None:
-        """Starts the child and waits until it is ready.
+    def __init__(
+        self,
+        settings: DetectorSettings,
+        on_restart: Callable[[str], None] | None = None,
+        job_limit_s: float = _JOB_LIMIT_S,
+    ) -> None:
+        """Starts the child and waits until it is ready. The child ends with the thread that calls this.
+
+        Args:
+            settings: what to detect with.
+            on_restart: told, from another thread, why the child had to be replaced.
+            job_limit_s: a child that takes longer than this for one picture hangs.
 
         Raises:
             OnboardError: it cannot start, or no detector is installed.
         """
         self.restarts = 0
         self._settings = settings
+        self._on_restart = on_restart
+        self._job_limit_s = job_limit_s
+        self._closing = threading.Event()
         self._jobs: queue.SimpleQueue[tuple[Picture, bool, Callable[[DetectionResult], None]] | None]
         self._jobs = queue.SimpleQueue()
         self._start_child()
@@ -82,13 +98,16 @@ class ChildDetector:
         return results.get()
 
     def close(self) -> None:
-        """Ends the child; pictures still queued come to nothing once it has been given up on."""
+        """Ends the child; pictures still queued after half a second come to nothing."""
         self._jobs.put(None)
         self._thread.join(_END_LIMIT_S)
+        self._closing.set()  # from here on nobody starts another
+        self._process.kill()
+        self._thread.join()
         self._stop_child()
 
     def _serve(self) -> None:
-        while (job := self._jobs.get()) is not None:
+        while (job := self._jobs.get()) is not None and not self._closing.is_set():
             picture, want_jpeg, on_result = job
             passed_through = picture if want_jpeg and isinstance(picture, bytes) and is_jpeg(picture) else None
             result = self._run(picture, want_jpeg and passed_through is None)
@@ -99,19 +118,29 @@ class ChildDetector:
     def _run(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
         try:
             self._connection.send((picture, want_jpeg))
-            if self._connection.poll(_JOB_LIMIT_S):
+            if self._connection.poll(self._job_limit_s):
                 result: DetectionResult = self._connection.recv()
                 return result
-            reason = f"detection gave no answer for {_JOB_LIMIT_S:g} s"
+            reason = f"detection gave no answer for {self._job_limit_s:g} s"
         except (OSError, EOFError):
             reason = "detection crashed"
+        return DetectionResult([], (0, 0), None, self._replace_child(reason))
+
+    def _replace_child(self, reason: str) -> str:
+        """Returns the reason with what became of it."""
+        if self._closing.is_set():
+            return f"{reason}; the recording is at its end"
+        self.restarts += 1
         try:
             self._stop_child()
             self._start_child()
-            self.restarts += 1
         except OnboardError as error:
             reason = f"{reason}; {error}"
-        return DetectionResult([], (0, 0), None, f"{reason}; its process was started again")
+        else:
+            reason = f"{reason}; its process was started again"
+        if self._on_restart is not None:
+            self._on_restart(reason)
+        return reason
 
     def _start_child(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -119,8 +148,11 @@ class ChildDetector:
         self._process = context.Process(
             target=_child, args=(theirs, self._settings), name="groundsbot-detection", daemon=True
         )
-        self._process.start()
+        with _signals_held_back():
+            self._process.start()
         theirs.close()
+        if self._closing.is_set():  # close() may have ended the one before this
+            self._process.kill()
         try:
             if not self._connection.poll(_START_LIMIT_S):
                 raise OnboardError(f"detection process did not start within {_START_LIMIT_S:g} s; try again")
@@ -133,16 +165,27 @@ class ChildDetector:
 
     def _stop_child(self) -> None:
         self._connection.close()
-        self._process.join(_END_LIMIT_S / 4)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        self._process.kill()
+        self._process.join()
+
+
+@contextmanager
+def _signals_held_back() -> Iterator[None]:
+    """A child started herein holds back Ctrl-C until it can say that it wants none; this thread only meanwhile."""
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
 
 def _child(connection: Connection, settings: DetectorSettings) -> None:
     """Runs in the child: answers until the parent is gone."""
     for each in (signal.SIGINT, signal.SIGTERM):  # the parent decides when recording ends
         signal.signal(each, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    # A detection that hangs would not notice that its parent was killed.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
     import cv2
 
     cv2.setNumThreads(1)

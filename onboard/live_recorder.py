@@ -8,11 +8,13 @@ import contextlib
 import queue
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
+
+from google.protobuf.message import Message
 
 from calib.camera_model import CameraModel, read_camera_yaml
 from calib.robot import Robot, parse_robot_yaml
@@ -20,10 +22,14 @@ from calib.yaml_file import read_text
 from onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
 from onboard.clock import RunClock, read_clocks, wall_clock_synchronised
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
+from onboard.disk_room import DiskRoom, one_recorder, space_policy
 from onboard.encoder_port import EncoderPort, PortLostError
 from onboard.errors import OnboardError
-from onboard.messages import Event, EventKind, Severity
-from onboard.recorder import RecorderCore, Run
+from onboard.log_keeper import LogKeeper
+from onboard.log_thread import LogThread
+from onboard.messages import Event, EventKind
+from onboard.recorder import RecorderCore, Run, segment_limits
+from onboard.storage import Disk
 
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.05
@@ -38,6 +44,7 @@ class RobotFiles:
     """robot.yaml and the camera file it names, read and fitting together.
 
     Attributes:
+        path: of robot.yaml.
         robot: the robot.
         text: its file's text.
         camera: the calibration; None for wheels only.
@@ -51,6 +58,7 @@ class RobotFiles:
             CalibError: a file is missing or wrong.
             OnboardError: there is nothing to record, or no calibration for the camera.
         """
+        self.path = path
         self.text = read_text(path)
         self.robot: Robot = parse_robot_yaml(self.text, str(path))
         devices = self.robot.devices
@@ -92,9 +100,11 @@ class LiveRecorder:
 
     Attributes:
         core: what has been written and lost; there from `run` on.
+        log: how the log does on its disk; there from `run` on.
     """
 
     core: RecorderCore
+    log: LogThread
 
     def __init__(
         self,
@@ -144,14 +154,25 @@ class LiveRecorder:
                 self._clock.run_epoch_ns,
             )
             wheels = files.robot.devices.encoder_port is not None
-            self.core = RecorderCore(self._output, run, on_event=self._on_event, expect_wheels=wheels)
-            try:
-                self._record()
-            finally:
-                self.core.close(self._clock.now_ns())
+            with one_recorder(files.path, self._output, files.robot.robot_id):
+                self.core = RecorderCore(
+                    self._output, run, on_event=self._on_event, expect_wheels=wheels, open_log=self._open_log
+                )
+                try:
+                    self._record()
+                finally:
+                    self.core.close(self._clock.now_ns())
         finally:
             if self._detector is not None:
                 self._detector.close()
+
+    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> LogThread:
+        robot, disk = self._files.robot, Disk()
+        room = DiskRoom(disk, self._output, robot.robot_id, space_policy(robot))
+        limits = segment_limits(robot)
+        keeper = LogKeeper(folder, head, start_ns, disk, room, keep_pictures=keep_pictures, limits=limits)
+        self.log = LogThread(keeper)
+        return self.log
 
     def _record(self) -> None:
         threads = []
@@ -228,15 +249,15 @@ class LiveRecorder:
             camera = opened  # kept over reconnects: it knows what it has given already
 
         while self._opened("camera", open_camera, CameraLostError) and camera is not None:
-            self._put(partial(self._tell_of_camera, settings.device, refused))
+            self._put(partial(self.core.on_camera_connected, settings.device, refused))
             try:
                 self._read_frames(camera)
                 return
             except CameraEndedError as error:
-                self._put(partial(self._event, EventKind.CAMERA_LOST, Severity.SEVERITY_INFO, str(error)))
+                self._put(partial(self.core.on_camera_lost, str(error), at_its_end=True))
                 return
             except CameraLostError as error:
-                self._put(partial(self._event, EventKind.CAMERA_LOST, Severity.SEVERITY_WARNING, str(error)))
+                self._put(partial(self.core.on_camera_lost, str(error)))
             finally:
                 camera.close()
 
@@ -285,15 +306,6 @@ class LiveRecorder:
             detector=self._detector.library,
             detector_settings=self._detector.settings,
         )
-
-    def _tell_of_camera(self, device: str, refused: list[str], now_ns: int) -> None:
-        self._event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, device, now_ns)
-        if refused:
-            text = f"{device} would not be set: {'; '.join(refused)}"
-            self._event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_WARNING, text, now_ns)
-
-    def _event(self, kind: EventKind, severity: "Severity | int", text: str, now_ns: int) -> None:
-        self.core.event(kind, severity, text, now_ns)
 
     # --- for all threads
 

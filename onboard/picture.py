@@ -1,10 +1,14 @@
 """Pictures as bytes and as arrays."""
 
+from typing import Final
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from onboard.errors import OnboardError
+
+_JPEG_END: Final = b"\xff\xd9"
 
 
 def decode_grey(encoded: bytes) -> NDArray[np.uint8]:
@@ -51,10 +55,16 @@ def is_jpeg(encoded: bytes) -> bool:
     return encoded.startswith(b"\xff\xd8\xff")
 
 
+def without_padding(encoded: bytes) -> bytes:
+    """A JPEG without what a camera's driver leaves behind its end mark."""
+    end = encoded.rfind(_JPEG_END)
+    return encoded[: end + len(_JPEG_END)] if end >= 0 else encoded
+
+
 def is_complete(encoded: bytes) -> bool:
     """Whether a PNG or JPEG file's bytes reach its end mark: OpenCV decodes half a JPEG without a word."""
     if is_jpeg(encoded):
-        return encoded.endswith(b"\xff\xd9")
+        return encoded.endswith(_JPEG_END)
     return encoded.startswith(b"\x89PNG\r\n\x1a\n") and encoded.endswith(b"IEND\xaeB`\x82")
 
 

@@ -17,7 +17,8 @@ from calib.camera_model import CameraModel
 from calib.robot import Robot
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_head import CAMERA_FRAME, log_head
-from onboard.log_writer import LogWriter
+from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
+from onboard.log_writer import LogNote, LogOpener, LogWriter, RunLog
 from onboard.measurements import detections_message, wheel_message
 from onboard.messages import (
     ClockAnchor,
@@ -31,12 +32,14 @@ from onboard.messages import (
 )
 from onboard.picture import encode_jpeg
 from onboard.tag_detector import Detection, TagDetector
+from onboard.watches import ClockWatch, SilenceWatch, Tallies
 from onboard.wheel_intake import StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S
 _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
-_WHEEL_SILENCE_NS: Final = 3 * _NS_PER_S
+_WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s
+_CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
 _WAIT_FOR_WHEELS_NS: Final = 500_000_000
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
@@ -80,6 +83,7 @@ class RecorderCore:
         on_event: Callable[[Event], None] | None = None,
         expect_wheels: bool = True,
         durable: bool = True,
+        open_log: LogOpener | None = None,
     ) -> None:
         """Opens the log.
 
@@ -90,6 +94,7 @@ class RecorderCore:
             on_event: told of each event as it is written.
             expect_wheels: whether their silence is worth an event.
             durable: see LogWriter.
+            open_log: opens another log than a LogWriter's: one that waits for no disk.
 
         Raises:
             LogError: the log cannot be opened.
@@ -101,20 +106,26 @@ class RecorderCore:
         self._options = run.robot.recorder
         self._detector = detector
         self._on_event = on_event
-        self._expect_wheels = expect_wheels
         self._intake = WheelIntake()
         self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
-        self._last_wheel_host_ns = run.start_ns
-        self._silent = False
+        self._wheels = SilenceWatch(_WHEEL_SILENCE_NS, run.start_ns if expect_wheels else None)
+        self._camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
+        self._wall_clock = ClockWatch()
+        self._tallies = Tallies()
         self._waiting: deque[_Waiting] = deque()
         self._odd_sizes: set[tuple[int, int]] = set()
         self._next_picture_ns = 0
         self._next_anchor_ns = 0
-        self._lines_lost = 0  # since the last event about them
-        self._reported = (0, 0)  # rejected and repeated lines in events so far
+        self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines told of so far
         head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
         keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
-        self._writer = LogWriter(self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable)
+        if open_log is None:
+            limits = segment_limits(run.robot)
+            self._writer: RunLog = LogWriter(
+                self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable, limits=limits
+            )
+        else:
+            self._writer = open_log(self.folder, head, run.start_ns, keep_pictures)
         self._keep_pictures = keep_pictures
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
@@ -141,13 +152,12 @@ class RecorderCore:
         self._note_gaps(each)
         self._write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._recent.append((each.stamp_ns, reading.sequence))
-        self._last_wheel_host_ns = each.host_ns
-        self._silent = False
+        self._wheels.heard(each.host_ns)
 
     def _note_gaps(self, each: StampedReading) -> None:
         reading = each.reading
         if reading.lost:
-            self._lines_lost += reading.lost
+            self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
             self.losses["wheel lines"] += reading.lost
         if not self._recent:
             return
@@ -161,6 +171,24 @@ class RecorderCore:
             self.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
 
     # --- camera
+
+    def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
+        """The camera is open, for the first time or again; `refused` says what it would not be set to."""
+        self._camera.heard(host_ns)
+        self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
+        if refused:
+            text = f"{name} would not be set: {'; '.join(refused)}"
+            self.event(EventKind.CAMERA_SETTING, Severity.SEVERITY_WARNING, text, host_ns)
+
+    def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
+        """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
+        self._camera.gone()
+        severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
+        self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
+
+    def on_detector_restarted(self, reason: str, host_ns: int) -> None:
+        """The detection's process had to be replaced."""
+        self.event(EventKind.DETECTOR_RESTARTED, Severity.SEVERITY_WARNING, reason, host_ns, 1)
 
     def on_frame(
         self, grey: NDArray[np.uint8], stamp_ns: int, receive_ns: int, source: "StampSource | int", sequence: int
@@ -206,6 +234,7 @@ class RecorderCore:
         detector_settings: str = "",
     ) -> None:
         """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
+        self._camera.heard(receive_ns)
         self._check_size(size_px, receive_ns)
         message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         self._waiting.append(_Waiting(message, receive_ns))
@@ -229,9 +258,10 @@ class RecorderCore:
             self._write("/camera/image", message, receive_ns, stamp_ns)
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
-        """Pictures that the log will not have: dropped, or of no use."""
+        """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
+        self._camera.heard(host_ns)
         self.losses["pictures"] += count
-        self.event(kind, Severity.SEVERITY_WARNING, reason, host_ns, count)
+        self._tallies.add(kind, count, reason)
 
     def _check_size(self, size_px: tuple[int, int], host_ns: int) -> None:
         camera = self._run.camera
@@ -275,6 +305,8 @@ class RecorderCore:
         for each in self._intake.release_due(now_ns):
             self._write_reading(each)
         self._write_waiting(now_ns)
+        self._watch(now_ns, now_ns if realtime_ns is None else realtime_ns)
+        self._tell_notes(now_ns)
         if now_ns < self._next_anchor_ns:
             return
         self._next_anchor_ns = now_ns - now_ns % _ANCHOR_PERIOD_NS + _ANCHOR_PERIOD_NS
@@ -285,28 +317,32 @@ class RecorderCore:
             synchronised=synchronised,
         )
         self._write("/clock", anchor, now_ns, now_ns)
-        self._report_wheels(now_ns)
+        self._tell_tallies(now_ns)
 
-    def _report_wheels(self, now_ns: int) -> None:
-        """Lost and bad lines come in numbers, so they are told of once a second."""
-        if self._lines_lost:
-            text = f"{self._lines_lost} lines missing by their sequence numbers"
-            self.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, now_ns, self._lines_lost)
-            self._lines_lost = 0
-        rejected, repeated = self._intake.parser.rejected, self._intake.unwrapper.repeated
-        if rejected > self._reported[0]:
-            count = rejected - self._reported[0]
-            text = f"{count} pieces that are no line, the last {self._intake.parser.last_rejected!r}"
-            self.event(EventKind.WHEEL_LINE_REJECTED, Severity.SEVERITY_WARNING, text, now_ns, count)
-        if repeated > self._reported[1]:
-            count = repeated - self._reported[1]
-            text = f"{count} lines left out: sequence number not newer than the last"
-            self.event(EventKind.WHEEL_SEQUENCE, Severity.SEVERITY_WARNING, text, now_ns, count)
-        self._reported = (rejected, repeated)
-        if self._expect_wheels and not self._silent and now_ns - self._last_wheel_host_ns > _WHEEL_SILENCE_NS:
-            self._silent = True
-            text = f"no valid wheel line for {_WHEEL_SILENCE_NS // _NS_PER_S} s: check cable, port and baud rate"
+    def _watch(self, now_ns: int, realtime_ns: int) -> None:
+        if self._wheels.fell_silent(now_ns):
+            text = "no valid data from the wheels for 3 s: check cable, port and baud rate"
             self.event(EventKind.NO_WHEEL_DATA, Severity.SEVERITY_WARNING, text, now_ns)
+        if self._camera.fell_silent(now_ns):
+            text = "no picture for 3 s: check cable and driver"
+            self.event(EventKind.NO_PICTURES, Severity.SEVERITY_WARNING, text, now_ns)
+        step_ns = self._wall_clock.step_ns(now_ns - self._run.run_epoch_ns, realtime_ns)
+        if step_ns is not None:
+            text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock goes on evenly"
+            self.event(EventKind.CLOCK_STEP, Severity.SEVERITY_WARNING, text, now_ns)
+
+    def _tell_tallies(self, now_ns: int) -> None:
+        parser, unwrapper = self._intake.parser, self._intake.unwrapper
+        left_out = (parser.rejected, unwrapper.repeated, unwrapper.overtaken)
+        rejected, repeated, overtaken = np.subtract(left_out, self._left_out).tolist()
+        self._left_out = left_out
+        self._tallies.add(
+            EventKind.WHEEL_LINE_REJECTED, rejected, f"pieces that are no line, the last {list(parser.last_rejected)}"
+        )
+        text = f"lines left out: {repeated} repeated, {overtaken} overtaken by newer ones"
+        self._tallies.add(EventKind.WHEEL_SEQUENCE, repeated + overtaken, text)
+        for each in self._tallies.take():
+            self.event(each.kind, Severity.SEVERITY_WARNING, f"{each.times} {each.text}", now_ns, each.times)
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Writes one event."""
@@ -323,20 +359,38 @@ class RecorderCore:
         for each in self._intake.release_all():
             self._write_reading(each)
         self._write_waiting(now_ns + _WAIT_FOR_WHEELS_NS)
-        self._report_wheels(now_ns)
-        if self._silent and not self.counts["/wheels"]:
+        self._tell_tallies(now_ns)
+        if self._wheels.is_silent and not self.counts["/wheels"]:
             self.losses["recording without a single wheel reading"] += 1
+        self._tell_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._writer.close()
+        for note in self._writer.take_notes():  # too late for the log
+            self._count(note)
+
+    def _tell_notes(self, now_ns: int) -> None:
+        """Writes what the log's disk has to say."""
+        for note in self._writer.take_notes():
+            self._count(note)
+            self.event(note.kind, note.severity, note.text, now_ns, sum(note.lost.values()))
+
+    def _count(self, note: LogNote) -> None:
+        for topic, count in note.lost.items():
+            self.losses["pictures" if topic == PICTURE_TOPIC else f"{topic} messages"] += count
 
     def _write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
         log_time_ns = max(receive_ns, self._writer.last_log_time_ns)
         try:
-            self._writer.write(topic, message, log_time_ns, stamp_ns)
+            taken = self._writer.write(topic, message, log_time_ns, stamp_ns)
         except MessageRefusedError as error:
             self.losses["messages refused"] += 1
             now_ns = self._writer.last_log_time_ns
             self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, str(error), now_ns, 1)
             return
-        self.counts[topic] += 1
+        self.counts[topic] += taken
+
+
+def segment_limits(robot: Robot) -> SegmentLimits:
+    """When a robot's logs begin new files."""
+    return SegmentLimits(round(robot.recorder.segment_s * _NS_PER_S), robot.recorder.segment_mb * 1_000_000)

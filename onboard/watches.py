@@ -56,7 +56,7 @@ class Tally(NamedTuple):
     """What happened several times."""
 
     kind: EventKind
-    count: int
+    times: int
     text: str  # of the last time
 
 
@@ -70,7 +70,7 @@ class Tallies:
         """Counts; nothing if `count` is 0."""
         if count:
             before = self._counted.get(kind)
-            self._counted[kind] = Tally(kind, count + (before.count if before else 0), text)
+            self._counted[kind] = Tally(kind, count + (before.times if before else 0), text)
 
     def take(self) -> Iterator[Tally]:
         """What has been counted since the last time."""

@@ -13,8 +13,6 @@ from onboard.camera import (
     CameraEndedError,
     CameraLostError,
     CameraSettings,
-    FolderCamera,
-    V4l2Camera,
     VideoCamera,
     camera_for,
 )
@@ -23,6 +21,8 @@ from onboard.detection_process import ChildDetector, DetectionResult, DetectorSe
 from onboard.errors import OnboardError
 from onboard.messages import StampSource
 from onboard.picture import is_jpeg
+from onboard.picture_folder import FolderCamera
+from onboard.v4l2_camera import V4l2Camera
 from tests.tag_pictures import draw_tag
 
 MS = 1_000_000
