@@ -1,41 +1,22 @@
 """Reads run logs: one chunk in memory at a time, every checksum checked, each message of its topic's own class."""
 
 import heapq
-import struct
-import zlib
 from collections.abc import Collection, Iterable, Iterator
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import Final
 
-import zstandard
-from google.protobuf.message import DecodeError, Message
-from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
-
+from onboard.chunk_reader import ChunkReader
 from onboard.errors import LogError
 from onboard.log_file import ACTIVE_SUFFIX
-from onboard.log_segments import PICTURE_TOPIC
+from onboard.log_losses import Damage, LogLosses, NoLosses
+from onboard.log_segments import PICTURE_TOPIC, of_pictures
+from onboard.message_decoder import LogMessage, MessageDecoder
 from onboard.messages import TOPICS, RunInfo
 
-# A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
-_RECORD_LIMIT_BYTES: Final = 64 << 20
-_RECORD_HEAD: Final = struct.Struct("<BQ")
-_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
-_MESSAGE_FIXED_BYTES: Final = _MESSAGE_HEAD.size - _RECORD_HEAD.size
-_CHUNK_HEAD: Final = struct.Struct("<QQQI")
-_U16: Final = struct.Struct("<H")
-_U32: Final = struct.Struct("<I")
-_U64: Final = struct.Struct("<Q")
+__all__ = ["LogMessage", "find_logs", "read_log", "read_run_info"]
 
-
-class LogMessage(NamedTuple):
-    """One message of a log; times in ns on the run's clock."""
-
-    topic: str
-    message: Message
-    log_time_ns: int
-    publish_time_ns: int
+_HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
 def find_logs(paths: Iterable[Path]) -> list[Path]:
@@ -45,10 +26,10 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
         paths: each one file, one run folder, or a folder of runs at any depth.
 
     Returns:
-        Files and run folders, for each argument sorted by name.
+        Files and run folders, for each argument sorted by name. Runs whose recording was cut short are among them.
 
     Raises:
-        LogError: a path is missing, or a folder holds no finished log.
+        LogError: a path is missing, or a folder holds no log.
     """
     logs: list[Path] = []
     for path in paths:
@@ -61,59 +42,66 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
     return logs
 
 
-def read_log(path: Path, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
+def read_log(
+    path: Path, topics: Collection[str] | None = None, losses: LogLosses | None = None
+) -> Iterator[LogMessage]:
     """Iterates over one run's messages.
 
     Args:
         path: one file, or one run folder, whose files are joined.
         topics: only these; files of pictures are not opened unless `/camera/image` is among them. None: all.
+        losses: takes what cannot be read, and reading goes on behind it. None: that is an error.
 
     Yields:
         Messages in order of log time. What every file repeats at its head (`/run` and so on) comes once.
 
     Raises:
-        LogError: (while iterating) the log is missing, empty, damaged, unfinished, of another kind, or its files
-            belong to different runs.
+        LogError: (while iterating) the log is missing, empty, of another kind, or its files belong to different runs;
+            without `losses` also that it is damaged or unfinished.
     """
     core, pictures = _files_of(path)
     if topics is not None and PICTURE_TOPIC not in topics and core:
         pictures = []
-    streams = [_joined(files, topics) for files in (core, pictures) if files]
-    if len(streams) == 1:
-        yield from streams[0]
-        return
-    _check_same_run([core[0], pictures[0]])
-    repeated = {name for name, topic in TOPICS.items() if topic.every_file}
-    without_heads = (each for each in streams[1] if each.topic not in repeated)
-    yield from heapq.merge(streams[0], without_heads, key=attrgetter("log_time_ns"))
+    core, pictures = _usable(core, losses), _usable(pictures, losses)
+    if not core and not pictures:
+        raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
+    _check_same_run([*core[:1], *pictures[:1]])
+    streams = [_joined(files, topics, losses) for files in (core, pictures) if files]
+    yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
 
 
 def read_run_info(path: Path) -> RunInfo:
-    """The `/run` message of a log file or run folder.
+    """The `/run` message of a log file or run folder, damaged or not.
 
     Raises:
-        LogError: as `read_log`.
+        LogError: it is missing, or not to be found in any file.
     """
     core, pictures = _files_of(path)
-    return _run_info(next(iter(core or pictures)))
+    files = [*core, *pictures]
+    for file in files:
+        try:
+            found = _run_info(file)
+        except LogError:
+            if len(files) == 1:
+                raise
+            continue
+        if found is not None:
+            return found
+    raise LogError(f"{path}: the beginning, which says whose run it is, is damaged; choose another log")
 
 
 def _logs_below(folder: Path) -> list[Path]:
-    if _finished(folder):
+    if _files_in(folder):
         return [folder]
-    logs = sorted({file.parent for file in folder.rglob("*.mcap")})
+    patterns = ("*.mcap", f"*.mcap{ACTIVE_SUFFIX}")
+    logs = sorted({file.parent for pattern in patterns for file in folder.rglob(pattern)})
     if not logs:
-        unfinished = next(folder.rglob(f"*.mcap{ACTIVE_SUFFIX}"), None)
-        if unfinished is not None:
-            raise LogError(
-                f"{unfinished}: its recording runs still or was cut short; wait for its end or choose another"
-            )
         raise LogError(f"{folder}: holds no .mcap file; give a log, a run folder or a folder of runs")
     return logs
 
 
-def _finished(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.mcap"))
+def _files_in(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("*.mcap"), *folder.glob(f"*.mcap{ACTIVE_SUFFIX}")])
 
 
 def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
@@ -122,26 +110,82 @@ def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
         if not path.exists():
             raise LogError(f"{path}: no such log; give a .mcap file or a run folder")
         return [path], []
-    files = _finished(path)
+    files = _files_in(path)
     if not files:
-        raise LogError(f"{path}: holds no finished .mcap file; give a .mcap file or a run folder")
-    pictures = [file for file in files if file.name.endswith(".camera.mcap")]
+        raise LogError(f"{path}: holds no .mcap file; give a .mcap file or a run folder")
+    pictures = of_pictures(files)
     return [file for file in files if file not in pictures], pictures
 
 
-def _joined(files: list[Path], topics: Collection[str] | None) -> Iterator[LogMessage]:
+def _usable(files: list[Path], losses: LogLosses | None) -> list[Path]:
+    """Those that hold something; a run that was killed may leave an empty one."""
+    if losses is None:
+        return files
+    usable = []
+    for file in files:
+        try:
+            with file.open("rb") as stream:
+                ChunkReader(stream, file, lambda _: None)
+        except LogError as error:
+            losses.unusable[file] = str(error).removeprefix(f"{file}: ")
+        except OSError as error:
+            losses.unusable[file] = f"cannot be read: {error.strerror or error}"
+        else:
+            usable.append(file)
+    return usable
+
+
+def _reasons(losses: LogLosses | None) -> str:
+    return "; ".join((losses or LogLosses()).lines())
+
+
+def _joined(files: list[Path], topics: Collection[str] | None, losses: LogLosses | None) -> Iterator[LogMessage]:
+    """The messages of files in their order. A disk that failed may leave the same ones at a seam twice."""
     _check_same_run(files)
-    repeated = {name for name, topic in TOPICS.items() if topic.every_file}
+    seam: set[bytes] = set()
     for index, file in enumerate(files):
-        for each in _read_file(file, topics):
-            if index == 0 or each.topic not in repeated:
-                yield each
+        following_ns = _first_time_ns(files[index + 1]) if index + 1 < len(files) else None
+        before, seam = seam, set()
+        for each in _read_file(file, topics, losses):
+            if each.topic not in _HEADS:
+                if before and _identity(each) in before:
+                    continue
+                if following_ns is not None and each.log_time_ns >= following_ns:
+                    seam.add(_identity(each))
+            yield each
+
+
+def _heads_once(messages: Iterator[LogMessage]) -> Iterator[LogMessage]:
+    seen: set[str] = set()
+    for each in messages:
+        if each.topic in _HEADS:
+            if each.topic in seen:
+                continue
+            seen.add(each.topic)
+        yield each
+
+
+def _identity(each: LogMessage) -> bytes:
+    return b"%s %d %d " % (each.topic.encode(), each.log_time_ns, each.publish_time_ns) + (
+        each.message.SerializeToString(deterministic=True)
+    )
+
+
+def _first_time_ns(file: Path) -> int | None:
+    """Log time of the first message behind a file's head, which has the time of the file's beginning."""
+    try:
+        for each in _read_file(file, None, LogLosses()):
+            return each.log_time_ns
+    except LogError:
+        pass
+    return None
 
 
 def _check_same_run(files: list[Path]) -> None:
     if len(files) < 2:
         return
-    run_ids = {_run_info(file).run_id: file for file in files}
+    found = {file: _run_info(file) for file in files}
+    run_ids = {info.run_id: file for file, info in found.items() if info is not None}
     if len(run_ids) > 1:
         (run_a, file_a), (run_b, file_b) = sorted(run_ids.items())[:2]
         raise LogError(
@@ -150,154 +194,35 @@ def _check_same_run(files: list[Path]) -> None:
         )
 
 
-def _run_info(file: Path) -> RunInfo:
-    first = next(_read_file(file, None))
-    if not isinstance(first.message, RunInfo):  # _read_file has made sure of it
-        raise LogError(f"{file}: does not begin with /run")
-    return first.message
+def _run_info(file: Path) -> RunInfo | None:
+    """The `/run` at a file's head; None: the head is damaged."""
+    first = next(_read_file(file, None, LogLosses()), None)
+    return first.message if first is not None and isinstance(first.message, RunInfo) else None
 
 
-def _read_file(path: Path, topics: Collection[str] | None) -> Iterator[LogMessage]:
-    """One file's messages; the first must be `/run`."""
+def _read_file(path: Path, topics: Collection[str] | None, losses: LogLosses | None) -> Iterator[LogMessage]:
+    """One file's messages; the first must be `/run`, unless it was lost."""
+    found = NoLosses() if losses is None else losses
     try:
         with path.open("rb") as stream:
-            reader = _FileReader(path, topics)
-            for chunk in _chunks(stream, path, path.stat().st_size):
-                yield from reader.messages(chunk)
-            if not reader.seen_run:
-                raise LogError(f"{path}: holds no /run, so it is not a groundsbot log; import it or choose another")
+            reader = ChunkReader(stream, path, found.add)
+            yield from _messages(reader, path, topics, found)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _chunks(stream: BinaryIO, path: Path, size: int) -> Iterator[bytes]:
-    """The uncompressed contents of a file's chunks, checked, up to the end of its data."""
-    magic = stream.read(len(MCAP0_MAGIC))
-    if not magic:
-        raise LogError(f"{path}: is empty (0 bytes); choose another log")
-    if magic != MCAP0_MAGIC:
-        raise LogError(f"{path}: is not an MCAP file; a log ends in .mcap and is written by record, simulate or import")
-    while True:
-        offset = stream.tell()
-        head = stream.read(_RECORD_HEAD.size)
-        if len(head) < _RECORD_HEAD.size:
-            raise LogError(f"{path}: ends at byte {offset} before its end mark: cut short or never finished")
-        opcode, length = _RECORD_HEAD.unpack(head)
-        if length > size - offset:
-            raise LogError(f"{path}: damaged at byte {offset}: a record of {length} bytes does not fit in the file")
-        if opcode == Opcode.DATA_END:
-            return
-        if opcode == Opcode.MESSAGE:
-            raise LogError(
-                f"{path}: message at byte {offset} outside a chunk carries no checksum; rewrite the log in chunks"
-            )
-        if opcode != Opcode.CHUNK:
-            stream.seek(length, 1)
-            continue
-        if length > _RECORD_LIMIT_BYTES:
-            raise LogError(
-                f"{path}: chunk at byte {offset} has {length} bytes, limit {_RECORD_LIMIT_BYTES}; rewrite the log"
-            )
-        yield _uncompressed(stream.read(length), f"{path}: chunk at byte {offset}")
-
-
-def _uncompressed(record: bytes, where: str) -> bytes:
-    try:
-        _, _, size, crc = _CHUNK_HEAD.unpack_from(record)
-        compression, position = _text(record, _CHUNK_HEAD.size)
-        (length,) = _U64.unpack_from(record, position)
-        data = record[position + _U64.size : position + _U64.size + length]
-        if size > _RECORD_LIMIT_BYTES or len(data) != length:
-            raise LogError(f"{where} is damaged: {size} bytes uncompressed, limit {_RECORD_LIMIT_BYTES}")
-        if compression == "zstd":
-            if zstandard.frame_content_size(data) not in (size, -1):  # else a small chunk could unfold to anything
-                raise LogError(f"{where} is damaged: its length is not the {size} bytes it claims")
-            data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        elif compression:
-            raise LogError(f"{where} is compressed by {compression}; rewrite the log with zstd")
-    except (struct.error, UnicodeDecodeError, zstandard.ZstdError) as error:
-        raise LogError(f"{where} is damaged: {error}") from error
-    if len(data) != size or crc == 0 or zlib.crc32(data) != crc:
-        raise LogError(f"{where} is damaged: its checksum does not fit")
-    return data
-
-
-def _text(data: bytes, position: int) -> tuple[str, int]:
-    (length,) = _U32.unpack_from(data, position)
-    start = position + _U32.size
-    if start + length > len(data):
-        raise struct.error("a text does not fit in its record")
-    return data[start : start + length].decode(), start + length
-
-
-class _FileReader:
-    """Decodes the records of a file's chunks."""
-
-    def __init__(self, path: Path, topics: Collection[str] | None) -> None:
-        self._path = path
-        self._topics = topics
-        self._schemas: dict[int, str] = {}
-        # By channel: topic and class, or None where the topic is not wanted.
-        self._channels: dict[int, tuple[str, type[Message]] | None] = {}
-        self._run_channel: int | None = None
-        self.seen_run = False
-
-    def messages(self, chunk: bytes) -> Iterator[LogMessage]:
-        try:
-            yield from self._messages(chunk)
-        except (struct.error, UnicodeDecodeError, DecodeError) as error:
-            raise LogError(f"{self._path}: a record cannot be decoded: {error}") from error
-
-    def _messages(self, chunk: bytes) -> Iterator[LogMessage]:
-        position, end = 0, len(chunk)
-        message_head, head_size, fixed_size = _MESSAGE_HEAD.unpack_from, _MESSAGE_HEAD.size, _MESSAGE_FIXED_BYTES
-        channels = self._channels
-        while position < end:
-            opcode, length = _RECORD_HEAD.unpack_from(chunk, position)
-            following = position + _RECORD_HEAD.size + length
-            if following > end:
-                raise struct.error("a record does not fit in its chunk")
-            if opcode == Opcode.MESSAGE:
-                if length < fixed_size:
-                    raise struct.error(f"a message of {length} bytes")
-                _, _, channel, _, log_time_ns, publish_time_ns = message_head(chunk, position)
-                if not self.seen_run:
-                    self._check_first(channel)
-                if channel not in channels:
-                    raise LogError(f"{self._path}: damaged: a message on channel {channel}, which is not declared")
-                target = channels[channel]
-                if target is not None:
-                    data = chunk[position + head_size : following]
-                    yield LogMessage(target[0], target[1].FromString(data), log_time_ns, publish_time_ns)
-            elif opcode == Opcode.SCHEMA:
-                self._add_schema(chunk, position + _RECORD_HEAD.size)
-            elif opcode == Opcode.CHANNEL:
-                self._add_channel(chunk, position + _RECORD_HEAD.size)
-            position = following
-
-    def _check_first(self, channel: int) -> None:
-        if channel != self._run_channel:
-            raise LogError(
-                f"{self._path}: does not begin with /run, so it is not a groundsbot log; import it or choose another"
-            )
-        self.seen_run = True
-
-    def _add_schema(self, chunk: bytes, position: int) -> None:
-        (identifier,) = _U16.unpack_from(chunk, position)
-        self._schemas[identifier], _ = _text(chunk, position + _U16.size)
-
-    def _add_channel(self, chunk: bytes, position: int) -> None:
-        identifier, schema = _U16.unpack_from(chunk, position)[0], _U16.unpack_from(chunk, position + 2)[0]
-        name, position = _text(chunk, position + 4)
-        encoding, _ = _text(chunk, position)
-        topic = TOPICS.get(name)
-        if topic is None:  # somebody else's topic beside ours
-            self._channels[identifier] = None
-            return
-        expected, found = topic.schema.DESCRIPTOR.full_name, self._schemas.get(schema, "nothing")
-        if found != expected or encoding != "protobuf":
-            raise LogError(f"{self._path}: topic {name} holds {found} in {encoding}, must be {expected} in protobuf")
-        if name == "/run":
-            self._run_channel = identifier
-        wanted = self._topics is None or name in self._topics
-        self._channels[identifier] = (name, topic.schema) if wanted else None
+def _messages(
+    reader: ChunkReader, path: Path, topics: Collection[str] | None, losses: LogLosses
+) -> Iterator[LogMessage]:
+    decoder = MessageDecoder(path, topics, lambda reason: losses.add_undecodable(path, reason))
+    n_damaged = losses.n_places
+    for chunk in reader:
+        if reader.n_chunks == 1 and losses.n_places > n_damaged:
+            decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
+        yield from decoder.messages(chunk)
+    if not reader.is_finished:
+        losses.add_unfinished(path, reader.end_offset)
+    elif reader.summary is not None and reader.summary.n_chunks is not None:
+        losses.add_lost_chunks(path, reader.summary.n_chunks - reader.n_chunks)
+    if reader.n_chunks == 0:
+        losses.add(Damage(path, 0, 0, "holds no /run, so it is not a groundsbot log; import it or choose another"))
