@@ -120,20 +120,31 @@ def info(
 @app.command()
 def compare(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")],
-    truth: Annotated[Path, typer.Option(help="truth.json of the simulation.")],
+    truth: Annotated[Path | None, typer.Option(help="truth.json of the simulation.")] = None,
+    survey: Annotated[
+        Path | None, typer.Option(help="Measured places of tags: tag_id,x_m,y_m, maybe sigma_m, family, instance.")
+    ] = None,
     json_output: JsonFlag = False,
 ) -> None:
-    """Tells how far a map is from ground truth, and whether its covariances are honest.
+    """Tells how far a map is from ground truth or from a survey, and whether its covariances are honest.
 
-    With several components the figures of the largest come first, then those of the others, each in its own frame.
+    A survey is aligned first, and its entries that look wrong are named. With several components the figures of the
+    largest come first, then those of the others, each in its own frame.
     """
     import json
 
-    from offline.evaluation import evaluate
+    from offline.evaluation import MapErrors, evaluate
     from offline.map_io import read_map
+    from offline.survey import SurveyErrors, judge_survey, read_survey
     from offline.truth import read_truth
 
-    errors = evaluate(read_map(folder), read_truth(truth))
+    errors: MapErrors | SurveyErrors
+    if truth is not None and survey is None:
+        errors = evaluate(read_map(folder), read_truth(truth))
+    elif survey is not None and truth is None:
+        errors = judge_survey(read_map(folder), read_survey(survey))
+    else:
+        raise typer.BadParameter("give either --truth or --survey")
     if json_output:
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return

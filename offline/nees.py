@@ -73,8 +73,7 @@ def turns_rad(component: Component, truth: Truth, T_world_map: FloatArray, place
     keyframes_m = np.concatenate(positions)
     errors_rad: FloatArray = np.concatenate(errors)
     nearest = [int(np.argmin(((keyframes_m - place) ** 2).sum(axis=1))) for place in places_m]
-    turns: FloatArray = errors_rad[nearest]
-    return turns
+    return np.array([errors_rad[i] for i in nearest], dtype=np.float64)
 
 
 def _differences(places_m: FloatArray) -> FloatArray:

@@ -1,0 +1,339 @@
+"""A map against positions that somebody measured, neither of which is beyond doubt.
+
+The survey is turned and moved onto the map, weighed by the joint covariance of both. Each entry is then tested for a
+shift of its own (Baarda, "A testing procedure for use in geodetic networks", 1968): what the map and all other entries
+say of it against what it says itself. The worst goes first, and the rest is judged anew.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from calib import se2
+from calib.arrays import FloatArray
+from offline.alignment import fit_transform
+from offline.csv_table import CsvTable, read_table
+from offline.errors import OfflineError
+from offline.result import Component, MapResult, TagResult
+
+# What a tape measure and a plumb line leave, where the file does not say.
+DEFAULT_SIGMA_M: Final = 0.02
+# An entry of a good survey is named once in a thousand surveys.
+_FALSE_ALARM: Final = 1e-3
+_MAX_STEPS: Final = 20
+
+
+@dataclass(frozen=True)
+class SurveyEntry:
+    """One measured place, in the survey's own frame."""
+
+    family: str  # empty: not said
+    tag_id: int
+    instance: str
+    position_m: FloatArray  # (2,)
+    sigma_m: float  # of each coordinate
+
+
+@dataclass(frozen=True)
+class JudgedEntry:
+    """One entry against the map.
+
+    Attributes:
+        shift_m: from where the entry puts the tag to where the map and the other entries put it, in map axes (2,).
+        sigmas: length of that shift in its own sigmas.
+        verdict: "fits", "wrong" or "swapped".
+        swapped_with: the other tag of a pair that fits once exchanged.
+    """
+
+    tag: TagResult
+    shift_m: FloatArray
+    sigmas: float
+    verdict: str
+    swapped_with: int | None = None
+
+    def line(self) -> str:
+        """For a person; of entries that do not fit."""
+        name = f"{self.tag.family} {self.tag.tag_id}{self.tag.instance}"
+        off = f"{float(np.linalg.norm(self.shift_m)):.3f} m ({self.sigmas:.0f} sigmas)"
+        if self.verdict == "swapped":
+            return f"entry {name} looks swapped with {self.swapped_with}: it fits there, and is off by {off} here"
+        return f"entry {name} looks wrong: the map and the other entries put the tag {off} away from it"
+
+
+@dataclass(frozen=True)
+class ComponentSurvey:
+    """One component against the survey; figures are of the entries that fit.
+
+    Attributes:
+        rmse_m, worst_m: after plain least squares, which weighs all alike.
+        T_map_survey: (3,) how the survey lies in the map.
+        scale_error: by what share the map's distances are longer than the survey's, with its sigma.
+        nees_per_dim: of what the alignment leaves over; None where there is nothing over.
+    """
+
+    frame_run: str
+    entries: tuple[JudgedEntry, ...]
+    T_map_survey: FloatArray
+    rmse_m: float
+    worst_m: float
+    scale_error: float
+    scale_sigma: float
+    nees_per_dim: float | None
+
+    @property
+    def odd(self) -> tuple[JudgedEntry, ...]:
+        """Entries that look wrong."""
+        return tuple(entry for entry in self.entries if entry.verdict != "fits")
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "frame_run": self.frame_run,
+            "n_entries": len(self.entries),
+            "T_map_survey": self.T_map_survey.tolist(),
+            "tags_rmse_aligned_m": self.rmse_m,
+            "worst_m": self.worst_m,
+            "scale_error": self.scale_error,
+            "scale_sigma": self.scale_sigma,
+            "nees_per_dim": self.nees_per_dim,
+            "entries": [
+                {
+                    "family": entry.tag.family,
+                    "tag_id": entry.tag.tag_id,
+                    "instance": entry.tag.instance,
+                    "shift_m": entry.shift_m.tolist(),
+                    "sigmas": entry.sigmas,
+                    "verdict": entry.verdict,
+                    "swapped_with": entry.swapped_with,
+                }
+                for entry in self.entries
+            ],
+        }
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        n_good = len(self.entries) - len(self.odd)
+        nees = "nothing left over to judge by" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
+        lines = [
+            f"frame: start of {self.frame_run}; {len(self.entries)} surveyed tags, {n_good} fit",
+            f"  aligned, those that fit: RMSE {self.rmse_m:.3f} m, worst {self.worst_m:.3f} m",
+            f"  scale: {100.0 * self.scale_error:+.2f} % against the survey (sigma {100.0 * self.scale_sigma:.2f} %)",
+            f"  NEES per dimension (1 is honest): {nees}",
+        ]
+        return lines + [f"  {entry.line()}" for entry in self.odd]
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """A whole map against the survey."""
+
+    components: tuple[ComponentSurvey, ...]
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; the largest component's figures on top."""
+        parts = [component.as_json() for component in self.components]
+        return parts[0] | {"components": parts, "notes": list(self.notes)}
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        return [line for component in self.components for line in component.lines()] + list(self.notes)
+
+
+def read_survey(path: Path) -> list[SurveyEntry]:
+    """Reads `tag_id,x_m,y_m` and, where they are there, `sigma_m,family,instance`; other columns are not looked at.
+
+    Raises:
+        OfflineError: not such a file, or a tag twice in it.
+    """
+    table = read_table(path)
+    missing = [column for column in ("tag_id", "x_m", "y_m") if column not in table]
+    if missing:
+        raise OfflineError(f"{path}: has no column {', '.join(missing)}; a survey has tag_id,x_m,y_m and maybe sigma_m")
+    n = len(table)
+    ids, x_m, y_m = table.integers("tag_id", minimum=0), table.numbers("x_m"), table.numbers("y_m")
+    sigmas = table.positive_numbers("sigma_m") if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
+    families = table.text("family") if "family" in table else [""] * n
+    instances = table.text("instance") if "instance" in table else [""] * n
+    entries = [
+        SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma)
+        for family, tag_id, instance, x, y, sigma in zip(families, ids, instances, x_m, y_m, sigmas, strict=True)
+    ]
+    _check_once(table, entries)
+    return entries
+
+
+def _check_once(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
+    seen = set()
+    for row, entry in enumerate(entries):
+        name = (entry.family, entry.tag_id, entry.instance)
+        if name in seen:
+            table.fail(row, "tag_id", "is there twice; leave one row out, or tell them apart by instance")
+        seen.add(name)
+
+
+def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:
+    """Compares every component that shares three entries or more.
+
+    Raises:
+        OfflineError: no component does.
+    """
+    components, found = [], set()
+    for component in result.components:
+        matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry)]
+        found |= {k for _, k in matched}
+        if len(matched) >= 3:
+            components.append(_judge(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
+    if not components:
+        raise OfflineError(
+            f"the survey shares {len(found)} tags with the map, and three in one component are the least that can be "
+            "judged; measure more tags, or give the survey of this map"
+        )
+    lost = [str(entry.tag_id) for k, entry in enumerate(entries) if k not in found]
+    notes = [f"not in the map: tags {', '.join(lost)}"] if lost else []
+    return SurveyErrors(tuple(components), tuple(notes))
+
+
+def _tags_of(component: Component, entry: SurveyEntry) -> list[int]:
+    """The component's tag that an entry means; none where that is not clear."""
+    fits = [
+        i
+        for i, tag in enumerate(component.tags)
+        if tag.tag_id == entry.tag_id and tag.instance == entry.instance and entry.family in ("", tag.family)
+    ]
+    return fits if len(fits) == 1 else []
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """What a least-squares fit of the survey onto the map leaves over.
+
+    Attributes:
+        T_map_survey: (3,).
+        residual: (2n,) map minus survey, in map axes.
+        reliability: (2n, 2n) A with A residual = Q^-1 (what the fit leaves over), A Q A = A.
+    """
+
+    T_map_survey: FloatArray
+    residual: FloatArray
+    reliability: FloatArray
+
+    def shift(self, rows: Sequence[int]) -> tuple[FloatArray, float]:
+        """Of the rows of some entries: the shift that would explain them, and its squared length in sigmas."""
+        at = np.array(rows)
+        pulled = (self.reliability @ self.residual)[at]
+        shift: FloatArray = np.asarray(np.linalg.pinv(self.reliability[np.ix_(at, at)], rcond=1e-12) @ pulled)
+        return shift, float(pulled @ shift)
+
+
+def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> _Adjusted:
+    """Generalised least squares for the transform alone."""
+    information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    T_map_survey = fit_transform(map_m, survey_m)
+    for _ in range(_MAX_STEPS):
+        placed = se2.apply(T_map_survey, survey_m)
+        jacobian = _by_transform(placed)
+        normal = jacobian.T @ information @ jacobian
+        step = np.linalg.solve(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
+        T_map_survey = se2.compose(np.array([0.0, 0.0, step[2]]), T_map_survey) + np.array([step[0], step[1], 0.0])
+        if np.abs(step).max() < 1e-12:
+            break
+    placed = se2.apply(T_map_survey, survey_m)
+    jacobian = _by_transform(placed)
+    weighted = information @ jacobian
+    reliability: FloatArray = information - weighted @ np.linalg.solve(jacobian.T @ weighted, weighted.T)
+    return _Adjusted(T_map_survey, (map_m - placed).reshape(-1), reliability)
+
+
+def _by_transform(placed_m: FloatArray) -> FloatArray:
+    """(2n, 3) derivative of places by a shift and a turn of the survey about the map's origin."""
+    jacobian = np.zeros((len(placed_m), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -placed_m[:, 1], placed_m[:, 0]
+    return jacobian.reshape(-1, 3)
+
+
+def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
+    map_m = np.array([component.tags[i].position_m for i in tags])
+    survey_m = np.array([entry.position_m for entry in entries])
+    rows = np.array([(2 * i, 2 * i + 1) for i in tags]).reshape(-1)
+    covariance = component.tag_covariance[np.ix_(rows, rows)]
+    covariance = covariance + np.diag(np.repeat([entry.sigma_m**2 for entry in entries], 2))
+    good = _fitting(map_m, survey_m, covariance)
+    swapped = _swapped(map_m, survey_m, covariance, good)
+    judged = []
+    for k, i in enumerate(tags):
+        part, adjusted = _with(map_m, survey_m, covariance, [*sorted({*good, k})])
+        at = 2 * part.index(k)
+        shift, square = adjusted.shift([at, at + 1])
+        verdict = "fits" if k in good else "swapped" if k in swapped else "wrong"
+        other = entries[swapped[k]].tag_id if k in swapped else None
+        judged.append(JudgedEntry(component.tags[i], shift, float(np.sqrt(max(square, 0.0))), verdict, other))
+    _, adjusted = _with(map_m, survey_m, covariance, good)
+    residual = map_m[good] - se2.apply(fit_transform(map_m[good], survey_m[good]), survey_m[good])
+    scale, scale_sigma = _scale(adjusted, map_m[good])
+    n_over = residual.size - 3
+    square = float(adjusted.residual @ adjusted.reliability @ adjusted.residual)
+    return ComponentSurvey(
+        frame_run=component.frame_run,
+        entries=tuple(judged),
+        T_map_survey=adjusted.T_map_survey,
+        rmse_m=float(np.sqrt((residual**2).sum(axis=1).mean())),
+        worst_m=float(np.linalg.norm(residual, axis=1).max()),
+        scale_error=scale,
+        scale_sigma=scale_sigma,
+        nees_per_dim=square / n_over if n_over > 0 else None,
+    )
+
+
+def _with(
+    map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, part: list[int]
+) -> tuple[list[int], _Adjusted]:
+    """The fit of some entries."""
+    rows = np.array([(2 * k, 2 * k + 1) for k in part]).reshape(-1)
+    return part, _adjust(map_m[part], survey_m[part], covariance[np.ix_(rows, rows)])
+
+
+def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
+    """Entries left after the worst have gone, one at a time; three at least."""
+    limit = chdtri(2, _FALSE_ALARM / len(map_m))
+    good = list(range(len(map_m)))
+    while len(good) > 3:
+        _, adjusted = _with(map_m, survey_m, covariance, good)
+        squares = [adjusted.shift([2 * k, 2 * k + 1])[1] for k in range(len(good))]
+        worst = int(np.argmax(squares))
+        if squares[worst] <= limit:
+            break
+        del good[worst]
+    return good
+
+
+def _swapped(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, good: Sequence[int]) -> dict[int, int]:
+    """Among the entries that do not fit, pairs that do once exchanged."""
+    found: dict[int, int] = {}
+    odd = [k for k in range(len(map_m)) if k not in good]
+    for a, b in combinations(odd, 2):
+        if a in found or b in found:
+            continue
+        exchanged = survey_m.copy()
+        exchanged[[a, b]] = survey_m[[b, a]]
+        part, adjusted = _with(map_m, exchanged, covariance, [*sorted({*good, a, b})])
+        rows = [2 * part.index(k) + axis for k in (a, b) for axis in (0, 1)]
+        if chdtrc(4, adjusted.shift(rows)[1]) > _FALSE_ALARM:
+            found[a], found[b] = b, a
+    return found
+
+
+def _scale(adjusted: _Adjusted, map_m: FloatArray) -> tuple[float, float]:
+    """How much longer the map is than the survey, as a share, and its sigma."""
+    direction = (map_m - map_m.mean(axis=0)).reshape(-1)
+    pulled = adjusted.reliability @ direction
+    information = float(direction @ pulled)
+    if information <= 0.0:
+        return 0.0, float("inf")
+    return float(pulled @ adjusted.residual) / information, information**-0.5
