@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from calib.robot import Wheels, parse_robot_yaml
 from offline.errors import OfflineError
+from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import (
     TOPICS,
@@ -27,6 +28,7 @@ _GAP_S: Final = 0.5  # wheel readings missing for longer leave the motion unknow
 _GAP_INTERVALS: Final = 5  # and in a slow log, as long as this many usual intervals
 _STREAMS: Final = ("/wheels", "/odometry", "/tags/detections", "/camera/image")
 _GAPS_SHOWN: Final = 5
+_PLACES_TOLD: Final = 20
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class LogInfo:
     duration_s: float
     distance_m: float | None  # by the wheels; None where the log has none
     n_wheel_restarts: int
+    n_wheel_lines_lost: int  # by their sequence numbers
     n_pictures: int | None  # None: an imported log
     n_pictures_lost: int
     tags: dict[str, dict[int, int]]  # family, id: how often seen
@@ -65,6 +68,7 @@ class LogInfo:
     gaps: tuple[Gap, ...]
     events: dict[str, int]  # kind: how many messages
     file_bytes: dict[str, int]
+    losses: tuple[str, ...]  # what of it cannot be read, in words
 
     def as_json(self) -> dict[str, Any]:
         """For `--json`: plain data."""
@@ -111,6 +115,9 @@ class LogInfo:
             lines.append(f"  {self.n_pictures_lost} pictures lost, by the camera's own count")
         if self.n_wheel_restarts:
             lines.append(f"  the wheel controller restarted {self.n_wheel_restarts} times")
+        if self.n_wheel_lines_lost:
+            lines.append(f"  {self.n_wheel_lines_lost} wheel readings lost, by the controller's own count")
+        lines.extend(f"  damaged: {loss}" for loss in self.losses)
         return lines
 
 
@@ -120,12 +127,13 @@ def describe_log(log: Path) -> LogInfo:
     Raises:
         GroundsbotError: the log is missing, damaged, no log of ours, or its robot.yaml cannot be used.
     """
-    collected = _Collected()
-    for entry in read_log(log):
+    collected, losses = _Collected(), LogLosses()
+    for entry in read_log(log, losses=losses):
         collected.add(entry)
     run = collected.run
     if run is None:
-        raise OfflineError(f"{log}: holds no /run message; is it a groundsbot log?")
+        found = "; ".join([f"{log}: holds no /run message", *losses.lines()])
+        raise OfflineError(f"{found}; is it a groundsbot log?")
     wheels = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").wheels
     stamps = [stamp for stamps in collected.stamps_ns.values() for stamp in stamps]
     first_ns = min(stamps, default=0)
@@ -138,13 +146,15 @@ def describe_log(log: Path) -> LogInfo:
         duration_s=(max(stamps, default=0) - first_ns) / _NS_PER_S,
         distance_m=_distance_m(collected, wheels),
         n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
+        n_wheel_lines_lost=_missing(collected.wheel_lines),
         n_pictures=collected.counts.get("/tags/detections"),
-        n_pictures_lost=sum(max(0, after - before - 1) for before, after in pairwise(collected.frame_sequences)),
+        n_pictures_lost=_missing([(0, sequence) for sequence in collected.frame_sequences]),
         tags={family: dict(sorted(collected.tags[family].items())) for family in sorted(collected.tags)},
         topics=tuple(TopicInfo(t, collected.counts[t], _rate_hz(collected.stamps_ns[t])) for t in topics),
         gaps=tuple(gap for topic in _STREAMS for gap in _gaps(topic, collected.stamps_ns[topic], first_ns)),
         events=dict(sorted(collected.events.items())),
         file_bytes=_file_bytes(log),
+        losses=tuple(losses.lines(_PLACES_TOLD)),
     )
 
 
@@ -156,6 +166,7 @@ class _Collected:
     counts: Counter[str] = field(default_factory=Counter)
     stamps_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     ticks: list[tuple[int, int, int]] = field(default_factory=list)  # boot, left, right
+    wheel_lines: list[tuple[int, int]] = field(default_factory=list)  # boot, sequence
     distances_m: list[float] = field(default_factory=list)  # cumulative, of the middle
     places_m: list[tuple[float, float]] = field(default_factory=list)
     frame_sequences: list[int] = field(default_factory=list)
@@ -170,6 +181,7 @@ class _Collected:
         message = entry.message
         if isinstance(message, WheelEncoders):
             self.ticks.append((message.boot_id, message.ticks_left, message.ticks_right))
+            self.wheel_lines.append((message.boot_id, message.sequence))
         elif isinstance(message, TagDetections):
             self.frame_sequences.append(message.frame_sequence)
             self._add_tags((detection.family, detection.tag_id) for detection in message.detections)
@@ -209,6 +221,11 @@ def _distance_m(collected: _Collected, wheels: Wheels) -> float | None:
     return None
 
 
+def _missing(numbered: list[tuple[int, int]]) -> int:
+    """How many numbers are left out in a rising sequence of (epoch, number), within each epoch."""
+    return sum(max(0, after[1] - before[1] - 1) for before, after in pairwise(numbered) if before[0] == after[0])
+
+
 def _rate_hz(stamps_ns: list[int]) -> float | None:
     span_ns = max(stamps_ns) - min(stamps_ns) if stamps_ns else 0
     return (len(stamps_ns) - 1) * _NS_PER_S / span_ns if span_ns else None
@@ -227,5 +244,5 @@ def _gaps(topic: str, stamps_ns: list[int], first_ns: int) -> list[Gap]:
 
 
 def _file_bytes(log: Path) -> dict[str, int]:
-    files = sorted(log.glob("*.mcap")) if log.is_dir() else [log]
+    files = sorted(log.glob("*.mcap*")) if log.is_dir() else [log]
     return {file.name: file.stat().st_size for file in files}

@@ -16,6 +16,7 @@ from offline.errors import OfflineError
 from offline.odometry import WheelTrack
 from offline.plausible import check_file_name, check_numbers, check_speed
 from onboard.log_head import camera_from_message
+from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
 
@@ -171,17 +172,19 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     Raises:
         GroundsbotError: one line that says why the log cannot be mapped.
     """
-    collected = _Collected()
-    for entry in read_log(log, topics=_TOPICS):
+    collected, losses = _Collected(), LogLosses()
+    for entry in read_log(log, topics=_TOPICS, losses=losses):
         collected.add(entry)
     info = collected.info
     if info is None:
-        raise OfflineError(f"{log}: no /run message, so whose run it is cannot be told; is it a groundsbot log?")
+        found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
+        raise OfflineError(f"{found}; is it a groundsbot log?")
     check_file_name(info.robot_id, f"{log}: /run: robot_id")
     check_file_name(info.run_id, f"{log}: /run: run_id")
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = _stretches(collected, robot, log)
+    warnings += losses.lines()
     tags, detections, positions = _tag_readings(collected)
     camera = _camera(collected, given.camera if given else None, log)
     if collected.n_other_size:
