@@ -4,8 +4,9 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from types import FrameType
-from typing import Final, NoReturn
+from typing import Annotated, Final, NoReturn
 
 import typer
 
@@ -28,8 +29,8 @@ class _Interrupted(BaseException):
 
 
 def new_app(help_text: str) -> typer.Typer:
-    """An empty program: `-h` as well as `--help`, and known errors left to `run`."""
-    return typer.Typer(
+    """A program without commands yet: `-h` as well as `--help`, `--version`, and known errors left to `run`."""
+    app = typer.Typer(
         help=help_text,
         no_args_is_help=True,
         add_completion=False,
@@ -37,6 +38,22 @@ def new_app(help_text: str) -> typer.Typer:
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
+    app.callback()(_program)
+    return app
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"groundsbot {metadata.version('groundsbot')}")
+        raise typer.Exit(EXIT_DONE)
+
+
+def _program(
+    _version: Annotated[
+        bool, typer.Option("--version", help="Print the version and end.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Options that stand before a command."""
 
 
 def run(app: typer.Typer) -> NoReturn:

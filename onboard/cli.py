@@ -15,11 +15,6 @@ app = new_app("Record a drive of a robot: wheels, camera and the tags it sees, o
 RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The robot's robot.yaml.")]
 
 
-@app.callback()
-def _program() -> None:
-    """Makes every command a word of its own, whatever their number."""
-
-
 @app.command()
 def record(
     robot: RobotOption,

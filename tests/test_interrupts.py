@@ -100,8 +100,8 @@ def test_an_interrupted_map_leaves_what_was_there(
 
 def test_signal_handlers_are_as_before_when_a_program_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     app = new_app("Does nothing.")
-    app.command()(lambda: None)
-    monkeypatch.setattr(sys, "argv", ["nothing"])
+    app.command("rest")(lambda: None)
+    monkeypatch.setattr(sys, "argv", ["nothing", "rest"])
     before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(SystemExit) as caught:
         run(app)

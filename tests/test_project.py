@@ -1,5 +1,7 @@
 """The distribution and its programs, as somebody who installs them meets them."""
 
+import importlib
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -39,6 +41,17 @@ except SystemExit as end:
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
     assert found.returncode == 0, found.stderr
     assert "Usage:" in found.stdout
+
+
+@pytest.mark.parametrize("module", ["onboard.cli", "offline.cli", "fixtures.__main__"])
+def test_version_is_that_of_the_distribution(
+    module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["program", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(module).main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"groundsbot {importlib.metadata.version('groundsbot')}\n"
 
 
 def test_every_command_is_among_those_whose_help_is_tested() -> None:
