@@ -14,10 +14,11 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead, Factorisation, UnderDeterminedError, build_arrowhead
-from offline.arrowhead_kernels import System
+from offline.arrowhead_kernels import Rows, System
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
 from offline.robust import SQUARES, Loss, huber, losses_and_weights
+from offline.tied_down import Untied, untied_parts
 
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0
@@ -30,6 +31,10 @@ _COST_ROUNDING: Final = 1e-14  # relative
 # Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
 # drive, so the first damping must be tiny to leave such modes free.
 _FIRST_DAMPING: Final = 1e-9
+# Where rounding leaves a matrix without a square root, its diagonal is raised by this share, then by ten times as much
+# until it has one.
+_LEAST_FLOOR: Final = 1e-16
+_MOST_FLOOR: Final = 1e-3
 _SURE: Final = 10.0
 # A step that brings less than this share of what the linear model says is also tried in the other way.
 _GOOD_GAIN: Final = 0.75
@@ -107,8 +112,6 @@ class Solution:
     Attributes:
         costs: one an accepted step, the first before all of them but after relaxed ones.
         n_linearised: how often all factors were linearised, rejected and relaxed steps included.
-        untied: column of the tangent vector that nothing ties down, as the first factorisation without damping found
-            it; None where all is tied down.
     """
 
     state: State
@@ -118,7 +121,6 @@ class Solution:
     problem: Problem = field(repr=False)
     losses: Losses = field(repr=False, default_factory=lambda: DEFAULT_LOSSES)
     n_linearised: int = 0
-    untied: int | None = None
 
     @property
     def cost(self) -> float:
@@ -127,14 +129,33 @@ class Solution:
 
     @cached_property
     def factorisation(self) -> Factorisation:
-        """Of H at the end.
+        """Of H at the end; with the floor added where H has no square root of its own.
 
         Raises:
-            UnderDeterminedError: something is not tied down.
+            UnderDeterminedError: a variable is in no factor at all, or measurements are no numbers.
         """
-        arrowhead = self.problem.arrowhead
-        system, _ = arrowhead.linearise(self.state, *self.losses)
-        return arrowhead.factorise(system)
+        return self._factorised[0]
+
+    @property
+    def floor(self) -> float:
+        """Share of H's diagonal that had to be added for a square root in double precision; 0 where all is well."""
+        return self._factorised[1]
+
+    @cached_property
+    def _factorised(self) -> tuple[Factorisation, float]:
+        system, _ = self.problem.arrowhead.linearise(self.state, *self.losses)
+        return _factorised(self.problem.arrowhead, system, 0.0)
+
+    @cached_property
+    def untied(self) -> Untied:
+        """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
+        problem = self.problem
+        return untied_parts(problem.odometry, problem.readings, problem.columns, self.state)
+
+    @property
+    def rank(self) -> int:
+        """How many of the `problem.columns.n` directions are tied down."""
+        return self.problem.columns.n - self.untied.n_directions
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns of the tangent vector, exact to first order; 0 where held (-1)."""
@@ -155,6 +176,16 @@ def solve(
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
+    It stops, and `Solution.reason` says which of these it was:
+
+    - "converged": by its linear model the next step, Gauss-Newton's unless damping was needed up to here, would lower
+      the cost by no more than the tolerance. At an optimum that is before the first step.
+    - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
+    - "stopped after 100 steps".
+    - "a variable is in no factor": or something in the factors is no number.
+
+    What nothing ties down stays where it was: damping holds it.
+
     Args:
         problem: the factors.
         start: values to begin from.
@@ -169,25 +200,26 @@ def solve(
     state, n_linearised = _relaxed(problem, start, relaxed_steps)
     _, cost = arrowhead.linearise(state, *losses, out=system)
     costs, n_linearised = [cost], n_linearised + 1
-    damping, growth, rejected, untied, rolled = 0.0, 2.0, 0, None, False
+    damping, growth, rejected, floor, rolled = 0.0, 2.0, 0, 0.0, False
 
     def ended(reason: str, *, converged: bool) -> Solution:
-        return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised, untied)
+        return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
 
     for _ in range(_MAX_ITERATIONS):
-        candidate, candidate_cost, expected = state, np.inf, np.inf
         try:
-            step = -arrowhead.factorise(system, damping, rows).solve_in_order(system.gradient)
-        except UnderDeterminedError as error:
-            untied = error.column if damping == 0.0 else untied
-        else:
-            expected = _expected_decrease(system, step, damping)
-            if expected <= cost_tolerance + relative_tolerance * cost:
-                return ended("converged", converged=True)
-            candidate, candidate_cost, rolled, n_tried = _taken(
-                problem, losses, state, step, cost - _GOOD_GAIN * expected, spare, rolled=rolled
-            )
-            n_linearised += n_tried
+            factorisation, used = _factorised(arrowhead, system, max(damping, floor), rows)
+        except UnderDeterminedError:
+            return ended("a variable is in no factor", converged=False)
+        if used > max(damping, floor):
+            damping = floor = used
+        step = -factorisation.solve_in_order(system.gradient)
+        expected = _expected_decrease(system, step, max(damping, floor))
+        if expected <= cost_tolerance + relative_tolerance * cost:
+            return ended("converged", converged=True)
+        candidate, candidate_cost, rolled, n_tried = _taken(
+            problem, losses, state, step, cost - _GOOD_GAIN * expected, spare, rolled=rolled
+        )
+        n_linearised += n_tried
         if candidate_cost < cost:
             gain = (cost - candidate_cost) / expected
             state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
@@ -196,7 +228,7 @@ def solve(
             # Where the model is off by a share, the next gradient is that share of this one, what another step could
             # bring its square. By chance a model is right too early: not for who wants the last digit.
             left = _SURE * expected * (1.0 - gain) ** 2
-            if relative_tolerance > _COST_ROUNDING and damping == 0.0 and left <= relative_tolerance * cost:
+            if relative_tolerance > _COST_ROUNDING and damping <= floor and left <= relative_tolerance * cost:
                 return ended("converged", converged=True)
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > _LEAST_DAMPING else 0.0
@@ -240,6 +272,23 @@ def _taken(
     if other[1] < first[1]:
         return *other, not rolled, 2
     return *tried(rolled=rolled), rolled, 3
+
+
+def _factorised(
+    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None
+) -> tuple[Factorisation, float]:
+    """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
+
+    Raises:
+        UnderDeterminedError: no damping helps.
+    """
+    while True:
+        try:
+            return arrowhead.factorise(system, damping, out), damping
+        except UnderDeterminedError:
+            if damping > _MOST_FLOOR:
+                raise
+            damping = max(10.0 * damping, _LEAST_FLOOR)
 
 
 def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
