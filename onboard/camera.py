@@ -1,5 +1,6 @@
 """Where pictures come from: a camera, a video file, or a folder into which somebody else puts them."""
 
+import threading
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -52,11 +53,11 @@ class Camera(ABC):
     """One source of pictures.
 
     Attributes:
-        waits: pictures wait for their reader; none is lost if it is slow.
+        patience_s: how old a picture may become while it waits for the detection; then it is dropped.
         drains: what is there when recording ends still belongs to it.
     """
 
-    waits = False
+    patience_s = 0.0
     drains = False
 
     @abstractmethod
@@ -104,7 +105,7 @@ def camera_for(settings: CameraSettings, clock: RunClock, since_ns: int) -> Came
 class VideoCamera(Camera):
     """A video file, played once at its own speed; stamps are the opening time plus the position in the file."""
 
-    waits = True
+    patience_s = threading.TIMEOUT_MAX  # it waits itself: none need be lost
 
     def __init__(self, path: Path, clock: RunClock) -> None:
         self._path = path

@@ -12,8 +12,8 @@ from onboard.detection_process import ChildDetector, DetectionResult
 from onboard.encoder_port import EncoderPort, PortLostError
 from onboard.encoder_protocol import EncoderParser
 from onboard.errors import OnboardError
-from onboard.live_recorder import RobotFiles
 from onboard.messages import TOPICS
+from onboard.robot_files import RobotFiles
 
 _NS_PER_S: Final = 1_000_000_000
 _LISTEN_NS: Final = 2 * _NS_PER_S

@@ -31,7 +31,8 @@ def record(
     import signal
     import threading
 
-    from onboard.live_recorder import LiveRecorder, RobotFiles
+    from onboard.live_recorder import LiveRecorder
+    from onboard.robot_files import RobotFiles
 
     stop = threading.Event()
     for each in (signal.SIGINT, signal.SIGTERM):
@@ -54,7 +55,7 @@ def check(
 ) -> None:
     """Check every device before driving; exit code 1 if one fails."""
     from onboard.check import check_robot
-    from onboard.live_recorder import RobotFiles
+    from onboard.robot_files import RobotFiles
 
     failed = False
     for result in check_robot(RobotFiles(robot), output):

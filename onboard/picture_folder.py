@@ -28,7 +28,7 @@ class FolderCamera(Camera):
     written and waits; one that never gets it is handed on after a second, for the decoder to refuse.
     """
 
-    waits = True
+    patience_s = 2.0
     drains = True
 
     def __init__(self, folder: Path, clock: RunClock, since_ns: int) -> None:
