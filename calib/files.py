@@ -1,9 +1,12 @@
-"""Files that are there whole or not at all."""
+"""Files and folders that are there whole or not at all."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from calib.errors import CalibError
 
 
 @contextmanager
@@ -15,3 +18,46 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_written_whole(folder: Path) -> Iterator[Path]:
+    """Yields an empty folder beside `folder`, which takes its place if the block ends well.
+
+    Whatever `folder` held is gone then. If the block fails, everything is as it was before; folders that were missing
+    on the way to it are not left behind either.
+
+    Raises:
+        CalibError: the folder cannot be made or replaced.
+    """
+    folder = folder.resolve()
+    made = [each for each in folder.parents if not each.exists()]
+    partial, replaced = (folder.with_name(f".{folder.name}.{os.getpid()}.{word}") for word in ("partial", "replaced"))
+    try:
+        with _told(folder):
+            if folder.is_mount():
+                raise CalibError(
+                    f"{folder}: is where a disk is mounted, and is filled by renaming; name a folder in it"
+                )
+            partial.mkdir(parents=True)
+        yield partial
+        with _told(folder):
+            if folder.exists():
+                folder.rename(replaced)
+            partial.rename(folder)
+    finally:
+        if replaced.exists() and not folder.exists():
+            replaced.rename(folder)
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+        for parent in made:
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise CalibError(f"{folder}: cannot be written ({error.strerror}); name a folder that you may write") from error

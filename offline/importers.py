@@ -1,6 +1,5 @@
 """A folder of CSV files -> a run log that `map` reads like a recorded one."""
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from heapq import merge
@@ -9,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
+from calib.files import folder_written_whole
 from calib.tag_family import families, family_size
 from offline.errors import OfflineError
 from offline.import_forms import (
@@ -164,29 +164,14 @@ def _check_output(output: Path, run_folder: Path) -> None:
 
 
 def _write_run(run_folder: Path, info: RunInfo, drive: _Drive, family: str) -> None:
-    """Writes into a hidden folder beside and renames it, so that a failure leaves nothing behind."""
-    made = _missing_folders(run_folder.parent)
-    partial = run_folder.with_name(f".{run_folder.name}.partial")
-    try:
-        start_ns = min(stamp for stamp, _, _ in _messages(drive, family))
-        writer = LogWriter(partial, {"/run": info}, start_ns)
-        with writer:
-            for stamp_ns, topic, message in _messages(drive, family):
-                writer.write(topic, message, stamp_ns, stamp_ns)
-        partial.rename(run_folder)
-    except BaseException as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        for created in made:
-            if created.is_dir() and not any(created.iterdir()):
-                created.rmdir()
-        if isinstance(error, OSError):
+    start_ns = min(stamp for stamp, _, _ in _messages(drive, family))
+    with folder_written_whole(run_folder) as partial:
+        try:
+            with LogWriter(partial, {"/run": info}, start_ns) as writer:
+                for stamp_ns, topic, message in _messages(drive, family):
+                    writer.write(topic, message, stamp_ns, stamp_ns)
+        except OSError as error:
             raise OfflineError(f"{run_folder}: cannot be written: {error.strerror}; choose another output") from error
-        raise
-
-
-def _missing_folders(folder: Path) -> list[Path]:
-    """Folders on the way to `folder` that do not exist yet, deepest first."""
-    return [each for each in (folder, *folder.parents) if not each.exists()]
 
 
 def _messages(drive: _Drive, family: str) -> Iterator[tuple[int, str, PlanarOdometry | TagObservations]]:

@@ -1,8 +1,6 @@
 """The `map` command: logs in, a folder with the map out; everything is written or nothing."""
 
 import json
-import os
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +9,7 @@ from math import degrees
 from pathlib import Path
 
 from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from calib.files import folder_written_whole
 from calib.noise import read_noise_yaml
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
@@ -50,12 +49,19 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     with compilation_announced(_say), _progress_bar() as show:
         stages = Stages(show)
         result = map_logs(logs, robot_files, noise, stages)
-        with _all_or_nothing(options.output) as folder:
-            with stages.stage("writing files"):
-                write_map(result, folder)
-            with stages.stage("drawing the picture"):
-                write_picture(result, folder / "map.png")
+        with folder_written_whole(options.output) as folder:
+            _write_files(result, folder, options.output, stages)
     return result, stages.costs
+
+
+def _write_files(result: MapResult, folder: Path, output: Path, stages: Stages) -> None:
+    try:
+        with stages.stage("writing files"):
+            write_map(result, folder)
+        with stages.stage("drawing the picture"):
+            write_picture(result, folder / "map.png")
+    except OSError as error:
+        raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
 
 
 def _read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
@@ -145,31 +151,6 @@ def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> Non
         raise OfflineError(
             f"-o {output}: --overwrite replaces maps only, and there is no {JSON_FILE} in it; name another folder"
         )
-
-
-@contextmanager
-def _all_or_nothing(output: Path) -> Iterator[Path]:
-    """A folder beside `output` that takes its place if the block ends well."""
-    output = output.resolve()
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
-        partial.mkdir()
-    except OSError as error:
-        raise OfflineError(f"-o {output}: cannot be made ({error.strerror}); name a folder you may write") from error
-    replaced = output.with_name(f".{output.name}.{os.getpid()}.replaced")
-    try:
-        yield partial
-        if output.exists():
-            output.rename(replaced)
-        partial.rename(output)
-    except OSError as error:
-        raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
-    finally:
-        if replaced.exists() and not output.exists():
-            replaced.rename(output)
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(replaced, ignore_errors=True)
 
 
 @contextmanager

@@ -73,10 +73,10 @@ def test_an_interrupted_simulation_leaves_nothing(
     tmp_path: Path, number: signal.Signals, code: int, rendering: bool
 ) -> None:
     output = tmp_path / "logs"
-    awaited = "*.partial/*/*/*.mcap*" if rendering else "*.partial"
+    awaited = ".*.partial/*/*/*.mcap*" if rendering else ".*.partial"
     long = ("--world", "room", "--frame-rate-hz", 1000)  # minutes, were its processes waited for
     with program("-m", "fixtures", "simulate", *long, "--output", output) as process:
-        wait_until(lambda: any(output.glob(awaited)), process)
+        wait_until(lambda: any(tmp_path.glob(awaited)), process)
         assert end_of(process, number) == (code, "interrupted\n")
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,99 @@
+"""Files and folders that are there whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from calib.errors import CalibError
+from calib.files import folder_written_whole, written_whole
+
+
+def spoilt(file: Path) -> None:
+    """Writes some and fails."""
+    file.write_text("half")
+    raise ZeroDivisionError
+
+
+def all_below(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*"))
+
+
+def test_a_file_appears_whole_or_stays_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    with written_whole(path) as partial:
+        partial.write_text("first")
+        assert not path.exists()
+    with pytest.raises(ZeroDivisionError), written_whole(path) as partial:
+        spoilt(partial)
+    assert path.read_text() == "first"
+    assert all_below(tmp_path) == [path]
+
+
+def test_a_folder_appears_whole_with_the_folders_on_the_way(tmp_path: Path) -> None:
+    folder = tmp_path / "way" / "there"
+    with folder_written_whole(folder) as partial:
+        (partial / "file").write_text("all")
+        assert not folder.exists()
+    assert (folder / "file").read_text() == "all"
+    assert all_below(tmp_path) == [tmp_path / "way", folder, folder / "file"]
+
+
+def test_a_folder_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    (folder / "sub").mkdir(parents=True)
+    with folder_written_whole(folder) as partial:
+        (partial / "new").write_text("")
+        assert (folder / "sub").is_dir()
+    assert all_below(tmp_path) == [folder, folder / "new"]
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_failure_leaves_all_as_it_was(tmp_path: Path, existing: bool) -> None:
+    folder = tmp_path / "way" / "there"
+    if existing:
+        folder.mkdir(parents=True)
+        (folder / "file").write_text("old")
+    before = all_below(tmp_path)
+    with pytest.raises(ZeroDivisionError), folder_written_whole(folder) as partial:
+        spoilt(partial / "file")
+    assert all_below(tmp_path) == before
+    assert not existing or (folder / "file").read_text() == "old"
+
+
+def test_what_was_there_comes_back_if_it_cannot_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "file").write_text("old")
+    rename = Path.rename
+
+    def fail(self: Path, target: Path) -> Path:
+        if self.name.endswith(".partial"):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail)
+    with (
+        pytest.raises(CalibError, match=r"folder: cannot be written \(Input/output error\); name a folder"),
+        folder_written_whole(folder) as partial,
+    ):
+        (partial / "file").write_text("new")
+    assert (folder / "file").read_text() == "old"
+    assert all_below(tmp_path) == [folder, folder / "file"]
+
+
+def test_a_folder_that_cannot_be_made_is_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(CalibError, match=r"file/folder: cannot be written \(Not a directory\)"),
+        folder_written_whole(tmp_path / "file" / "folder"),
+    ):
+        pytest.fail("the block must not run")
+
+
+def test_a_mount_point_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path)
+    with (
+        pytest.raises(CalibError, match="is where a disk is mounted"),
+        folder_written_whole(tmp_path),
+    ):
+        pytest.fail("the block must not run")
