@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from calib.command_line import new_app
+from calib.command_line import EXIT_WITH_LOSSES, new_app
 from calib.command_line import run as run_program
 from calib.errors import GroundsbotError
 
@@ -115,6 +115,24 @@ def info(
         typer.echo(f"error: {earlier}", err=True)
     if refused:
         raise refused[-1]
+
+
+@app.command()
+def salvage(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder, damaged or unfinished.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="New log file or run folder.")],
+) -> None:
+    """Writes what a damaged or unfinished log still holds into a new one, finished and with an index.
+
+    The old log is not touched. Exit 3: something of it is lost; it is said what.
+    """
+    from offline.salvage import salvage as make_salvage
+
+    salvaged = make_salvage(log, output)
+    for line in (line for each in salvaged for line in each.lines()):
+        typer.echo(line)
+    if not all(each.is_whole for each in salvaged):
+        raise typer.Exit(EXIT_WITH_LOSSES)
 
 
 @app.command()

@@ -63,6 +63,15 @@ class LogLosses:
         """Notes how many chunks of its index a file does not hold."""
         self.n_chunks += max(0, n_chunks)
 
+    def add_nothing_found(self, path: Path) -> None:
+        """Notes a file without a single whole chunk."""
+        self.unusable[path] = "holds not one whole chunk"
+
+    @property
+    def n_lost(self) -> int:
+        """How many things are lost, as far as they can be counted; a file cut short as such is none."""
+        return self.n_places + self.n_chunks + self.n_undecodable
+
     def __bool__(self) -> bool:
         """Whether anything is amiss, an unfinished file included."""
         return bool(self.n_places or self.n_chunks or self.n_undecodable or self.unfinished or self.unusable)
@@ -100,3 +109,7 @@ class NoLosses(LogLosses):
         """Raises LogError if there are any."""
         if n_chunks > 0:
             raise LogError(f"{path}: {n_chunks} chunks that its index names are lost; salvage it first")
+
+    def add_nothing_found(self, path: Path) -> None:
+        """Raises LogError."""
+        raise LogError(f"{path}: holds no /run, so it is not a groundsbot log; import it or choose another")

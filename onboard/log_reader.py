@@ -2,19 +2,22 @@
 
 import heapq
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
+from google.protobuf.message import Message
+
 from onboard.chunk_reader import ChunkReader
 from onboard.errors import LogError
 from onboard.log_file import ACTIVE_SUFFIX
-from onboard.log_losses import Damage, LogLosses, NoLosses
+from onboard.log_losses import LogLosses, NoLosses
 from onboard.log_segments import PICTURE_TOPIC, of_pictures
 from onboard.message_decoder import LogMessage, MessageDecoder
 from onboard.messages import TOPICS, RunInfo
 
-__all__ = ["LogMessage", "find_logs", "read_log", "read_run_info"]
+__all__ = ["LogMessage", "files_of", "find_logs", "read_head", "read_log", "read_run_info"]
 
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
@@ -88,6 +91,32 @@ def read_run_info(path: Path) -> RunInfo:
         if found is not None:
             return found
     raise LogError(f"{path}: the beginning, which says whose run it is, is damaged; choose another log")
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files of a log, a file itself or those of a run folder, finished or not.
+
+    Raises:
+        LogError: there are none.
+    """
+    core, pictures = _files_of(path)
+    return sorted([*core, *pictures])
+
+
+def read_head(path: Path) -> dict[str, Message]:
+    """What stands at the head of a log's files, from the first file in which each topic of it is to be found.
+
+    Raises:
+        LogError: `path` is missing or its files belong to different runs.
+    """
+    head: dict[str, Message] = {}
+    for file in files_of(path):
+        with suppress(LogError):
+            for each in _read_file(file, None, LogLosses()):
+                if each.topic not in _HEADS:
+                    break
+                head.setdefault(each.topic, each.message)
+    return head
 
 
 def _logs_below(folder: Path) -> list[Path]:
@@ -173,11 +202,9 @@ def _identity(each: LogMessage) -> bytes:
 
 def _first_time_ns(file: Path) -> int | None:
     """Log time of the first message behind a file's head, which has the time of the file's beginning."""
-    try:
+    with suppress(LogError):
         for each in _read_file(file, None, LogLosses()):
             return each.log_time_ns
-    except LogError:
-        pass
     return None
 
 
@@ -225,4 +252,4 @@ def _messages(
     elif reader.summary is not None and reader.summary.n_chunks is not None:
         losses.add_lost_chunks(path, reader.summary.n_chunks - reader.n_chunks)
     if reader.n_chunks == 0:
-        losses.add(Damage(path, 0, 0, "holds no /run, so it is not a groundsbot log; import it or choose another"))
+        losses.add_nothing_found(path)

@@ -171,4 +171,9 @@ def is_unfinished(path: Path) -> bool:
 
 def of_pictures(files: Iterable[Path]) -> list[Path]:
     """Those that hold pictures."""
-    return [path for path in files if path.name.removesuffix(ACTIVE_SUFFIX).endswith(CAMERA_SUFFIX)]
+    return [path for path in files if finished_name(path).endswith(CAMERA_SUFFIX)]
+
+
+def finished_name(path: Path) -> str:
+    """What a file is called once it is finished."""
+    return path.name.removesuffix(ACTIVE_SUFFIX)

@@ -105,6 +105,7 @@ class EventKind(StrEnum):
     CLOCK_STEP = "clock_step"
     MESSAGE_REFUSED = "message_refused"
     DISK = "disk"
+    SALVAGED = "salvaged"
 
 
 def timestamp(stamp_ns: int) -> Timestamp:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.errors import GroundsbotError
 from calib.robot import Robot, Wheels
 from offline.info import LogInfo, describe_log
-from onboard.errors import LogError
 from onboard.log_writer import LogWriter
 from onboard.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
 
@@ -118,12 +118,21 @@ def test_a_log_of_nothing_is_described_too(tmp_path: Path) -> None:
 def test_what_is_no_log_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "some.mcap"
     path.write_bytes(content)
-    with pytest.raises(LogError, match=r"some\.mcap: "):
+    with pytest.raises(GroundsbotError, match=r"some\.mcap: "):
         describe_log(path)
 
 
-def test_a_log_cut_short_is_refused(drive: Path) -> None:
+def test_a_log_cut_in_its_first_chunk_is_refused(drive: Path) -> None:
     file = drive / "0000.core.mcap"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 10])
-    with pytest.raises(LogError, match=r"0000\.core\.mcap"):
+    with pytest.raises(GroundsbotError, match=r"holds no /run message; .*0000\.core\.mcap"):
         describe_log(drive)
+
+
+def test_what_is_left_of_a_log_cut_short_is_described(drive: Path) -> None:
+    whole = describe_log(drive)
+    file = drive / "0000.core.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 5])
+    info = describe_log(drive)
+    assert 0 < info.duration_s < whole.duration_s
+    assert any("0000.core.mcap: was never finished" in line for line in info.lines())

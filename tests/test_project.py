@@ -19,6 +19,7 @@ COMMANDS = [
     ("offline.cli", "map"),
     ("offline.cli", "import"),
     ("offline.cli", "info"),
+    ("offline.cli", "salvage"),
     ("offline.cli", "compare"),
     ("fixtures.__main__",),
     ("fixtures.__main__", "simulate"),
