@@ -132,7 +132,7 @@ def test_a_log_cut_in_its_first_chunk_is_refused(drive: Path) -> None:
 def test_what_is_left_of_a_log_cut_short_is_described(drive: Path) -> None:
     whole = describe_log(drive)
     file = drive / "0000.core.mcap"
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 5])
+    file.write_bytes(file.read_bytes()[:3600])
     info = describe_log(drive)
     assert 0 < info.duration_s < whole.duration_s
     assert any("0000.core.mcap: was never finished" in line for line in info.lines())
