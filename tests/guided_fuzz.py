@@ -1,0 +1,130 @@
+"""Fuzzing guided by coverage: inputs that reach a new step from line to line are kept and changed further.
+
+After the idea of AFL (Zalewski, 2013); small, so that it needs nothing that is not here already.
+"""
+
+import random
+import sys
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+_NOTEWORTHY = (b"\x00", b"\xff", b"\x7f\xff", b"\xff" * 4, b"\xff" * 8, b"\x00" * 8, b"\x80\x00\x00\x00")
+_LONGEST = 4096
+
+Mutation = Callable[[bytes, random.Random], bytes]
+
+
+@dataclass
+class Findings:
+    """What a session of fuzzing did."""
+
+    runs: int
+    corpus: list[bytes]
+    edges: int
+
+
+def fuzz(
+    check: Callable[[bytes], None],
+    seeds: Sequence[bytes],
+    modules: Collection[str],
+    *,
+    seed: int,
+    runs: int | None = None,
+    seconds: float | None = None,
+    mutations: Sequence[Mutation] = (),
+    findings_folder: Path | None = None,
+) -> Findings:
+    """Feeds changed inputs to `check` until it raises, or the runs or seconds are over.
+
+    Args:
+        check: raises where something is wrong.
+        seeds: inputs to begin with.
+        modules: the files (their full names) whose steps count as coverage.
+        seed: of the random numbers.
+        runs: how many inputs.
+        seconds: how long.
+        mutations: ways to change an input that suit its format, besides the common ones.
+        findings_folder: where an input that makes `check` raise is put.
+    """
+    chance = random.Random(seed)
+    corpus, edges, n = list(seeds), set(), 0
+    for each in corpus:
+        edges |= _traced(check, each, modules, findings_folder)
+    end_s = time.monotonic() + seconds if seconds is not None else float("inf")
+    while (runs is None or n < runs) and time.monotonic() < end_s:
+        n += 1
+        data = _changed(corpus, chance, mutations)
+        found = _traced(check, data, modules, findings_folder)
+        if not found <= edges:
+            edges |= found
+            corpus.append(data)
+    return Findings(n, corpus, len(edges))
+
+
+def _changed(corpus: Sequence[bytes], chance: random.Random, mutations: Sequence[Mutation]) -> bytes:
+    data = chance.choice(corpus)
+    for _ in range(1 << chance.randrange(4)):
+        if mutations and chance.random() < 0.5:
+            data = chance.choice(mutations)(data, chance)
+        else:
+            data = _common(data, corpus, chance)
+    return data[:_LONGEST]
+
+
+def _common(data: bytes, corpus: Sequence[bytes], chance: random.Random) -> bytes:
+    at, length = chance.randrange(len(data) + 1), chance.choice((1, 2, 4, 8, 32, 128))
+    kind = chance.randrange(7)
+    if kind == 0 and data:
+        at = min(at, len(data) - 1)
+        return data[:at] + bytes([data[at] ^ 1 << chance.randrange(8)]) + data[at + 1 :]
+    if kind == 1:
+        return data[:at] + data[at + length :]
+    if kind == 2:
+        return data[:at] + chance.randbytes(length) + data[at + length :]
+    if kind == 3:
+        return data[:at] + data[at : at + length] * 2 + data[at + length :]
+    if kind == 4:
+        other = chance.choice(corpus)
+        return data[:at] + other[chance.randrange(len(other) + 1) :]
+    if kind == 5:
+        return data[:at] + chance.choice(_NOTEWORTHY) + data[at:]
+    moved = chance.randrange(len(data) + 1)
+    return data[:moved] + data[at : at + length] + data[moved:]
+
+
+def _traced(
+    check: Callable[[bytes], None], data: bytes, modules: Collection[str], findings_folder: Path | None
+) -> set[tuple[object, int, int]]:
+    edges: set[tuple[object, int, int]] = set()
+
+    def local(frame: FrameType) -> Callable[[FrameType, str, Any], Any]:
+        last = 0
+
+        def each_line(_frame: FrameType, event: str, _argument: Any) -> Any:
+            nonlocal last
+            if event == "line":
+                edges.add((frame.f_code, last, frame.f_lineno))
+                last = frame.f_lineno
+            return each_line
+
+        return each_line
+
+    def each_call(frame: FrameType, _event: str, _argument: Any) -> Any:
+        return local(frame) if frame.f_code.co_filename in modules else None
+
+    before = sys.gettrace()
+    sys.settrace(each_call)
+    try:
+        check(data)
+    except BaseException:
+        if findings_folder is not None:
+            findings_folder.mkdir(parents=True, exist_ok=True)
+            (findings_folder / f"{abs(hash(data)):016x}.bin").write_bytes(data)
+        raise
+    finally:
+        sys.settrace(before)
+    return edges
