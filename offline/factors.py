@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
@@ -225,6 +226,25 @@ class CalibrationPrior:
         """Residuals (C, 1) and one block."""
         weight = 1.0 / np.where(self.sigma > 0.0, self.sigma, 1.0)
         return Linearised(self.residual(state), ((columns.calibration[:, None], weight[:, None, None]),))
+
+
+def stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
+    """One sparse Jacobian (m, n) and its residuals (m,)."""
+    rows, columns, values, residuals = [], [], [], []
+    first_row = 0
+    for kind in kinds:
+        m, n = kind.residual.shape
+        row = first_row + np.arange(m * n).reshape(m, n, 1)
+        for block_columns, derivative in kind.blocks:
+            full = np.broadcast_to(block_columns[:, None, :], derivative.shape)
+            free = full >= 0
+            rows.append(np.broadcast_to(row, derivative.shape)[free])
+            columns.append(full[free])
+            values.append(derivative[free])
+        residuals.append(kind.residual.reshape(-1))
+        first_row += m * n
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)
 
 
 def whitening(covariance: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from calib.arrays import FloatArray
-from offline.factors import Linearised, State
+from offline.factors import Linearised, State, stacked
 from offline.robust import SQUARES, Loss, losses_and_weights
 from offline.solver import PLAIN_SQUARES, Losses, Problem
 
@@ -52,7 +52,7 @@ def plain_normal_equations(
         _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),
         problem.prior.linearise(state, problem.columns),
     )
-    jacobian, residual = _stacked(kinds, problem.columns.n)
+    jacobian, residual = stacked(kinds, problem.columns.n)
     return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
 
 
@@ -65,22 +65,3 @@ def _reweighted(kind: Linearised, loss: Loss) -> Linearised:
         kind.residual * root[:, None],
         tuple((columns, derivative * root[:, None, None]) for columns, derivative in kind.blocks),
     )
-
-
-def _stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
-    """One sparse Jacobian (m, n) and its residuals (m,)."""
-    rows, columns, values, residuals = [], [], [], []
-    first_row = 0
-    for kind in kinds:
-        m, n = kind.residual.shape
-        row = first_row + np.arange(m * n).reshape(m, n, 1)
-        for block_columns, derivative in kind.blocks:
-            full = np.broadcast_to(block_columns[:, None, :], derivative.shape)
-            free = full >= 0
-            rows.append(np.broadcast_to(row, derivative.shape)[free])
-            columns.append(full[free])
-            values.append(derivative[free])
-        residuals.append(kind.residual.reshape(-1))
-        first_row += m * n
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)
