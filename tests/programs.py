@@ -1,5 +1,9 @@
 """What a program did, as a person meets it."""
 
+import os
+import pty
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,3 +16,21 @@ class Outcome:
 
 
 Run = Callable[..., Outcome]
+
+
+def on_terminal(*arguments: object) -> tuple[int, str, str]:
+    """Runs a Python process whose standard error is a terminal: exit code, what the terminal got, standard output."""
+    outer, inner = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    command = [sys.executable, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=inner, env=environment) as program:
+        os.close(inner)
+        shown = b""
+        while True:
+            try:
+                shown += os.read(outer, 1 << 16)
+            except OSError:  # the other end is closed
+                break
+        printed = program.stdout.read() if program.stdout else b""
+    os.close(outer)
+    return program.returncode, shown.decode(), printed.decode()

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from fixtures.simulate import simulate
 from fixtures.world import World, load_world
 from onboard.log_reader import read_log
 from onboard.messages import TagDetections, WheelEncoders
+from tests.programs import on_terminal
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -53,7 +55,7 @@ def exact_world() -> World:
 
 @pytest.mark.parametrize("render", [False, pytest.param(True, id="rendered")])
 def test_the_same_seed_gives_the_same_bytes_whoever_else_drives(tmp_path: Path, render: bool) -> None:
-    options: dict[str, Any] = {"render": render, "picture_rate_hz": 1.0, "frame_rate_hz": 3.0}
+    options: dict[str, Any] = {"render": render, "picture_rate_hz": 1.0 if render else None, "frame_rate_hz": 3.0}
     together = ["a", "b"] if render else None
     simulate("room", 3, tmp_path / "both", together, **options)
     simulate("room", 3, tmp_path / "alone", ["a"], **options)
@@ -80,6 +82,22 @@ def test_a_folder_that_is_not_empty_is_refused_and_left_alone(tmp_path: Path) ->
     with pytest.raises(FixturesError, match="output folder is not empty"):
         simulate("room", 0, tmp_path, render=False)
     assert list(digests(tmp_path)) == ["kept.txt"]
+
+
+def test_keeping_pictures_that_nobody_renders_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FixturesError, match="--picture-rate-hz is 2, but --no-render makes no pictures"):
+        simulate("room", 0, tmp_path / "out", render=False, picture_rate_hz=2.0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_terminal_shows_how_far_each_robot_is(tmp_path: Path) -> None:
+    command = ["-m", "fixtures", "simulate", "--world", "room", "--robots", "a,c", "--no-render"]
+    code, shown, printed = on_terminal(*command, "--output", tmp_path / "out")
+    assert code == 0
+    assert "recording a" in shown
+    done, total = re.findall(r"recording c.* (\d+)/(\d+)", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown))[-1]
+    assert done == total != "0"
+    assert "recording" not in printed
 
 
 def test_nothing_is_left_behind_when_a_robot_cannot_drive(tmp_path: Path) -> None:

@@ -79,6 +79,10 @@ def test_base_gives_what_is_not_given_again(tmp_path: Path) -> None:
         (TINY + "pictures: {rate_hz: 1001}\n", "pictures.rate_hz is 1001 but must be less than or equal to 1000"),
         (TINY + "wheel_link: {rate_hz: 1.0e+6}\n", "wheel_link.rate_hz is .* must be less than or equal to 10000"),
         (TINY + TINY.split("robots:\n")[1], r"id a is given twice"),
+        (
+            TINY + "tags:\n" + 2 * "- {tag_id: 5, position_m: [0, 0, 1], yaw_deg: 0}\n",
+            "tiny: .*tags: tag_id 5 of tag36h11 is given 2 times",
+        ),
         ("name: x\nbase: nowhere\n", "world nowhere: neither a file nor one of"),
     ],
 )
@@ -86,6 +90,12 @@ def test_errors_name_file_field_and_value(text: str, expected: str) -> None:
     with pytest.raises(FixturesError, match=expected) as caught:
         parse_world(text, "tiny")
     assert "\n" not in str(caught.value)
+
+
+def test_one_id_in_two_families_is_two_tags() -> None:
+    place = "position_m: [0, 0, 1], yaw_deg: 0"
+    world = parse_world(TINY + f"tags: [{{tag_id: 5, {place}}}, {{tag_id: 5, family: tag25h9, {place}}}]\n", "tiny")
+    assert [tag.family for tag in world.tags] == ["tag36h11", "tag25h9"]
 
 
 def test_a_base_that_leads_back_is_refused(tmp_path: Path) -> None:

@@ -1,10 +1,6 @@
 """Stages of mapping: told as they go on, timed, and shown to the person who waits."""
 
 import json
-import os
-import pty
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +9,7 @@ import pytest
 from offline import stages as stages_module
 from offline.stages import Stages
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
-from tests.programs import Run
+from tests.programs import Run, on_terminal
 
 ALL = [
     "reading logs",
@@ -99,21 +95,8 @@ def test_verbose_json_holds_the_stages_and_the_map_file_does_not(run: Run, logs:
 
 
 def test_a_terminal_shows_the_stages_and_is_left_clean(logs: Path, tmp_path: Path) -> None:
-    outer, inner = pty.openpty()
-    command = [sys.executable, "-m", "offline.cli", "map", str(logs), "-o", str(tmp_path / "map")]
-    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=inner, env=environment) as program:
-        os.close(inner)
-        shown = b""
-        while True:
-            try:
-                shown += os.read(outer, 65536)
-            except OSError:  # the other end is closed
-                break
-        assert program.stdout is not None
-        printed = program.stdout.read().decode()
-    os.close(outer)
-    assert program.returncode == 0
-    assert b"drawing the picture" in shown
-    assert shown.endswith(b"\x1b[2K")  # the bar's line is wiped
+    code, shown, printed = on_terminal("-m", "offline.cli", "map", logs, "-o", tmp_path / "map")
+    assert code == 0
+    assert "drawing the picture" in shown
+    assert shown.endswith("\x1b[2K")  # the bar's line is wiped
     assert "stage " not in printed
