@@ -235,9 +235,9 @@ class ChunkReader:
             (length,) = U64.unpack_from(content, position)
         except (struct.error, UnicodeDecodeError) as error:
             raise _BadRecordError(f"a chunk is damaged: {error}") from error
-        data = content[position + U64.size : position + U64.size + length]
-        if len(data) != length:
-            raise _BadRecordError(f"a chunk is damaged: holds {len(data)} of the {length} bytes it claims")
+        data = content[position + U64.size :]
+        if len(data) != length:  # more would hide what follows
+            raise _BadRecordError(f"a chunk is damaged: holds {len(data)} bytes, not the {length} it claims")
         allowance = _UNFOLDED_FREE_BYTES + _UNFOLDED_SHARE * self._stream.tell() - self._unfolded
         if size > min(RECORD_LIMIT_BYTES, allowance):
             raise _BadRecordError(
