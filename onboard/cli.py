@@ -19,8 +19,12 @@ RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The 
 def record(
     robot: RobotOption,
     output: Annotated[Path, typer.Option(metavar="DIR", help="Where run folders go; may exist.")],
+    status: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where to write the status each second.  [default: DIR/ROBOT.status.json]"),
+    ] = None,
 ) -> None:
-    """Record one run until stopped (Ctrl-C or SIGTERM).
+    """Record one run until stopped (Ctrl-C, SIGTERM, or the terminal's end).
 
     Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap where pictures are kept. Devices that are absent are waited
     for. A folder as the camera gives the pictures that appear in it as T.png or T.jpg, T being the middle of the
@@ -31,20 +35,36 @@ def record(
     import signal
     import threading
 
+    from onboard.housekeeping import Housekeeper
     from onboard.live_recorder import LiveRecorder
     from onboard.robot_files import RobotFiles
+    from onboard.status import STATUS_SUFFIX
+    from onboard.systemd import Notifier
 
     stop = threading.Event()
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, lambda *_: stop.set())
-    recorder = LiveRecorder(RobotFiles(robot), output, stop, _tell_event, typer.echo)
-    recorder.run()
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(each) is not signal.SIG_IGN:
+            signal.signal(each, lambda *_: stop.set())
+    files = RobotFiles(robot)
+    path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
+
+    def tell_event(event: "Event") -> None:
+        _say(f"{event.kind}: {event.text}")
+        keeper.note(event)
+
+    recorder = LiveRecorder(files, output, stop, tell_event, _say)
+    keeper = Housekeeper(recorder, path, Notifier())
+    keeper.start()
+    try:
+        recorder.run()
+    finally:
+        keeper.end()
     core = recorder.core
     counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.counts.items()))
-    typer.echo(f"{core.folder}: {counts}")
+    _say(f"{core.folder}: {counts}")
     if core.losses:
         lost = ", ".join(f"{count} {what}" for what, count in sorted(core.losses.items()))
-        typer.echo(f"lost: {lost}")
+        _say(f"lost: {lost}")
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 
@@ -65,8 +85,38 @@ def check(
         raise typer.Exit(EXIT_REFUSED)
 
 
-def _tell_event(event: "Event") -> None:
-    typer.echo(f"{event.kind}: {event.text}")
+@app.command()
+def status(
+    place: Annotated[
+        Path, typer.Argument(metavar="[DIR]", help="Where `record` writes: its DIR, or its status file.")
+    ] = Path(),
+    once: Annotated[bool, typer.Option("--once", help="Print it once, in plain lines, and end.")] = False,
+) -> None:
+    """Show how a running recorder does: rates, ages, losses, tags in view, hours left on the disk.
+
+    Exit code with --once: 0 recording and all is well; 1 no recorder at work; 3 something is lost or wrong.
+    """
+    from rich.console import Console
+
+    from onboard.status import is_alive
+    from onboard.status_view import print_once, show_live
+
+    console = Console()
+    if not once and console.is_terminal:
+        show_live(place, console)
+    shown = print_once(place, console)
+    if not is_alive(shown):
+        raise typer.Exit(EXIT_REFUSED)
+    if shown.losses or shown.problems:
+        raise typer.Exit(EXIT_WITH_LOSSES)
+
+
+def _say(text: str) -> None:
+    """Whoever listened may be gone; the recording goes on."""
+    import contextlib
+
+    with contextlib.suppress(OSError):
+        typer.echo(text)
 
 
 def main() -> None:

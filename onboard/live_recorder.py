@@ -8,6 +8,7 @@ import contextlib
 import queue
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
@@ -49,6 +50,10 @@ class LiveRecorder:
     Attributes:
         core: what has been written and lost; there from `run` on.
         log: how the log does on its disk; there from `run` on.
+        begun: set once both are there.
+        files: the robot.
+        output: where run folders go.
+        start_ns: on the run's clock.
     """
 
     core: RecorderCore
@@ -71,17 +76,33 @@ class LiveRecorder:
             on_event: told of each event in the log.
             on_notice: told, in words, of what is not for the log: what is waited for.
         """
-        self._files = files
-        self._output = output
+        self.files = files
+        self.output = output
+        self.begun = threading.Event()
         self._stop = stop
         self._on_event = on_event
         self._on_notice = on_notice
         self._clock = RunClock()
-        self._start_ns = self._clock.now_ns()
+        self.start_ns = self._clock.now_ns()
+        self._served_s = time.monotonic()
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # for the core, in its thread
         self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
         self._under_way = 0
         self._detector: ChildDetector | None = None
+
+    def now_ns(self) -> int:
+        """Now, on the run's clock."""
+        return self._clock.now_ns()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether it has been told to stop."""
+        return self._stop.is_set()
+
+    @property
+    def stalled_s(self) -> float:
+        """How long the core's thread has not come round: a healthy one does so twenty times a second."""
+        return time.monotonic() - self._served_s
 
     def run(self) -> None:
         """Records until `stop` is set, then takes in what the devices still hold and closes the log.
@@ -89,7 +110,7 @@ class LiveRecorder:
         Raises:
             OnboardError: recording cannot start or go on.
         """
-        files = self._files
+        files = self.files
         if files.camera_settings is not None:
             self._detector = ChildDetector(files.detector_settings, self._detector_restarted)
         try:
@@ -97,15 +118,16 @@ class LiveRecorder:
                 files.robot,
                 files.text,
                 files.camera,
-                new_run_id(self._start_ns),
-                self._start_ns,
+                new_run_id(self.start_ns),
+                self.start_ns,
                 self._clock.run_epoch_ns,
             )
             wheels = files.robot.devices.encoder_port is not None
-            with one_recorder(files.path, self._output, files.robot.robot_id):
+            with one_recorder(files.path, self.output, files.robot.robot_id):
                 self.core = RecorderCore(
-                    self._output, run, on_event=self._on_event, expect_wheels=wheels, open_log=self._open_log
+                    self.output, run, on_event=self._on_event, expect_wheels=wheels, open_log=self._open_log
                 )
+                self.begun.set()
                 try:
                     self._record()
                 finally:
@@ -115,8 +137,8 @@ class LiveRecorder:
                 self._detector.close()
 
     def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> LogThread:
-        robot, disk = self._files.robot, Disk()
-        room = DiskRoom(disk, self._output, robot.robot_id, space_policy(robot))
+        robot, disk = self.files.robot, Disk()
+        room = DiskRoom(disk, self.output, robot.robot_id, space_policy(robot))
         limits = segment_limits(robot)
         keeper = LogKeeper(folder, head, start_ns, disk, room, keep_pictures=keep_pictures, limits=limits)
         self.log = LogThread(keeper)
@@ -144,7 +166,7 @@ class LiveRecorder:
             self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, self._clock.now_ns(), self._under_way)
 
     def _device_threads(self) -> list[DeviceThread]:
-        files, devices = self._files, self._files.robot.devices
+        files, devices = self.files, self.files.robot.devices
         threads: list[DeviceThread] = []
         if devices.encoder_port is not None:
             port = EncoderPort(devices.encoder_port, devices.encoder_baud)
@@ -157,7 +179,7 @@ class LiveRecorder:
                 self._stop,
                 self._on_notice,
                 clock=self._clock,
-                since_ns=self._start_ns,
+                since_ns=self.start_ns,
                 slots=self._slots,
                 detect=self._detect,
                 drop=self._drop,
@@ -168,6 +190,7 @@ class LiveRecorder:
     def _serve(self, go_on: Callable[[], bool]) -> None:
         next_tick_ns = 0
         while go_on():
+            self._served_s = time.monotonic()
             with contextlib.suppress(queue.Empty):
                 self._work.get(timeout=_WAIT_S)()
             now_ns = self._clock.now_ns()

@@ -72,6 +72,8 @@ class RecorderCore:
         folder: the run's folder.
         counts: messages written, by topic.
         losses: what is missing from the log, by a word for it.
+        newest_ns: when the newest message arrived, by topic.
+        tags_in_view: of the newest picture, by family and id.
     """
 
     def __init__(
@@ -102,6 +104,8 @@ class RecorderCore:
         self.folder = folder / run.run_id
         self.counts: Counter[str] = Counter()
         self.losses: Counter[str] = Counter()
+        self.newest_ns: dict[str, int] = {}
+        self.tags_in_view: tuple[str, ...] = ()
         self._run = run
         self._options = run.robot.recorder
         self._detector = detector
@@ -113,6 +117,7 @@ class RecorderCore:
         self._wall_clock = ClockWatch()
         self._tallies = Tallies()
         self._waiting: deque[_Waiting] = deque()
+        self._source: StampSource | int = StampSource.STAMP_SOURCE_UNSPECIFIED
         self._odd_sizes: set[tuple[int, int]] = set()
         self._next_picture_ns = 0
         self._next_anchor_ns = 0
@@ -236,6 +241,8 @@ class RecorderCore:
         """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
         self._camera.heard(receive_ns)
         self._check_size(size_px, receive_ns)
+        self._note_source(source)
+        self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
         message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         self._waiting.append(_Waiting(message, receive_ns))
         self._write_waiting(receive_ns)
@@ -262,6 +269,12 @@ class RecorderCore:
         self._camera.heard(host_ns)
         self.losses["pictures"] += count
         self._tallies.add(kind, count, reason)
+
+    def _note_source(self, source: "StampSource | int") -> None:
+        if source != self._source and source == StampSource.STAMP_SOURCE_ARRIVAL:
+            text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
+            self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
+        self._source = source
 
     def _check_size(self, size_px: tuple[int, int], host_ns: int) -> None:
         camera = self._run.camera
@@ -389,6 +402,7 @@ class RecorderCore:
             self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, str(error), now_ns, 1)
             return
         self.counts[topic] += taken
+        self.newest_ns[topic] = receive_ns
 
 
 def segment_limits(robot: Robot) -> SegmentLimits:

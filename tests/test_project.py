@@ -15,6 +15,7 @@ COMMANDS = [
     ("onboard.cli",),
     ("onboard.cli", "record"),
     ("onboard.cli", "check"),
+    ("onboard.cli", "status"),
     ("offline.cli",),
     ("offline.cli", "map"),
     ("offline.cli", "import"),

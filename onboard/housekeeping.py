@@ -1,0 +1,144 @@
+"""Beside the recording: writes its status each second and tells systemd that it is well, in a thread of its own.
+
+A thread of its own, so that a disk or a device that blocks the recording shows in the status. The watchdog is fed only
+while the log comes forward.
+"""
+
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Final, Literal
+
+from onboard.clock import wall_clock_synchronised
+from onboard.live_recorder import LiveRecorder
+from onboard.log_keeper import LogStatus
+from onboard.messages import Event, Severity
+from onboard.status import DiskStatus, Look, Rates, Status, write_status
+from onboard.systemd import Notifier
+
+_NS_PER_S: Final = 1_000_000_000
+_PERIOD_S: Final = 1.0
+_EVENTS_SHOWN: Final = 6
+_SILENT_S: Final = 3.0
+_STALLED_S: Final = 5.0
+_S_PER_H: Final = 3600
+
+
+class Housekeeper(threading.Thread):
+    """Looks after one recording from its start to its end."""
+
+    def __init__(self, recorder: LiveRecorder, path: Path, notifier: Notifier, period_s: float = _PERIOD_S) -> None:
+        """Starts nothing yet.
+
+        Args:
+            recorder: whose recording has begun.
+            path: of the status file.
+            notifier: for systemd.
+            period_s: between two looks.
+        """
+        super().__init__(name="housekeeping", daemon=True)
+        self._recorder = recorder
+        self._path = path
+        self._notifier = notifier
+        watchdog_s = notifier.watchdog_s or _STALLED_S * 2.0
+        self._period_s = min(period_s, watchdog_s / 4.0)
+        self._stalled_s = watchdog_s / 2.0
+        self._over = threading.Event()
+        self._rates = Rates()
+        self._events: deque[str] = deque(maxlen=_EVENTS_SHOWN)
+        self._free_bytes = 0
+
+    def note(self, event: Event) -> None:
+        """Remembers an event for people; called by the recorder."""
+        if event.severity != Severity.SEVERITY_INFO:
+            self._events.append(f"{time.strftime('%H:%M:%S')} {event.kind}: {event.text}")
+
+    def run(self) -> None:
+        """Looks each second until told that it is over."""
+        while not self._recorder.begun.wait(self._period_s):
+            if self._over.is_set():
+                return
+        self._notifier.ready()
+        while not self._over.wait(self._period_s):
+            state: Literal["recording", "stopping"] = "stopping" if self._recorder.is_stopping else "recording"
+            if state == "stopping":
+                self._notifier.stopping()
+            status = self._look(state)
+            write_status(status, self._path)
+            text = "; ".join(status.problems) or f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
+            if status.stalled_s < self._stalled_s:
+                self._notifier.alive(text)
+            else:
+                self._notifier.troubled(text)
+
+    def end(self) -> None:
+        """Writes the last status; the recording is closed, or never began."""
+        self._over.set()
+        self.join(2.0 * self._period_s)
+        if self._recorder.begun.is_set() and not self.is_alive():  # else its disk blocks
+            write_status(self._look("stopped"), self._path)
+
+    def _look(self, state: Literal["recording", "stopping", "stopped"]) -> Status:
+        recorder, core, log = self._recorder, self._recorder.core, self._recorder.log.status
+        devices = recorder.files.robot.devices
+        now_ns = recorder.now_ns()
+        counts = dict(core.counts)
+        self._rates.add(Look(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
+        wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
+        camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
+        stalled_s = max(recorder.stalled_s, recorder.log.stalled_s) if state == "recording" else 0.0
+        problems = [
+            f"no {what} for {_SILENT_S:g} s"
+            for device, what in ((wheels, "wheel readings"), (camera, "pictures"))
+            if device.expected
+            and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
+            > _SILENT_S * _NS_PER_S
+        ]
+        if stalled_s > _STALLED_S:
+            problems.insert(0, f"the log has not come forward for {stalled_s:.0f} s")
+        if log.problem is not None:
+            problems.insert(0, f"disk: {log.problem}")
+        return Status(
+            robot_id=recorder.files.robot.robot_id,
+            run_id=core.folder.name,
+            folder=str(core.folder),
+            pid=os.getpid(),
+            state=state,
+            updated_ns=time.time_ns(),
+            recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
+            wheels=wheels,
+            camera=camera,
+            tags_in_view=list(core.tags_in_view),
+            counts=counts,
+            losses=dict(core.losses),
+            disk=self._disk(log),
+            clock_synchronised=wall_clock_synchronised(),
+            stalled_s=round(stalled_s, 2),
+            problems=problems if state == "recording" else [],
+            last_events=list(self._events),
+        )
+
+    def _disk(self, log: LogStatus) -> DiskStatus:
+        try:
+            room = os.statvfs(self._recorder.output)
+            self._free_bytes = room.f_bavail * room.f_frsize
+        except OSError:
+            self._free_bytes = 0
+        per_s = self._rates.bytes_per_s()
+        return DiskStatus(
+            free_bytes=self._free_bytes,
+            bytes_per_s=per_s,
+            hours_left=round(self._free_bytes / per_s / _S_PER_H, 1) if per_s else None,
+            waiting_bytes=log.waiting_bytes,
+            problem=log.problem,
+        )
+
+
+def _size_of(folder: Path) -> int:
+    """Of the run's files; those removed meanwhile, to make room, count no more."""
+    try:
+        return sum(each.stat().st_size for each in os.scandir(folder))
+    except OSError:
+        return 0
