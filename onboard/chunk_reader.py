@@ -268,15 +268,22 @@ def _decompressed(data: bytes, compression: str, size: int) -> bytes:
 
 def _check_form(opcode: int, content: bytes) -> None:
     """Small records carry no checksum, so their own lengths must fit: a flipped bit must not skip what follows."""
+    if opcode == Opcode.CHUNK:
+        return
     try:
         if opcode == Opcode.MESSAGE_INDEX:
-            fits = U32.unpack_from(content, U16.size)[0] == len(content) - U16.size - U32.size
+            end = _counted(content, U16.size)
         elif opcode == Opcode.HEADER:
-            _, position = read_text(content, 0)
-            fits = read_text(content, position)[1] == len(content)
-        else:
-            fits = True  # chunks carry a checksum; schemas and channels outside one are somebody else's
+            end = read_text(content, read_text(content, 0)[1])[1]
+        else:  # a schema or a channel outside a chunk is somebody else's
+            start = U16.size if opcode == Opcode.SCHEMA else 2 * U16.size
+            end = _counted(content, read_text(content, read_text(content, start)[1])[1])
     except (struct.error, UnicodeDecodeError):
-        fits = False
-    if not fits:
+        end = -1
+    if end != len(content):
         raise _BadRecordError("a record's length does not fit its content")
+
+
+def _counted(content: bytes, position: int) -> int:
+    """Where the bytes end that have their number before them."""
+    return int(position + U32.size + U32.unpack_from(content, position)[0])
