@@ -16,6 +16,7 @@ from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_kernels, arrowhead_substitution, linearise_kernels, linearise_readings
 from offline.arrowhead_covariance import joint_covariance
 from offline.arrowhead_kernels import Rows, System
+from offline.arrowhead_marginals import pose_marginals
 from offline.arrowhead_tree import Tree, build_tree
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import Free, Odometry, Readings, Values
@@ -212,6 +213,14 @@ class Factorisation:
         covariance = np.zeros((len(columns), len(columns)))
         covariance[np.ix_(free, free)] = joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
         return covariance
+
+    def pose_covariances(self, poses: IntArray) -> FloatArray:
+        """(k, 3, 3) of k poses, by their right perturbation; all at once, and 0 where held."""
+        wanted = np.zeros(self.arrowhead.tree.n_poses, dtype=np.bool_)
+        wanted[poses] = True
+        marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, self.top, wanted)[poses]
+        free = self.arrowhead.free.poses[poses]
+        return marginals * (free[:, :, None] * free[:, None, :])
 
     def condition(self) -> float:
         """Estimate, from below, of the ratio of H's largest and smallest eigenvalue: power iteration on both ends."""

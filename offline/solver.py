@@ -161,6 +161,10 @@ class Solution:
         """Joint covariance (k, k) of k columns of the tangent vector, exact to first order; 0 where held (-1)."""
         return self.factorisation.covariance(columns)
 
+    def pose_covariances(self, poses: IntArray) -> FloatArray:
+        """Covariance (k, 3, 3) of each of k poses, in its own axes; as `covariance`, but quick for many."""
+        return self.factorisation.pose_covariances(poses)
+
     def condition(self) -> float:
         """Estimate of H's condition number at the end."""
         return self.factorisation.condition()

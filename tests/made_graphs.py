@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from calib import se2
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
 from offline.solver import Problem
 
@@ -15,7 +15,7 @@ N_ROBOTS: Final = 2
 
 
 def made_graph(
-    seed: int, lengths: list[int], n_tags: int, *, calibrated: bool = True, reach: float = 0.3
+    seed: int, lengths: list[int], n_tags: int, *, calibrated: bool = True, reach: float = 0.3, held: float = 0.0
 ) -> tuple[Problem, State]:
     """A problem and the state that its measurements are of, but for their noise.
 
@@ -25,6 +25,7 @@ def made_graph(
         n_tags: each read along some part of the first chain, and of others.
         calibrated: calibration is free, else it is held.
         reach: the longest share of a chain along which a tag is read.
+        held: share of the other poses' directions, and of the tags, that are held like the first pose.
     """
     rng = np.random.default_rng(seed)
     sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
@@ -35,7 +36,7 @@ def made_graph(
         odometry=_odometry(rng, truth, first, chain_of),
         readings=readings,
         prior=CalibrationPrior(sigma),
-        columns=_columns(len(poses), n_tags, sigma > 0.0),
+        columns=_columns(rng, len(poses), n_tags, sigma > 0.0, held),
         anchor=readings.pose[np.unique(readings.tag, return_index=True)[1]],
     )
     return problem, truth
@@ -118,9 +119,12 @@ def _who_reads_what(
     return np.concatenate(pose), np.concatenate(tag)
 
 
-def _columns(n_poses: int, n_tags: int, free: IntArray) -> Columns:
-    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
-    poses[0] = -1
-    n = 3 * n_poses - 3
-    calibration = np.where(free, n + 2 * n_tags + np.cumsum(free) - 1, -1)
-    return Columns(poses, n + np.arange(2 * n_tags).reshape(n_tags, 2), calibration, n + 2 * n_tags + int(free.sum()))
+def _columns(rng: np.random.Generator, n_poses: int, n_tags: int, free: BoolArray, held: float) -> Columns:
+    """Poses, tags, calibration; all of the first pose is held, of others what chance says."""
+    free_poses = rng.random((n_poses, 3)) >= held
+    free_poses[0] = False
+    free_tags = np.broadcast_to(rng.random((n_tags, 1)) >= held, (n_tags, 2))
+    is_free = np.concatenate([free_poses.reshape(-1), free_tags.reshape(-1), free])
+    column = np.where(is_free, np.cumsum(is_free) - 1, -1)
+    poses, tags, calibration = np.split(column, [3 * n_poses, 3 * n_poses + 2 * n_tags])
+    return Columns(poses.reshape(-1, 3), tags.reshape(-1, 2), calibration, int(is_free.sum()))
