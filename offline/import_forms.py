@@ -55,6 +55,7 @@ class WheelScale:
     track_m: float | None
     metres_per_tick_left: float | None
     metres_per_tick_right: float | None
+    tick_flags: tuple[str, ...] = ()  # options of the command line that tell of ticks
 
 
 def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
@@ -64,13 +65,16 @@ def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
     distances exactly, for a constant speed between two rows is an arc.
 
     Raises:
-        OfflineError: A wrong column or value, time not advancing, or a scale that the form needs and is not known.
+        OfflineError: A wrong column or value, time not advancing, a scale that the form needs and is not known, or
+            options that it has no use for.
     """
     table = read_table(path)
     form = _columns_of(table, _ODOMETRY)
     if len(table) == 0:
         raise OfflineError(f"{path}: has a header but no rows; a run needs wheel readings, export it again")
     stamps = table.stamps_ns(strictly=True)
+    if form != ("left_ticks", "right_ticks"):
+        refuse_tick_options(path, scale.tick_flags)
     if form == ("left_ticks", "right_ticks"):
         wheels = _from_ticks(table, stamps, scale)
         said = "cumulative wheel ticks"
@@ -83,6 +87,16 @@ def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
         said = "forward and turning speeds, each the mean since the row before"
     _check_speeds(table, form[0], wheels)
     return wheels, said
+
+
+def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:
+    """Complains of options that would be of no use.
+
+    Raises:
+        OfflineError: `flags` names some.
+    """
+    if flags:
+        raise OfflineError(f"{path}: holds no ticks, so {' and '.join(flags)} would not be used; leave that out")
 
 
 def read_observations(path: Path, max_tag_id: int) -> list[Observation]:

@@ -63,6 +63,11 @@ class ImportOptions:
         """Whether any part of the camera's place was given."""
         return any(value is not None for value in (self.camera_x_m, self.camera_y_m, self.camera_yaw_deg))
 
+    @property
+    def tick_flags(self) -> tuple[str, ...]:
+        """Those given that tell how long a tick is."""
+        return tuple(_flag(o) for o in ("wheel_radius_m", "ticks_per_turn") if getattr(self, o) is not None)
+
 
 def safe_name(folder: Path) -> str:
     """A folder's name with everything but letters, digits, dot, dash and underscore turned to dashes."""
@@ -77,11 +82,11 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
     robot = read_robot_yaml(options.robot) if options.robot else None
     if robot is None:
         if options.wheel_radius_m is None or options.ticks_per_turn is None:
-            return WheelScale(options.track_width_m, None, None)
+            return WheelScale(options.track_width_m, None, None, options.tick_flags)
         tick_m = 2 * pi * options.wheel_radius_m / options.ticks_per_turn
-        return WheelScale(options.track_width_m, tick_m, tick_m)
+        return WheelScale(options.track_width_m, tick_m, tick_m, options.tick_flags)
     wheels = robot.wheels.model_copy(update=_given_wheels(options))
-    return WheelScale(wheels.track_m, *wheels.metres_per_tick)
+    return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags)
 
 
 def describe_robot(folder: Path, options: ImportOptions, in_camera: bool) -> tuple[Robot, str, list[str]]:

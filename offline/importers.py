@@ -10,6 +10,7 @@ from typing import Final
 
 from calib.files import folder_written_whole
 from calib.tag_family import families, family_size
+from calib.words import counted
 from offline.errors import OfflineError
 from offline.import_forms import (
     Observation,
@@ -18,6 +19,7 @@ from offline.import_forms import (
     read_odometry,
     read_paper_landmarks,
     read_paper_odometry,
+    refuse_tick_options,
 )
 from offline.import_robot import ImportOptions, describe_robot, safe_name, wheel_scale
 from onboard.log_writer import LogWriter
@@ -43,8 +45,10 @@ class ImportReport:
 
     def lines(self) -> list[str]:
         """For a person."""
-        drive = f"{self.n_odometry} odometry readings over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
-        seen = f"{self.n_observations} observations of {self.n_tags} tags"
+        drive = (
+            f"{counted(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
+        )
+        seen = f"{counted(self.n_observations, 'observation')} of {counted(self.n_tags, 'tag')}"
         return [
             f"robot {self.robot_id}, run {self.run_id}: {drive}; {seen}",
             *(f"  {remark}" for remark in self.remarks),
@@ -112,10 +116,11 @@ def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
     outside = _n_outside(drive)
     if outside and outside == len(drive.observations):
         raise OfflineError(
-            f"{folder}: all {outside} observations lie outside the odometry's time; are both files on one clock?"
+            f"{folder}: none of {counted(outside, 'observation')} lies within the odometry's time; "
+            "are both files on one clock?"
         )
     if outside:
-        drive.remarks.append(f"{outside} observations lie outside the odometry's time and cannot be placed by a map")
+        drive.remarks.append(f"{counted(outside, 'observation')} outside the odometry's time: a map cannot place them")
     return drive
 
 
@@ -135,6 +140,7 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
         raise OfflineError(
             f"{folder / _PAPER_PAIR[0]}: holds no times; give --state-rate-hz (the paper's authors took 4.2)"
         )
+    refuse_tick_options(folder / _PAPER_PAIR[0], options.tick_flags)
     wheels = read_paper_odometry(folder / _PAPER_PAIR[0], rate_hz)
     n_states = len(wheels.stamps_ns) - 1
     observations = read_paper_landmarks(folder / _PAPER_PAIR[1], n_states, rate_hz, family_size(options.tag_family) - 1)

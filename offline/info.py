@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from itertools import pairwise
 from math import hypot
 from pathlib import Path
@@ -10,6 +11,7 @@ from statistics import median
 from typing import Any, Final
 
 from calib.robot import Wheels, parse_robot_yaml
+from calib.words import counted
 from offline.errors import OfflineError
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
@@ -24,6 +26,7 @@ from onboard.messages import (
 )
 
 _NS_PER_S: Final = 1_000_000_000
+_EARLIEST_NS: Final = 946_684_800 * _NS_PER_S  # 2000-01-01: no log is older
 _GAP_S: Final = 0.5  # wheel readings missing for longer leave the motion unknown
 _GAP_INTERVALS: Final = 5  # and in a slow log, as long as this many usual intervals
 _STREAMS: Final = ("/wheels", "/odometry", "/tags/detections", "/camera/image")
@@ -57,6 +60,7 @@ class LogInfo:
     run_id: str
     robot_id: str
     software_version: str
+    start_utc: str | None  # the first measurement, to the second; None where the log's clock tells no date
     duration_s: float
     distance_m: float | None  # by the wheels; None where the log has none
     n_wheel_restarts: int
@@ -80,7 +84,7 @@ class LogInfo:
         lines = [
             f"{self.log}",
             f"  robot {self.robot_id}, run {self.run_id}, written by {self.software_version or 'an unnamed version'}",
-            f"  {self.duration_s:.1f} s, {self._distance()}; {size}",
+            f"  {self._time()}, {self._distance()}; {size}",
             f"  tags: {self._tags()}",
         ]
         for topic in self.topics:
@@ -91,6 +95,9 @@ class LogInfo:
             lines.append("  events: " + ", ".join(f"{kind} {count}" for kind, count in self.events.items()))
         return lines
 
+    def _time(self) -> str:
+        return f"{self.duration_s:.1f} s" if self.start_utc is None else f"{self.start_utc}, {self.duration_s:.1f} s"
+
     def _distance(self) -> str:
         if self.distance_m is None:
             return "no wheel readings, so no map can use it"
@@ -100,7 +107,7 @@ class LogInfo:
         if not self.tags:
             return "none seen"
         return "; ".join(
-            f"{len(seen)} of {family} in {sum(seen.values())} readings: {' '.join(map(str, seen))}"
+            f"{len(seen)} of {family} in {counted(sum(seen.values()), 'reading')}: {' '.join(map(str, seen))}"
             for family, seen in self.tags.items()
         )
 
@@ -110,13 +117,13 @@ class LogInfo:
             for gap in self.gaps[:_GAPS_SHOWN]
         ]
         if len(self.gaps) > _GAPS_SHOWN:
-            lines.append(f"  and {len(self.gaps) - _GAPS_SHOWN} more gaps; --json lists them")
+            lines.append(f"  and {counted(len(self.gaps) - _GAPS_SHOWN, 'more gap')}; --json lists them")
         if self.n_pictures_lost:
-            lines.append(f"  {self.n_pictures_lost} pictures lost, by the camera's own count")
+            lines.append(f"  {counted(self.n_pictures_lost, 'picture')} lost, by the camera's own count")
         if self.n_wheel_restarts:
-            lines.append(f"  the wheel controller restarted {self.n_wheel_restarts} times")
+            lines.append(f"  the wheel controller restarted {counted(self.n_wheel_restarts, 'time')}")
         if self.n_wheel_lines_lost:
-            lines.append(f"  {self.n_wheel_lines_lost} wheel readings lost, by the controller's own count")
+            lines.append(f"  {counted(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
         lines.extend(f"  damaged: {loss}" for loss in self.losses)
         return lines
 
@@ -143,6 +150,7 @@ def describe_log(log: Path) -> LogInfo:
         run_id=run.run_id,
         robot_id=run.robot_id,
         software_version=run.software_version,
+        start_utc=_utc(first_ns),
         duration_s=(max(stamps, default=0) - first_ns) / _NS_PER_S,
         distance_m=_distance_m(collected, wheels),
         n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
@@ -224,6 +232,13 @@ def _distance_m(collected: _Collected, wheels: Wheels) -> float | None:
 def _missing(numbered: list[tuple[int, int]]) -> int:
     """How many numbers are left out in a rising sequence of (epoch, number), within each epoch."""
     return sum(max(0, after[1] - before[1] - 1) for before, after in pairwise(numbered) if before[0] == after[0])
+
+
+def _utc(stamp_ns: int) -> str | None:
+    """Date and time of day; none for an imported log whose times begin somewhere near zero."""
+    if stamp_ns < _EARLIEST_NS:
+        return None
+    return datetime.fromtimestamp(stamp_ns // _NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 def _rate_hz(stamps_ns: list[int]) -> float | None:

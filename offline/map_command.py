@@ -11,6 +11,7 @@ from pathlib import Path
 from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from calib.files import folder_written_whole
 from calib.noise import read_noise_yaml
+from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
@@ -118,12 +119,14 @@ def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
 def _component_lines(component: Component, *, several: bool) -> list[str]:
     lines = []
     if several:
-        lines.append(f"component in the frame of {component.frame_run}: {len(component.tags)} tags")
+        lines.append(f"component in the frame of {component.frame_run}: {counted(len(component.tags), 'tag')}")
     for run in component.runs:
         n_tags = sum(run.name in tag.runs for tag in component.tags)
-        lines.append(f"{run.name}: {run.n_keyframes} keyframes, {run.distance_m:.1f} m, {n_tags} tags")
+        lines.append(
+            f"{run.name}: {counted(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {counted(n_tags, 'tag')}"
+        )
     if not several:
-        lines.append(f"{len(component.tags)} tags in one map, in the frame of {component.frame_run}'s start")
+        lines.append(f"{counted(len(component.tags), 'tag')} in one map, in the frame of {component.frame_run}'s start")
     return lines
 
 

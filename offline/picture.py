@@ -19,6 +19,7 @@ from matplotlib.transforms import Affine2D
 
 from calib.arrays import FloatArray
 from calib.files import written_whole
+from calib.words import counted
 from offline.label_places import place_labels
 from offline.result import Component, MapResult, RunResult, TagResult
 
@@ -63,7 +64,7 @@ def draw_map(result: MapResult) -> Figure:
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(result.components) > 1:
             axes.set_title(
-                f"component {index + 1}: {len(component.tags)} tags, from the start of {component.frame_run}"
+                f"component {index + 1}: {counted(len(component.tags), 'tag')}, from the start of {component.frame_run}"
             )
         _draw_component(axes, component, styles, factor)
         panels.append(axes)
@@ -98,7 +99,7 @@ def _title(result: MapResult) -> str:
     runs = {run.run for run in result.runs}
     n_tags = sum(len(component.tags) for component in result.components)
     driven_m = sum(run.distance_m for run in result.runs)
-    title = f"{n_tags} {_plural('tag', n_tags)}, {len(runs)} {_plural('run', len(runs))}, {driven_m:.0f} m driven"
+    title = f"{counted(n_tags, 'tag')}, {counted(len(runs), 'run')}, {driven_m:.0f} m driven"
     pairs = [pair for component in result.components for pair in component.start_to_start]
     if len(pairs) == 1:
         title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
@@ -107,10 +108,6 @@ def _title(result: MapResult) -> str:
     if len(result.components) > _MOST_PANELS:
         title += f", the {_MOST_PANELS} largest drawn"
     return title
-
-
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
 
 
 def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
@@ -187,7 +184,7 @@ def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fa
         names = {part.name for part in parts}
         n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
         stretches = f", {len(parts)} stretches" if len(parts) > 1 else ""
-        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {n_tags} {_plural('tag', n_tags)}{stretches}"
+        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {counted(n_tags, 'tag')}{stretches}"
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
     handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
     shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"

@@ -3,6 +3,7 @@
 from collections import Counter
 from math import cos, radians, sin
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,6 +110,37 @@ def test_ticks_become_metres_from_zero_on(tmp_path: Path) -> None:
     np.testing.assert_allclose(distances, np.array([(0, 0), (0.5, 0.5), (0.4, 1.0)]) * turn_m, rtol=1e-12)
     robot = parse_robot_yaml(run_of(log).robot_yaml, "log")
     assert (robot.wheels.radius_left_m, robot.wheels.ticks_per_turn, robot.wheels.track_m) == (0.1, 1000, 0.5)
+
+
+@pytest.mark.parametrize(
+    "odometry",
+    ["t_s,left_m_s,right_m_s\n0,0,0\n1,1,1\n", "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0\n"],
+    ids=["wheel speeds", "twists"],
+)
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"wheel_radius_m": 0.1}, "--wheel-radius-m"),
+        ({"ticks_per_turn": 100.0}, "--ticks-per-turn"),
+        ({"wheel_radius_m": 0.1, "ticks_per_turn": 100.0}, "--wheel-radius-m and --ticks-per-turn"),
+    ],
+)
+def test_options_about_ticks_are_refused_where_there_are_none(
+    tmp_path: Path, odometry: str, options: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(GroundsbotError, match=rf"odometry\.csv: holds no ticks, so {named} would not be used"):
+        imported(tmp_path, odometry, options=ImportOptions(track_width_m=0.5, **options))
+    assert not (tmp_path / "logs").exists()
+
+
+def test_options_about_ticks_are_refused_for_the_papers_form(tmp_path: Path) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    (folder / "odom.csv").write_text("0.1,0.1\n")
+    (folder / "landmarks.csv").write_text("")
+    options = ImportOptions(track_width_m=0.5, state_rate_hz=4.2, ticks_per_turn=100.0)
+    with pytest.raises(GroundsbotError, match=r"odom\.csv: holds no ticks, so --ticks-per-turn would not be used"):
+        import_folder(folder, tmp_path / "logs", options)
 
 
 def test_wheels_and_mount_come_from_robot_yaml_and_options_win(tmp_path: Path) -> None:
@@ -219,7 +251,7 @@ def test_names_can_be_given(tmp_path: Path) -> None:
 
 def test_observations_outside_the_odometrys_time_are_said(tmp_path: Path) -> None:
     report = imported(tmp_path, observations="t_s,tag_id,x_m,y_m\n1,1,2,0\n2.5,1,2,0\n")
-    assert any(line.strip().startswith("1 observations lie outside") for line in report.lines())
+    assert any(line.strip().startswith("1 observation outside the odometry's time") for line in report.lines())
 
 
 BAD_ODOMETRY = [
@@ -270,7 +302,7 @@ BAD_OBSERVATIONS = [
     ("t_s,tag_id,x_m,y_m\n1,1,0,0\n", "puts the tag inside the robot's own origin"),
     ("t_s,tag_id,range_m,bearing_rad\n1,1,-2,0\n", "column range_m: '-2' must be above 0"),
     ("t_s,tag_id,range_m,bearing_rad\n1,1,2,30\n", "column bearing_rad: '30' is more than a whole turn"),
-    ("t_s,tag_id,x_m,y_m\n1000,1,1,1\n", "all 1 observations lie outside the odometry's time"),
+    ("t_s,tag_id,x_m,y_m\n1000,1,1,1\n", "none of 1 observation lies within the odometry's time"),
 ]
 
 

@@ -54,6 +54,7 @@ def test_a_drive_is_described(drive: Path) -> None:
     info = describe_log(drive)
     assert (info.run_id, info.robot_id, info.software_version) == ("monday", "carl", "9")
     assert info.duration_s == pytest.approx(2.3)
+    assert info.start_utc == "2027-01-15 08:00:00 UTC"  # date --utc --date @1800000000
     metres_per_tick = 2 * np.pi * 0.1 / 1000
     assert info.distance_m == pytest.approx((100 + 40 + 50) * metres_per_tick)  # what the restart hides is not counted
     assert info.n_wheel_restarts == 1
@@ -81,10 +82,15 @@ def test_json_and_text_tell_the_same(drive: Path) -> None:
     assert data["run_id"] == "monday"
     assert data["tags"]["tag36h11"] == {"3": 2, "7": 2}
     text = "\n".join(info.lines())
-    for wanted in ("robot carl, run monday", "2.3 s", "2 of tag36h11 in 4 readings: 3 7", "gap in /wheels: 0.70 s"):
+    for wanted in (
+        "robot carl, run monday",
+        "2027-01-15 08:00:00 UTC, 2.3 s",
+        "2 of tag36h11 in 4 readings: 3 7",
+        "gap in /wheels: 0.70 s",
+    ):
         assert wanted in text
-    assert "1 pictures lost" in text
-    assert "restarted 1 times" in text
+    assert "1 picture lost" in text
+    assert "restarted 1 time\n" in f"{text}\n"
 
 
 def test_a_slow_log_has_no_gaps_at_its_own_pace(tmp_path: Path) -> None:
@@ -94,6 +100,8 @@ def test_a_slow_log_has_no_gaps_at_its_own_pace(tmp_path: Path) -> None:
             writer.write("/odometry", PlanarOdometry(stamp_ns=k, wheels=distances), k * 1000 * MS, k * 1000 * MS)
     info = describe_log(tmp_path / "slow")
     assert info.gaps == ()
+    assert info.start_utc is None  # it began at zero
+    assert info.lines()[2].startswith("  5.0 s, 5.00 m driven")
     assert info.distance_m == pytest.approx(5)
     assert info.n_pictures is None
 
