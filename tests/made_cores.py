@@ -1,0 +1,59 @@
+"""Recorder cores for tests: no device, no clock; what came of them read back from their logs."""
+
+from pathlib import Path
+
+from calib.camera_model import CameraModel
+from calib.robot import parse_robot_yaml
+from onboard.encoder_protocol import WheelLine, format_line
+from onboard.log_reader import read_log
+from onboard.messages import Event, TagDetections, WheelEncoders
+from onboard.recorder import RecorderCore, Run
+
+ROBOT_YAML = """
+robot_id: gb1
+wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}
+camera: camera.yaml
+recorder: {picture_rate_hz: 5}
+"""
+CAMERA = CameraModel("front", 160, 120, 150.0, 150.0, 79.5, 59.5, "plumb_bob", (0.0,) * 5)
+START_NS = 1_800_000_000_000_000_000
+UPTIME_NS = 3_600_000_000_000
+PERIOD_NS = 10_000_000
+DELAY_NS = 1_000_000
+MS = 1_000_000
+S = 1_000_000_000
+
+
+def made_core(folder: Path, camera: CameraModel | None = CAMERA) -> RecorderCore:
+    """A core whose run folder is `folder/run1`."""
+    run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, camera, "run1", START_NS, START_NS - UPTIME_NS)
+    return RecorderCore(folder, run, durable=False)
+
+
+def line_of(index: int, boot_id: int = 7) -> WheelLine:
+    """Line `index` of a steady drive at 100 Hz."""
+    return WheelLine(boot_id, index, index * 10_000, 13 * index, -14 * index, 0)
+
+
+def send(core: RecorderCore, index: int, data: bytes | None = None, boot_id: int = 7) -> int:
+    """Gives the core line `index` (or other bytes in its place) at its time, and a tick; returns that time."""
+    now_ns = START_NS + index * PERIOD_NS + DELAY_NS
+    core.on_serial_bytes(format_line(line_of(index, boot_id)) if data is None else data, now_ns)
+    core.tick(now_ns)
+    return now_ns
+
+
+def events_of(log: Path, kind: str | None = None) -> list[Event]:
+    """The events in a log, all or those of one kind."""
+    events = [each.message for each in read_log(log, ["/events"]) if isinstance(each.message, Event)]
+    return [each for each in events if kind in (None, each.kind)]
+
+
+def wheels_of(log: Path) -> list[WheelEncoders]:
+    """The wheel readings in a log."""
+    return [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
+
+
+def frames_of(log: Path) -> list[TagDetections]:
+    """The detections in a log."""
+    return [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
