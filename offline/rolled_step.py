@@ -53,8 +53,10 @@ def _roll_on(here: FloatArray, there: FloatArray, step: FloatArray, poses: Float
     own_x = step[3] - (cos * carried_x + sin * carried_y)
     own_y = step[4] - (cos * carried_y - sin * carried_x)
     own_turn = step[5] - step[2]
-    # exp of a small twist: to the middle of its turn.
-    c, s = np.cos(0.5 * own_turn), np.sin(0.5 * own_turn)
+    # exp: a chord, in the middle of its turn.
+    half = 0.5 * own_turn
+    chord = np.sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
+    c, s = chord * np.cos(half), chord * np.sin(half)
     own_x, own_y = c * own_x - s * own_y, s * own_x + c * own_y
     x, y = x + cos * own_x - sin * own_y, y + sin * own_x + cos * own_y
     theta = poses[pose, 2]

@@ -18,6 +18,7 @@ from offline.arrowhead_kernels import Rows, System
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
 from offline.robust import SQUARES, Loss, huber, losses_and_weights
+from offline.step_taken import Before, take_step
 from offline.tied_down import Untied, untied_parts
 
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
@@ -36,8 +37,6 @@ _FIRST_DAMPING: Final = 1e-9
 _LEAST_FLOOR: Final = 1e-16
 _MOST_FLOOR: Final = 1e-3
 _SURE: Final = 10.0
-# A step that brings less than this share of what the linear model says is also tried in the other way.
-_GOOD_GAIN: Final = 0.75
 _LEAST_DAMPING: Final = 1e-10  # below it a step is Gauss-Newton's
 
 
@@ -220,13 +219,12 @@ def solve(
         expected = _expected_decrease(system, step, max(damping, floor))
         if expected <= cost_tolerance + relative_tolerance * cost:
             return ended("converged", converged=True)
-        candidate, candidate_cost, rolled, n_tried = _taken(
-            problem, losses, state, step, cost - _GOOD_GAIN * expected, spare, rolled=rolled
-        )
-        n_linearised += n_tried
-        if candidate_cost < cost:
-            gain = (cost - candidate_cost) / expected
-            state, cost, rejected, growth = candidate, candidate_cost, 0, 2.0
+        taken = take_step(problem.arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
+        n_linearised += taken.n_linearised
+        if taken.cost < cost:
+            expected *= taken.share * (2.0 - taken.share)
+            gain = (cost - taken.cost) / expected
+            state, cost, rolled, rejected, growth = taken.state, taken.cost, taken.rolled, 0, 2.0
             system, spare = spare, system
             costs.append(cost)
             # Where the model is off by a share, the next gradient is that share of this one, what another step could
@@ -243,39 +241,6 @@ def solve(
         damping = max(damping * growth, _FIRST_DAMPING)
         growth *= 2.0
     return ended(f"stopped after {_MAX_ITERATIONS} steps", converged=False)
-
-
-def _taken(
-    problem: Problem, losses: Losses, state: State, step: FloatArray, good_cost: float, out: System, *, rolled: bool
-) -> tuple[State, float, bool, int]:
-    """A step taken pose by pose, or rolled: motion by motion. The other way too where the first is not good.
-
-    Args:
-        problem: the factors.
-        losses: of each kind.
-        state: before the step.
-        step: in the arrowhead's order.
-        good_cost: below it there is no need to try the other way.
-        out: takes the blocks of the state that is returned.
-        rolled: which way to try first: the one that won last time.
-
-    Returns:
-        The better state, its cost, whether it is the rolled one, and how often the factors were linearised.
-    """
-    arrowhead = problem.arrowhead
-
-    def tried(*, rolled: bool) -> tuple[State, float]:
-        moved = arrowhead.moved(state, step, problem.anchor)
-        moved = arrowhead.rolled(state, step, problem.anchor, moved) if rolled else moved
-        return moved, arrowhead.linearise(moved, *losses, out=out)[1]
-
-    first = tried(rolled=rolled)
-    if first[1] < good_cost:
-        return *first, rolled, 1
-    other = tried(rolled=not rolled)
-    if other[1] < first[1]:
-        return *other, not rolled, 2
-    return *tried(rolled=rolled), rolled, 3
 
 
 def _factorised(

@@ -1,0 +1,202 @@
+"""Long drives past few tags: a town of long roads, driven at random, whose dead reckoning ends somewhere else.
+
+No logs and no pictures: a chain as `map` makes it from a run, with the truth beside it.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray, IntArray
+from calib.noise import NoiseParameters
+from calib.robot import Robot
+from offline.chain import Chain, chains_of
+from offline.factors import State
+from offline.graph import Graph
+from offline.odometry import WheelTrack
+from offline.run import Positions, TagKey
+from tests.made_drives import FAMILY, START_NS, S, made_robot, made_run
+
+ROAD_M: Final = 25.0
+N_CROSSINGS: Final = 5  # along each side of the town
+TURN_ROUND_SHARE: Final = 0.1  # of the crossings: back the way it came
+TAG_SPACING_M: Final = (10.0, 30.0)
+TAG_OFFSET_M: Final = 1.5  # from the middle of the road
+REACH_M: Final = (0.5, 5.0)
+HALF_VIEW_RAD: Final = np.radians(40.0)
+READ_SHARE: Final = 0.7  # of the pictures with a tag in view
+STEP_M: Final = 0.05  # between wheel readings
+STEP_RAD: Final = np.radians(5.0)
+STEP_NS: Final = S // 20
+SIGMA_READING: Final = np.array([0.05, np.radians(1.0)])
+# A heading that wanders by a right angle over a kilometre: soft tyres, carpets.
+NOISE: Final = NoiseParameters(sigma_heading_rad_per_sqrt_m=np.radians(2.0))
+# How much larger or smaller the noise truly is than the estimate is told, each kind on its own.
+NOISE_FACTORS: Final = (0.7, 1.4)
+_WAYS: Final = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+
+
+@dataclass(frozen=True)
+class LongDrive:
+    """A chain, and what its measurements are of, in the frame of its start."""
+
+    chain: Chain
+    T_start_base: FloatArray  # (K, 3)
+    tags_m: dict[TagKey, FloatArray]
+    calibration: dict[str, float]
+
+    def true_state(self, graph: Graph) -> State:
+        """As variables of the chain's own graph."""
+        return State(
+            self.T_start_base,
+            np.array([self.tags_m[tag] for tag in graph.tags]).reshape(-1, 2),
+            np.array([self.calibration.get(parameter.name, 0.0) for parameter in graph.parameters]),
+        )
+
+
+def made_long_drive(
+    seed: int, length_m: float = 1000.0, picture_every: int = 5, radius_sigma: float | None = None
+) -> LongDrive:
+    """A robot that drives at random from crossing to crossing, past tags that hang 10 to 30 m apart.
+
+    Calibration is off by draws from what its robot.yaml allows, and motions and readings by the noise that the estimate
+    is told of, times a factor that it is not told of.
+
+    Args:
+        seed: of everything.
+        length_m: driven, to the next crossing.
+        picture_every: so many steps of 5 cm or 5 degrees.
+        radius_sigma: the relative one of each wheel; robot.yaml's default where None.
+    """
+    rng = np.random.default_rng(seed)
+    robot = _robot(radius_sigma)
+    town = _driven(rng, length_m)
+    poses = se2.compose(se2.inverse(town[0]), town)
+    stamps_ns = START_NS + STEP_NS * np.arange(len(poses), dtype=np.int64)
+    tags_m = se2.apply(se2.inverse(town[0]), _placed_tags(rng))
+    calibration = _drawn_calibration(rng, robot)
+    odometry_factor, reading_factor = NOISE_FACTORS[0] * (NOISE_FACTORS[1] / NOISE_FACTORS[0]) ** rng.random(2)
+    pictures = np.arange(0, len(poses), picture_every)
+    picture, tag, value = _readings(rng, poses[pictures], tags_m, robot, calibration, reading_factor)
+    seen, tag = np.unique(tag, return_inverse=True)
+    keys = tuple(TagKey(FAMILY, int(i)) for i in seen)
+    n = len(picture)
+    positions = Positions(
+        stamps_ns[pictures[picture]], tag, value, np.ones(n, dtype=np.bool_),
+        np.tile(np.diag(SIGMA_READING**2), (n, 1, 1)), np.ones(n, dtype=np.bool_),
+    )  # fmt: skip
+    track = _wheel_track(stamps_ns, poses, robot, calibration)
+    run = made_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
+    (chain,) = chains_of(run, NOISE)
+    return LongDrive(
+        _with_noise(rng, chain, odometry_factor),
+        poses[np.searchsorted(stamps_ns, chain.stamps_ns)],
+        dict(zip(keys, tags_m[seen], strict=True)),
+        calibration,
+    )
+
+
+def _robot(radius_sigma: float | None) -> Robot:
+    robot = made_robot()
+    if radius_sigma is None:
+        return robot
+    wheels_section = robot.wheels.model_copy(
+        update={
+            "radius_left_m_sigma": radius_sigma * robot.wheels.radius_left_m,
+            "radius_right_m_sigma": radius_sigma * robot.wheels.radius_right_m,
+        }
+    )
+    return robot.model_copy(update={"wheels": wheels_section})
+
+
+def _driven(rng: np.random.Generator, length_m: float) -> FloatArray:
+    """(N, 3) true poses at the wheel readings: along roads, turning on the spot."""
+    place, way = rng.integers(0, N_CROSSINGS, 2), int(rng.integers(0, 4))
+    turns, steps = round(0.5 * np.pi / STEP_RAD), round(ROAD_M / STEP_M)
+    poses: list[FloatArray] = [np.r_[ROAD_M * place, 0.5 * np.pi * way][None]]
+    for _ in range(round(length_m / ROAD_M)):
+        free = [turn for turn in (0, 1, -1, 2) if _is_crossing(place + _WAYS[(way + turn) % 4])]
+        onward = [turn for turn in free if turn != 2]
+        turn = 2 if 2 in free and (not onward or rng.random() < TURN_ROUND_SHARE) else int(rng.choice(onward))
+        heading = 0.5 * np.pi * way + np.sign(turn) * STEP_RAD * np.arange(1, abs(turn) * turns + 1)
+        poses.append(np.column_stack([np.tile(ROAD_M * place, (len(heading), 1)), heading]))
+        way = (way + turn) % 4
+        along = STEP_M * np.arange(1, steps + 1)[:, None] * _WAYS[way]
+        poses.append(np.column_stack([ROAD_M * place + along, np.full(steps, 0.5 * np.pi * way)]))
+        place = place + _WAYS[way]
+    driven = np.concatenate(poses)
+    driven[:, 2] = se2.wrap_angle(driven[:, 2])
+    return driven
+
+
+def _is_crossing(place: IntArray) -> bool:
+    return bool(((place >= 0) & (place < N_CROSSINGS)).all())
+
+
+def _placed_tags(rng: np.random.Generator) -> FloatArray:
+    """(T, 2) beside the roads, now left, now right."""
+    tags = []
+    for across in range(N_CROSSINGS):
+        for along_x in (True, False):
+            along_m = rng.uniform(0.0, TAG_SPACING_M[1])
+            while along_m < ROAD_M * (N_CROSSINGS - 1):
+                place = np.array([along_m, ROAD_M * across + TAG_OFFSET_M * rng.choice([-1.0, 1.0])])
+                tags.append(place if along_x else place[::-1])
+                along_m += rng.uniform(*TAG_SPACING_M)
+    return np.array(tags)
+
+
+def _drawn_calibration(rng: np.random.Generator, robot: Robot) -> dict[str, float]:
+    """By name of the parameter: two wheels, the track, the mount and the tags, each a draw from its prior."""
+    made = robot.wheels
+    left = made.radius_left_m_sigma / made.radius_left_m * rng.standard_normal()
+    right = made.radius_right_m_sigma / made.radius_right_m * rng.standard_normal()
+    mount, batch = robot.mount, robot.tags[0]
+    return {
+        "wheel_scale": 0.5 * (left + right),
+        "wheel_ratio": right - left,
+        "track_scale": made.track_m_sigma / made.track_m * rng.standard_normal(),
+        "mount_x_m": mount.x_m_sigma * rng.standard_normal(),
+        "mount_y_m": mount.y_m_sigma * rng.standard_normal(),
+        "mount_yaw_rad": mount.yaw_rad_sigma * rng.standard_normal(),
+        "tag_scale": batch.relative_sigma * rng.standard_normal(),
+    }
+
+
+def _wheel_track(stamps_ns: IntArray, poses: FloatArray, robot: Robot, calibration: dict[str, float]) -> WheelTrack:
+    """What the wheels count by their nominal radii."""
+    moved = se2.log(se2.between(poses[:-1], poses[1:]))
+    half_turn_m = 0.5 * robot.wheels.track_m * (1.0 + calibration["track_scale"]) * moved[:, 2]
+    scale, half_ratio = 1.0 + calibration["wheel_scale"], 0.5 * calibration["wheel_ratio"]
+    left_m = np.cumsum(moved[:, 0] - half_turn_m) / (scale * (1.0 - half_ratio))
+    right_m = np.cumsum(moved[:, 0] + half_turn_m) / (scale * (1.0 + half_ratio))
+    return WheelTrack(stamps_ns, np.r_[0.0, left_m], np.r_[0.0, right_m])
+
+
+def _readings(
+    rng: np.random.Generator,
+    poses: FloatArray,
+    tags_m: FloatArray,
+    robot: Robot,
+    calibration: dict[str, float],
+    factor: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pose, tag and (range, bearing) about the camera of each reading."""
+    off = np.array([calibration[name] for name in ("mount_x_m", "mount_y_m", "mount_yaw_rad")])
+    mount = np.array([robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad]) + off
+    place = se2.apply(se2.inverse(se2.compose(poses, mount))[:, None], tags_m[None])
+    place /= 1.0 + calibration["tag_scale"]
+    range_m, bearing_rad = np.hypot(place[..., 0], place[..., 1]), np.arctan2(place[..., 1], place[..., 0])
+    in_view = (range_m > REACH_M[0]) & (range_m < REACH_M[1]) & (np.abs(bearing_rad) < HALF_VIEW_RAD)
+    pose, tag = np.nonzero(in_view & (rng.random(in_view.shape) < READ_SHARE))
+    value = np.column_stack([range_m[pose, tag], bearing_rad[pose, tag]])
+    return pose, tag, value + factor * SIGMA_READING * rng.standard_normal(value.shape)
+
+
+def _with_noise(rng: np.random.Generator, chain: Chain, factor: float) -> Chain:
+    odometry = chain.odometry
+    root = factor * np.linalg.cholesky(odometry.covariance)
+    error = np.einsum("nij,nj->ni", root, rng.standard_normal((len(root), 3)))
+    return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error))))
