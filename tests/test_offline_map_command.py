@@ -135,14 +135,24 @@ def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tm
         assert str(text_file) in text
         assert reason in text
         assert str(text_file) in refused(logs["a"], text_file)
+
+
+@pytest.mark.parametrize("damage", ["cut short", "one bit"])
+def test_a_damaged_log_is_mapped_as_far_as_it_goes(
+    map_to: Run, logs: dict[str, Path], tmp_path: Path, damage: str
+) -> None:
     whole = (logs["a"] / "0000.core.mcap").read_bytes()
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole[: len(whole) // 2])
-    assert str(cut) in refused(cut)
-    flipped = bytearray(whole)
-    flipped[whole.index(ZSTD_MAGIC) + 300] ^= 0x10
-    cut.write_bytes(flipped)
-    assert str(cut) in refused(cut)
+    damaged = tmp_path / "damaged.mcap"
+    if damage == "cut short":
+        damaged.write_bytes(whole[: len(whole) // 2])
+    else:
+        flipped = bytearray(whole)
+        flipped[whole.index(ZSTD_MAGIC, len(whole) // 2) + 100] ^= 0x10
+        damaged.write_bytes(flipped)
+    outcome = map_to(damaged)
+    assert "damaged.mcap" in outcome.out[outcome.out.index("warning: ") :]
+    (run,) = read_map(tmp_path / "out").runs
+    assert run.log == damaged
 
 
 def test_a_camera_file_of_another_size(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
