@@ -1,0 +1,267 @@
+"""Variances of the measurements, from what the estimate leaves over of them: restricted maximum likelihood.
+
+The covariance of each factor is a sum of known matrices, each times a variance that many factors share. With P the
+information that the residuals keep once the estimate has taken its share (P = S^-1 - S^-1 J H^-1 J^T S^-1), the
+likelihood of the residuals has the score (r' S^-1 A S^-1 r - tr(P A)) / 2 and the average information f' P f / 2 with
+f = A S^-1 r. Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal" (1971);
+Gilmour, Thompson and Cullis, "Average information REML" (1995). The trace is an average over random signs
+(Hutchinson, 1989) of its smaller part, that of the share taken.
+
+Sigmas are searched by their logarithm, each with a wide prior about where it began: what the data cannot tell stays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from calib.arrays import BoolArray, FloatArray
+from offline.factors import State, stacked, whitening
+from offline.solver import Problem, solve
+
+# Of a logarithm of sigma: a factor of ten either way is one such sigma.
+PRIOR_SIGMA: Final = float(np.log(10.0))
+# A residual beyond this is no noise but a fault, and says nothing of the noise; of good ones 0.1 % lie there.
+_FAULT: Final = 1e-3
+_MAX_FAULTS: Final = 0.1
+_N_SIGNS: Final = 8
+_SEED: Final = 11
+_MAX_ITERATIONS: Final = 12
+# As many squares as that leave a sigma uncertain by a third.
+_LEAST_REDUNDANCY: Final = 5.0
+_CONTRADICTED: Final = 3.0  # sigmas of the score
+_LONGEST_STEP: Final = 1.2  # of a logarithm of sigma
+_SMALL_STEP: Final = 0.05  # of its own standard deviation
+_COST_TOLERANCE: Final = 1e-2  # of the solves in between
+
+
+@dataclass(frozen=True)
+class Components:
+    """How the covariances of one problem's factors follow from K variances.
+
+    Attributes:
+        odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
+        odometry_rest: (M, 3, 3) what is added whatever the variances.
+        readings: (K, N, 2, 2) and readings_rest: (N, 2, 2) likewise.
+    """
+
+    odometry: FloatArray
+    odometry_rest: FloatArray
+    readings: FloatArray
+    readings_rest: FloatArray
+
+    def weighed(self, problem: Problem, variances: FloatArray) -> Problem:
+        """The problem under variances (K,)."""
+        odometry = np.tensordot(variances, self.odometry, 1) + self.odometry_rest
+        readings = np.tensordot(variances, self.readings, 1) + self.readings_rest
+        return replace(
+            problem,
+            odometry=replace(problem.odometry, whitening=whitening(odometry)),
+            readings=replace(problem.readings, whitening=whitening(readings)),
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A problem, where its solve begins, and what its covariances are made of."""
+
+    problem: Problem
+    start: State
+    components: Components
+
+
+@dataclass(frozen=True)
+class FittedVariances:
+    """What the residuals say of K sigmas.
+
+    Attributes:
+        sigma: (K,)
+        log_covariance: (K, K) of the logarithms, the prior included.
+        redundancy: (K,) of how many squares of its own each sigma is the mean: one over twice the variance of its
+            logarithm, the prior's share taken off.
+        told: (K,) whether the data say enough of it; else it stands where it began, unless they speak against that.
+        states: of the parts, solved under these sigmas.
+    """
+
+    sigma: FloatArray
+    log_covariance: FloatArray
+    redundancy: FloatArray
+    told: BoolArray
+    states: tuple[State, ...]
+    converged: bool
+
+    def interval(self, quantile: float) -> tuple[FloatArray, FloatArray]:
+        """Bounds (K,) between which each sigma lies, `quantile` normal deviations of its logarithm either way."""
+        spread = np.exp(quantile * np.sqrt(np.diag(self.log_covariance)))
+        return self.sigma / spread, self.sigma * spread
+
+
+def fit_variances(parts: Sequence[Part], sigma: FloatArray) -> FittedVariances:
+    """Fits K sigmas to all parts at once, from `sigma` (K,), which is also the middle of the prior.
+
+    Sigmas of which the data say next to nothing are put back to where they began, unless the data speak against it.
+
+    Raises:
+        UnderDeterminedError: a part has something that nothing ties down.
+    """
+    search = _Search(parts, np.log(sigma))
+    converged = search.run(np.ones(len(sigma), dtype=np.bool_))
+    fitted = search.log_sigma.copy()
+    told = search.redundancy() >= _LEAST_REDUNDANCY
+    if not told.all():
+        search.log_sigma = np.where(told, fitted, search.middle)
+        search.look()
+        contradicted = -search.score > _CONTRADICTED * np.sqrt(2.0 * np.maximum(search.expected, 1e-300))
+        search.log_sigma = np.where(told | contradicted, fitted, search.middle)
+        converged &= search.run(told)
+    return FittedVariances(
+        np.exp(search.log_sigma), search.covariance(), search.redundancy(), told, tuple(search.states), converged
+    )
+
+
+class _Search:
+    """Newton's method on the logarithms of sigma.
+
+    Attributes:
+        score: (K,) and information: (K, K) of the likelihood where `look` looked last.
+        expected: (K,) squares that each sigma should leave over there. Where sigmas are far off, residuals that are far
+            too small make the information far too small; this does not depend on them.
+    """
+
+    def __init__(self, parts: Sequence[Part], log_sigma: FloatArray) -> None:
+        self._parts = parts
+        self.middle = log_sigma
+        self.log_sigma = log_sigma.copy()
+        self.states = [part.start for part in parts]
+        self.score = np.zeros(len(log_sigma))
+        self.expected = np.zeros(len(log_sigma))
+        self.information = np.zeros((len(log_sigma), len(log_sigma)))
+
+    def look(self) -> None:
+        """Solves all parts under the sigmas as they are."""
+        seen = [
+            _look(part, state, np.exp(2.0 * self.log_sigma))
+            for part, state in zip(self._parts, self.states, strict=True)
+        ]
+        self.states = [each.state for each in seen]
+        self.score = np.sum([each.squares - each.expected for each in seen], axis=0)
+        self.expected = np.sum([each.expected for each in seen], axis=0)
+        self.information = np.sum([each.information for each in seen], axis=0)
+
+    def covariance(self) -> FloatArray:
+        """(K, K) of the logarithms, prior included."""
+        prior = np.eye(len(self.middle)) / PRIOR_SIGMA**2
+        inverse: FloatArray = np.asarray(np.linalg.inv(self.information + prior), dtype=np.float64)
+        return inverse
+
+    def redundancy(self) -> FloatArray:
+        """(K,) see `FittedVariances`."""
+        return 0.5 * np.maximum(1.0 / np.diag(self.covariance()) - 1.0 / PRIOR_SIGMA**2, 0.0)
+
+    def run(self, free: BoolArray) -> bool:
+        """Moves the sigmas that are free (K,) until they stand; False where they did not come to stand."""
+        longest, before = np.full(len(free), _LONGEST_STEP), np.zeros(len(free))
+        for _ in range(_MAX_ITERATIONS):
+            self.look()
+            total = self.information + np.eye(len(free)) / PRIOR_SIGMA**2
+            pull = self.score - (self.log_sigma - self.middle) / PRIOR_SIGMA**2
+            step = np.zeros(len(free))
+            step[free] = np.linalg.solve(total[np.ix_(free, free)], pull[free])
+            told = self.expected >= _LEAST_REDUNDANCY
+            if (np.abs(step) < _SMALL_STEP * np.sqrt(np.diag(self.covariance())))[free & told].all():
+                return True
+            # Where a sigma is next to nothing its curvature says nothing of what lies beyond: steps that turn back
+            # shrink.
+            longest = np.where(step * before < 0.0, 0.5 * longest, longest)
+            before = np.clip(step, -longest, longest)
+            self.log_sigma = self.log_sigma + before
+        return False
+
+
+class _Seen(NamedTuple):
+    """What one part says at given variances, by the logarithms of sigma.
+
+    Attributes:
+        squares: (K,) weighted squares of residuals that each sigma answers for; expected: (K,) what they should be.
+        information: (K, K) average information.
+    """
+
+    state: State
+    squares: FloatArray
+    expected: FloatArray
+    information: FloatArray
+
+
+def _look(part: Part, start: State, variances: FloatArray) -> _Seen:
+    """Solves one part under variances (K,)."""
+    problem = part.components.weighed(part.problem, variances)
+    solution = solve(problem, start, cost_tolerance=_COST_TOLERANCE)
+    odometry = problem.odometry.linearise(solution.state, problem.columns)
+    readings = problem.readings.linearise(solution.state, problem.columns)
+    jacobian, residual = stacked((odometry, readings), problem.columns.n)
+    shares = (
+        _whitened(problem.odometry.whitening, part.components.odometry, variances, odometry.residual),
+        _whitened(problem.readings.whitening, part.components.readings, variances, readings.residual),
+    )
+
+    def taken(vectors: FloatArray) -> FloatArray:
+        """What the estimate explains of whitened residuals (rows, n): J H^-1 J' vectors."""
+        inner = jacobian.T @ vectors
+        solved = np.stack([solution.factorisation.solve(column) for column in inner.T], axis=-1)
+        product: FloatArray = jacobian @ solved
+        return product
+
+    signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (len(residual), _N_SIGNS))
+    left = _own_blocks_left(signs, taken(signs), odometry.residual.size)
+    expected = np.sum([np.einsum("kmij,mij->k", share, own) for share, own in zip(shares, left, strict=True)], axis=0)
+    force = np.concatenate(
+        [
+            (share @ kind.residual[..., None]).reshape(len(variances), -1)
+            for share, kind in zip(shares, (odometry, readings), strict=True)
+        ],
+        axis=1,
+    )
+    return _Seen(solution.state, force @ residual, expected, _positive(2.0 * force @ (force.T - taken(force.T))))
+
+
+def _own_blocks_left(signs: FloatArray, explained: FloatArray, n_odometry: int) -> tuple[FloatArray, FloatArray]:
+    """Estimates (M, 3, 3) and (N, 2, 2) of what the estimate leaves of each factor's whitened covariance.
+
+    Args:
+        signs: (rows, n) random.
+        explained: (rows, n) what the estimate explains of them.
+        n_odometry: how many of the rows belong to motions.
+    """
+    blocks = []
+    for rows, size in ((slice(0, n_odometry), 3), (slice(n_odometry, None), 2)):
+        before, after = (each[rows].reshape(-1, size, _N_SIGNS) for each in (signs, explained))
+        blocks.append(np.eye(size) - np.einsum("mid,mjd->mij", before, after) / _N_SIGNS)
+    return blocks[0], blocks[1]
+
+
+def _positive(matrix: FloatArray) -> FloatArray:
+    """The nearest symmetric matrix without negative eigenvalues; faults left out of a few terms can cause them."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    nearest: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return nearest
+
+
+def _whitened(whitening: FloatArray, unit: FloatArray, variances: FloatArray, residual: FloatArray) -> FloatArray:
+    """Shares (K, M, n, n) from unit covariances (K, M, n, n); zero for factors whose residual is a fault."""
+    good = _no_fault(residual)
+    matrices: FloatArray = np.where(good[:, None, None], whitening, 0.0)
+    shares: FloatArray = variances[:, None, None, None] * (matrices @ unit @ matrices.swapaxes(-1, -2))
+    return shares
+
+
+def _no_fault(residual: FloatArray) -> BoolArray:
+    """(M,) which whitened residuals (M, n) may be noise; all, where the sigmas are so far off that many look bad."""
+    if not len(residual):
+        return np.zeros(0, dtype=np.bool_)
+    n = residual.shape[1]
+    square = (residual**2).sum(axis=1)
+    level = max(1.0, float(np.median(square)) / float(chdtri(n, 0.5)))
+    good: BoolArray = square <= level * chdtri(n, _FAULT)
+    return good if good.mean() > 1.0 - _MAX_FAULTS else np.ones(len(good), dtype=np.bool_)
