@@ -7,14 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel, read_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from calib.words import counted
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
-from offline.plausible import check_file_name, check_numbers, check_speed
+from offline.plausible import check_file_name
+from offline.stretches import WheelRow, stretches_of
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
@@ -101,7 +102,7 @@ class _Collected:
 
     info: RunInfo | None = None
     calibration: CameraCalibration | None = None
-    wheels: list[tuple[int, int, int, int]] = field(default_factory=list)  # stamp, boot, left, right
+    wheels: list[WheelRow] = field(default_factory=list)
     odometry: list[PlanarOdometry] = field(default_factory=list)
     pictures: list[int] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
@@ -183,14 +184,13 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     check_file_name(info.run_id, f"{log}: /run: run_id")
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
-    stretches, warnings = _stretches(collected, robot, log)
+    stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log)
     warnings += losses.lines()
     tags, detections, positions = _tag_readings(collected)
     camera = _camera(collected, given.camera if given else None, log)
     if collected.n_other_size:
-        warnings.append(
-            f"{collected.n_other_size} pictures have another size than the first ({collected.picture_size}); left out"
-        )
+        pictures = counted(collected.n_other_size, "picture")
+        warnings.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
     name = f"{info.robot_id}_{info.run_id}"
     return Run(
         name=name,
@@ -206,86 +206,6 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
         positions=positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
     )
-
-
-def _stretches(collected: _Collected, robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
-    if collected.wheels:
-        return _encoder_stretches(collected.wheels, robot, log)
-    if collected.odometry:
-        return _imported_stretch(collected.odometry, robot, log)
-    raise OfflineError(
-        f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
-        "was the encoder port connected? `groundsbot-onboard check` tells"
-    )
-
-
-def _encoder_stretches(
-    readings: list[tuple[int, int, int, int]], robot: Robot, log: Path
-) -> tuple[list[WheelTrack], list[str]]:
-    """Cuts where the controller was reset: what was driven in between is unknown."""
-    table = np.array(readings, dtype=np.int64)
-    cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
-    m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
-    stretches: list[WheelTrack] = []
-    warnings: list[str] = []
-    for part in np.split(table, cuts):
-        ordered, dropped = _strictly_later(part)
-        if dropped:
-            warnings.append(f"{dropped} wheel readings are not later than the one before them; left out")
-        # As floats first: counts far enough apart would wrap round in whole numbers.
-        counted = np.asarray(ordered[:, 2:], dtype=np.float64)
-        check_speed(ordered[:, 0], counted * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
-        left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
-        quantum_m = max(m_per_tick_left, m_per_tick_right)
-        stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
-    if len(stretches) > 1:
-        warnings.append(
-            f"the wheel controller restarted {len(stretches) - 1} times; the motion in between is unknown, "
-            f"so the run has {len(stretches)} stretches that only tags can join"
-        )
-    return stretches, warnings
-
-
-def _imported_stretch(readings: list[PlanarOdometry], robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
-    warnings: list[str] = []
-    where = f"{log}: /odometry"
-    stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
-    left_m = np.array([reading.wheels.left_m for reading in readings])
-    right_m = np.array([reading.wheels.right_m for reading in readings])
-    check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)
-    if readings[0].WhichOneof("motion") == "pose":
-        poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
-        check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
-        left_m, right_m, sideways = wheel_distances(poses, robot.wheels.track_m)
-        if sideways > 0.05:
-            warnings.append(
-                f"{100.0 * sideways:.0f} % of the odometry's motion is sideways, which a differential drive cannot do; "
-                "it is not used"
-            )
-    table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
-    if dropped:
-        warnings.append(f"{dropped} odometry readings are not later than the one before them; left out")
-    keep = table[:, 1]
-    check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
-    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep])], warnings
-
-
-def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:
-    """Cumulative (left_m, right_m) whose arcs join odometry poses (N, 3), and the share of motion that is sideways."""
-    twists = se2.log(se2.between(poses[:-1], poses[1:]))
-    half_turn_m = 0.5 * track_m * twists[:, 2]
-    left_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] - half_turn_m)])
-    right_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] + half_turn_m)])
-    forward = float(np.abs(twists[:, 0]).sum())
-    sideways = float(np.abs(twists[:, 1]).sum())
-    return left_m, right_m, sideways / max(forward, 1e-9) if sideways > 1e-6 else 0.0
-
-
-def _strictly_later(table: IntArray) -> tuple[IntArray, int]:
-    """Rows whose stamp (first column) is later than all before, and how many are not."""
-    latest_before = np.maximum.accumulate(np.concatenate([[table[0, 0] - 1], table[:-1, 0]]))
-    keep = table[:, 0] > latest_before
-    return table[keep], int((~keep).sum())
 
 
 def _tag_readings(collected: _Collected) -> tuple[tuple[TagKey, ...], Detections, Positions]:

@@ -12,7 +12,8 @@ from calib import se2
 from calib.camera_model import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import write_robot_yaml
-from offline.run import RobotFile, load_run, read_robot_file, wheel_distances
+from offline.run import RobotFile, load_run, read_robot_file
+from offline.stretches import wheel_distances
 from onboard.log_head import log_head
 from onboard.log_writer import LogWriter
 from onboard.messages import (
@@ -114,7 +115,7 @@ def test_readings_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> No
     readings = [wheels(0.0, 0, 0), wheels(0.1, 5, 5), wheels(0.1, 6, 6), wheels(0.05, 4, 4), wheels(0.2, 9, 9)]
     run = load_run(write_log(tmp_path, readings))
     assert (run.stretches[0].stamps_ns - START_NS).tolist() == [0, S // 10, S // 5]
-    assert "2 wheel readings are not later" in run.warnings[0]
+    assert "2 wheel readings not later" in run.warnings[0]
 
 
 def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
@@ -139,7 +140,7 @@ def test_pictures_of_another_size_are_left_out_and_said(tmp_path: Path) -> None:
     seen = [picture(0.01, tag(1)), picture(0.02, tag(2), size=(640, 360)), picture(0.03, tag(3))]
     run = load_run(write_log(tmp_path, [*TWO_READINGS, *seen]))
     assert [key.tag_id for key in run.tags] == [1, 3]
-    assert "1 pictures have another size" in run.warnings[0]
+    assert "1 picture of another size" in run.warnings[0]
 
 
 def test_wheel_distances_and_observations_of_an_imported_log(tmp_path: Path) -> None:
