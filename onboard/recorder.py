@@ -243,7 +243,11 @@ class RecorderCore:
         self._check_size(size_px, receive_ns)
         self._note_source(source)
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
-        message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
+        try:
+            message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
+        except ValueError as error:  # protobuf's word for a number that does not fit its field
+            self._refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
+            return
         self._waiting.append(_Waiting(message, receive_ns))
         self._write_waiting(receive_ns)
 
@@ -397,12 +401,14 @@ class RecorderCore:
         try:
             taken = self._writer.write(topic, message, log_time_ns, stamp_ns)
         except MessageRefusedError as error:
-            self.losses["messages refused"] += 1
-            now_ns = self._writer.last_log_time_ns
-            self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, str(error), now_ns, 1)
+            self._refuse(str(error))
             return
         self.counts[topic] += taken
         self.newest_ns[topic] = receive_ns
+
+    def _refuse(self, reason: str) -> None:
+        self.losses["messages refused"] += 1
+        self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, reason, self._writer.last_log_time_ns, 1)
 
 
 def segment_limits(robot: Robot) -> SegmentLimits:
