@@ -4,7 +4,7 @@ No reading is thinned out: exact arcs from reading to reading, composed, with th
 keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the chain's first wheel reading.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,10 +12,19 @@ import numpy as np
 from calib import se2, wheels
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
+from offline.covariance_parts import CovarianceParts
 
 # The calibration numbers that odometry depends on, in the order of `ChainOdometry.jacobian`:
 # left = left_nominal (1 + wheel_scale) (1 - wheel_ratio / 2), right likewise with +, track = nominal (1 + track_scale).
 WHEEL_PARAMETERS: Final = ("wheel_scale", "wheel_ratio", "track_scale")
+
+# In the order of the unit covariances below.
+ODOMETRY_NOISE: Final = (
+    "sigma_distance_m_per_sqrt_m",
+    "sigma_lateral_m_per_sqrt_m",
+    "sigma_heading_rad_per_sqrt_m",
+    "sigma_heading_rad_per_sqrt_rad",
+)
 
 # Where readings are missing for longer, cumulative counts still give distance and turn, not the path between.
 GAP_NS: Final = 500_000_000
@@ -53,12 +62,14 @@ class ChainOdometry:
     Attributes:
         motion: (K-1, 3) T_k_k+1 by the nominal calibration.
         covariance: (K-1, 3, 3) of the motion's right tangent.
+        parts: what the covariance is made of.
         jacobian: (K-1, 3, 3) derivative of that tangent by WHEEL_PARAMETERS.
         distance_m: (K-1,) driven.
     """
 
     motion: FloatArray
     covariance: FloatArray
+    parts: CovarianceParts
     jacobian: FloatArray
     distance_m: FloatArray
 
@@ -69,7 +80,17 @@ class ChainOdometry:
     def prefix(self, n_steps: int) -> "ChainOdometry":
         """The first steps only."""
         part = slice(0, n_steps)
-        return ChainOdometry(self.motion[part], self.covariance[part], self.jacobian[part], self.distance_m[part])
+        return ChainOdometry(
+            self.motion[part],
+            self.covariance[part],
+            self.parts.where(part),
+            self.jacobian[part],
+            self.distance_m[part],
+        )
+
+    def weighed(self, noise: NoiseParameters) -> "ChainOdometry":
+        """The same motions under other noise."""
+        return replace(self, covariance=self.parts.under(noise))
 
     def dead_reckoned(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
         """(K, 3) poses that follow from the motions alone, from `start` (3,) on, with wheel parameters (3,)."""
@@ -91,7 +112,9 @@ def compose_odometry(
         noise: what is added per metre and per radian.
     """
     if len(keyframe_stamps_ns) < 2:
-        return ChainOdometry(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+        none = np.zeros((0, 3, 3))
+        parts = CovarianceParts(ODOMETRY_NOISE, np.zeros((len(ODOMETRY_NOISE), 0, 3, 3)), none)
+        return ChainOdometry(np.zeros((0, 3)), none, parts, none, np.zeros(0))
     inner = track.stamps_ns[(track.stamps_ns >= keyframe_stamps_ns[0]) & (track.stamps_ns <= keyframe_stamps_ns[-1])]
     grid_ns = np.union1d(inner, keyframe_stamps_ns)
     left_m, right_m = track.at(grid_ns)
@@ -105,13 +128,19 @@ def compose_odometry(
     to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
 
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
-    noise_of_piece = _piece_covariance(left_m, right_m, track_m, duration_s, step_of_piece, noise)
+    net_turn_rad = _net_turn(right_m - left_m, duration_s, step_of_piece) / track_m
+    unit, in_gap = _piece_covariances(0.5 * (left_m + right_m), net_turn_rad, duration_s)
+    parts = CovarianceParts(
+        ODOMETRY_NOISE,
+        np.stack([_summed(_carried(to_step_end, each), ends) for each in unit]),
+        _summed(_carried(to_step_end, in_gap), ends) + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+    )
     tangent = se2.right_tangent_from_coordinates(pieces)
     jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
-    covariance = to_step_end @ noise_of_piece @ to_step_end.swapaxes(-1, -2)
     return ChainOdometry(
         motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
-        covariance=_summed(covariance, ends) + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+        covariance=parts.under(noise),
+        parts=parts,
         jacobian=_summed(to_step_end @ jacobian, ends),
         distance_m=_summed(np.abs(0.5 * (left_m + right_m)), ends),
     )
@@ -126,35 +155,42 @@ def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
     return np.stack([x, y, se2.wrap_angle(theta)], axis=-1)
 
 
-def _piece_covariance(
-    left_m: FloatArray,
-    right_m: FloatArray,
-    track_m: float,
-    duration_s: FloatArray,
-    step_of_piece: IntArray,
-    noise: NoiseParameters,
-) -> FloatArray:
-    """(N, 3, 3) of the pieces' right tangents, for noise that comes in all along a piece."""
-    forward_m = 0.5 * (left_m + right_m)
-    distance_m = np.abs(forward_m)
-    turn_rad = (right_m - left_m) / track_m
-    # The turn of a whole step, spread over its pieces: quantised readings taken one by one would add up a turn that
-    # never was.
+def _carried(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
+    carried: FloatArray = to_step_end @ covariance @ to_step_end.swapaxes(-1, -2)
+    return carried
+
+
+def _net_turn(difference_m: FloatArray, duration_s: FloatArray, step_of_piece: IntArray) -> FloatArray:
+    """(N,) the turn of a whole step, spread over its pieces by duration, as a difference of the wheels.
+
+    Quantised readings taken one by one would add up a turn that never was.
+    """
     n_steps = int(step_of_piece[-1]) + 1
-    step_turn = np.abs(np.bincount(step_of_piece, turn_rad, n_steps))
-    step_duration = np.bincount(step_of_piece, duration_s, n_steps)
-    net_turn_rad = step_turn[step_of_piece] * duration_s / step_duration[step_of_piece]
-    in_gap = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
-    heading = (
-        noise.sigma_heading_rad_per_sqrt_m**2 * distance_m + noise.sigma_heading_rad_per_sqrt_rad**2 * net_turn_rad
-    )
-    covariance = np.zeros((len(distance_m), 3, 3))
-    covariance[:, 0, 0] = noise.sigma_distance_m_per_sqrt_m**2 * distance_m + in_gap
+    turned = np.abs(np.bincount(step_of_piece, difference_m, n_steps))
+    duration = np.bincount(step_of_piece, duration_s, n_steps)
+    return np.asarray(turned[step_of_piece] * duration_s / duration[step_of_piece])
+
+
+def _piece_covariances(
+    forward_m: FloatArray, net_turn_rad: FloatArray, duration_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(4, N, 3, 3) by ODOMETRY_NOISE, of the pieces' right tangents, and (N, 3, 3) what a gap adds.
+
+    Noise comes in all along a piece.
+    """
+    distance_m = np.abs(forward_m)
+    heading = np.zeros((len(forward_m), 3, 3))
     # A heading error made u before the end moves the end sideways by u times it: means of u^2 and u over the piece.
-    covariance[:, 1, 1] = noise.sigma_lateral_m_per_sqrt_m**2 * distance_m + in_gap + heading * forward_m**2 / 3.0
-    covariance[:, 1, 2] = covariance[:, 2, 1] = heading * forward_m / 2.0
-    covariance[:, 2, 2] = heading
-    return covariance
+    heading[:, 1, 1] = forward_m**2 / 3.0
+    heading[:, 1, 2] = heading[:, 2, 1] = forward_m / 2.0
+    heading[:, 2, 2] = 1.0
+    unit = np.zeros((len(ODOMETRY_NOISE), len(forward_m), 3, 3))
+    unit[0, :, 0, 0] = unit[1, :, 1, 1] = distance_m
+    unit[2] = distance_m[:, None, None] * heading
+    unit[3] = net_turn_rad[:, None, None] * heading
+    in_gap = np.zeros((len(forward_m), 3, 3))
+    in_gap[:, 0, 0] = in_gap[:, 1, 1] = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
+    return unit, in_gap
 
 
 def _by_wheel_parameters(
