@@ -39,5 +39,9 @@ def place_labels(points_px: FloatArray, sizes_px: FloatArray, trails_px: FloatAr
 
 def _n_covered(candidates: FloatArray, half: FloatArray, points: FloatArray) -> FloatArray:
     """How many points (M, 2) lie within the half widths (2,) or (M, 2) of each candidate (C, 2)."""
-    apart = np.abs(candidates[:, np.newaxis] - points[np.newaxis])
-    return np.asarray((apart < half).all(axis=-1).sum(axis=1), dtype=np.float64)
+    half = np.broadcast_to(half, points.shape)
+    lowest, highest = candidates.min(axis=0), candidates.max(axis=0)
+    # Most points are far from all candidates.
+    near = np.flatnonzero(((points > lowest - half) & (points < highest + half)).all(axis=-1))
+    apart = np.abs(candidates[:, np.newaxis] - points[near])
+    return np.asarray((apart < half[near]).all(axis=-1).sum(axis=1), dtype=np.float64)

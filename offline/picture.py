@@ -140,8 +140,7 @@ def _draw_component(axes: Axes, component: Component, styles: dict[str, tuple[st
         colour, dashes = styles[run.run]
         axes.plot(run.T_map_base[:, 0], run.T_map_base[:, 1], color=colour, linestyle=dashes, linewidth=1.4, zorder=3)
         _draw_start(axes, run, colour)
-    for tag in component.tags:
-        _draw_tag(axes, tag, component, styles, factor)
+    _draw_tags(axes, component, styles, factor)
 
 
 def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
@@ -153,10 +152,17 @@ def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
     start.set_markeredgewidth(1.2)
 
 
-def _draw_tag(
-    axes: Axes, tag: TagResult, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int
-) -> None:
-    colour = _tag_colour(tag, component, styles)
+def _draw_tags(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+    places_m: dict[str, list[FloatArray]] = {}
+    for tag in component.tags:
+        colour = _tag_colour(tag, component, styles)
+        places_m.setdefault(colour, []).append(tag.position_m[:2])
+        axes.add_artist(_ellipse(tag, colour, factor))  # add_patch would look for new limits each time
+    for colour, places in places_m.items():
+        axes.plot(*np.array(places).T, marker="s", color=colour, markersize=4.0, zorder=4, linestyle="")
+
+
+def _ellipse(tag: TagResult, colour: str, factor: int) -> Ellipse:
     variances, directions = np.linalg.eigh(tag.covariance)
     small_m, large_m = np.sqrt(np.maximum(variances, 0.0)) * factor
     angle_deg = degrees(np.arctan2(directions[1, 1], directions[0, 1]))
@@ -164,8 +170,7 @@ def _draw_tag(
         (tag.position_m[0], tag.position_m[1]), 2 * large_m, 2 * small_m, angle=angle_deg, linewidth=0.8, zorder=2
     )
     ellipse.set(facecolor=(colour, 0.15), edgecolor=(colour, 0.7))
-    axes.add_patch(ellipse)
-    axes.plot([tag.position_m[0]], [tag.position_m[1]], marker="s", color=colour, markersize=4.0, zorder=4)
+    return ellipse
 
 
 def _tag_colour(tag: TagResult, component: Component, styles: dict[str, tuple[str, Dashes]]) -> str:
