@@ -5,7 +5,7 @@ Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissec
 `arrowhead_tree`.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -13,12 +13,13 @@ import numpy as np
 from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_kernels, arrowhead_substitution, linearise_kernels, linearise_readings
+from offline import arrowhead_kernels, arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
 from offline.arrowhead_covariance import joint_covariance
 from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_marginals import pose_marginals
-from offline.arrowhead_tree import Tree, build_tree
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from offline.arrowhead_skeleton import expand
+from offline.arrowhead_tree import Tree
+from offline.factors import State
 from offline.linearise_kernels import Free, Odometry, Readings, Values
 from offline.robust import SQUARES, Loss
 from offline.rolled_step import rolled
@@ -40,14 +41,12 @@ class Arrowhead:
     """What stays the same from step to step: factors in the order of poses, and the order of elimination.
 
     Attributes:
-        relaxed: the readings as places (x, y), whatever form they were read in: nearly linear in the poses.
         tangent: (n,) column of the arrowhead for each column of the tangent vector.
     """
 
     tree: Tree
     odometry: Odometry
     readings: Readings
-    relaxed: Readings
     prior_sigma: FloatArray
     free: Free
     tangent: IntArray
@@ -66,7 +65,7 @@ class Arrowhead:
         system = out if out is not None else self.empty_system()
         values = Values(state.poses, state.tags, state.calibration)
         linearise_kernels.clear(system)
-        total = linearise_kernels.add_odometry(self.odometry, odometry_loss, values, self.free, system)
+        total = linearise_odometry.add_odometry(self.odometry, odometry_loss, values, self.free, system)
         total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
         total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
         linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
@@ -89,30 +88,6 @@ class Arrowhead:
         out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
         rolled(values, step, anchor, self.tree.chain_start, by_pose, out)
         return State(*out)
-
-    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
-        """Poses and tags from one pass in order of time.
-
-        Args:
-            state: its calibration counts, and the pose at the start of each chain.
-            start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
-        """
-        values = Values(state.poses, state.tags, state.calibration)
-        out = Values(np.empty_like(state.poses), np.empty_like(state.tags), np.empty_like(state.calibration))
-        starting_pass(self.tree, self.odometry, self.readings, values, np.square(start_sigma), out)
-        return State(*out)
-
-    def relaxed_step(self, state: State, anchor: IntArray) -> State:
-        """The state after a Gauss-Newton step on the relaxed readings.
-
-        Range and bearing are far from linear where a start is metres off; places are not.
-
-        Raises:
-            UnderDeterminedError: something is not tied down.
-        """
-        system, _, rows = self.scratch
-        replace(self, readings=self.relaxed).linearise(state, out=system)
-        return self.moved(state, -self.factorise(system, out=rows).solve_in_order(system.gradient), anchor)
 
     @cached_property
     def scratch(self) -> tuple[System, System, Rows]:
@@ -236,85 +211,64 @@ class Factorisation:
             largest, smallest = largest / up, smallest / down
         return up * down
 
+    def relative_error(self) -> float:
+        """What rounding does to solutions, as a share: the length of one step of iterative refinement.
 
-def build_arrowhead(
-    odometry: OdometryFactors, readings: ReadingFactors, prior: CalibrationPrior, columns: Columns
-) -> Arrowhead:
-    """Sorts factors by pose and settles the order of elimination.
+        Higham, "Accuracy and stability of numerical algorithms" (2002), chapter 12. Unlike the condition number this
+        does not mind units. The right-hand side is random, so that the directions known least weigh most.
+        """
+        vector = self.arrowhead.in_order(np.random.default_rng(0).standard_normal(len(self.arrowhead.tangent)))
+        solution = self.solve_in_order(vector)
+        rest = vector - arrowhead_substitution.product(self.arrowhead.tree, self.system, solution)
+        length = float(np.linalg.norm(solution))
+        return float(np.linalg.norm(self.solve_in_order(rest))) / length if length else 0.0
 
-    Poses that odometry joins to the next one form a chain.
+
+@dataclass(frozen=True)
+class Skeleton:
+    """The poses that read tags: a smaller problem to start with, nearly linear because readings count as places.
+
+    Range and bearing are far from linear where a start is metres off; places (x, y) are not.
+
+    Attributes:
+        arrowhead: of these poses, the motions between them composed; `whole` of all poses.
+        index: (P,) of each pose in the skeleton, -1 where it is not kept.
     """
-    n_poses, n_tags = len(columns.poses), len(columns.tags)
-    starts_chain = np.ones(n_poses + 1, dtype=np.bool_)
-    starts_chain[odometry.first + 1] = False
-    chain_start = np.flatnonzero(starts_chain)
-    chain_of = np.cumsum(starts_chain[:-1]) - 1
-    order = np.argsort(readings.pose, kind="stable")
-    pose, tag = readings.pose[order], readings.tag[order]
-    reading_parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter])[order]
-    is_free = columns.calibration >= 0
-    free = Free(
-        poses=(columns.poses >= 0).astype(np.float64),
-        tags=(columns.tags >= 0).astype(np.float64),
-        calibration=np.where(is_free, np.cumsum(is_free) - 1, -1),
-    )
-    users = (
-        (chain_of[odometry.first], free.calibration[odometry.parameters]),
-        (chain_of[pose], free.calibration[reading_parameters]),
-    )
-    uses = np.zeros((len(chain_start) - 1, len(is_free) + 1), dtype=np.bool_)
-    for chain, parameters in users:
-        uses[chain[:, None], parameters] = True
-    uses[:, -1] = False  # where held
-    slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
-    slots = [np.flatnonzero(own) for own in uses]
-    tree = build_tree(chain_start, pose, tag, n_tags, slots, int(is_free.sum()))
-    sorted_readings = Readings(
-        pose=pose,
-        tag=tag,
-        value=readings.value[order],
-        polar=readings.polar[order],
-        whitening=readings.whitening[order],
-        mount=readings.mount[order],
-        parameters=reading_parameters,
-        slots=slot[users[1][0][:, None], users[1][1]],
-    )
-    return Arrowhead(
-        tree=tree,
-        odometry=Odometry(
-            first=np.ascontiguousarray(odometry.first),
-            motion=np.ascontiguousarray(odometry.motion),
-            information=np.ascontiguousarray(odometry.whitening.swapaxes(-1, -2) @ odometry.whitening),
-            jacobian=np.ascontiguousarray(odometry.jacobian),
-            parameters=np.ascontiguousarray(odometry.parameters),
-            slots=slot[users[0][0][:, None], users[0][1]],
-        ),
-        readings=sorted_readings,
-        relaxed=_relaxed(sorted_readings),
-        prior_sigma=prior.sigma,
-        free=free,
-        tangent=_tangent_order(columns),
-    )
 
+    arrowhead: Arrowhead
+    whole: Arrowhead
+    index: IntArray
 
-def _relaxed(readings: Readings) -> Readings:
-    """The same as places (x, y), with the covariance that the reading had there."""
-    x, y = readings.value.T
-    range_m, cos, sin = np.maximum(x, 1e-6), np.cos(y), np.sin(y)
-    by_place = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1) / range_m[:, None]], axis=-2)
-    polar = readings.polar[:, None]
-    return readings._replace(
-        value=np.where(polar, np.column_stack([x * cos, x * sin]), readings.value),
-        polar=np.zeros_like(readings.polar),
-        whitening=np.where(polar[..., None], readings.whitening @ by_place, readings.whitening),
-    )
+    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
+        """Poses and tags from one pass in order of time.
 
+        Args:
+            state: its calibration counts, and the pose at the start of each chain.
+            start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
+        """
+        own, start = self.arrowhead, self._kept(state)
+        values = Values(start.poses, start.tags, start.calibration)
+        out = Values(np.empty_like(start.poses), np.empty_like(start.tags), np.empty_like(start.calibration))
+        starting_pass(own.tree, own.odometry, own.readings, values, np.square(start_sigma), out)
+        return self._expanded(State(*out))
 
-def _tangent_order(columns: Columns) -> IntArray:
-    """(n,) the arrowhead's column of each column of the tangent vector."""
-    tangent = np.empty(columns.n, dtype=np.int64)
-    is_free = columns.calibration >= 0
-    all_columns = np.concatenate([columns.poses.reshape(-1), columns.tags.reshape(-1), columns.calibration[is_free]])
-    free = all_columns >= 0
-    tangent[all_columns[free]] = np.flatnonzero(free)
-    return tangent
+    def relaxed(self, state: State, anchor: IntArray, steps: int) -> State:
+        """The state after some Gauss-Newton steps.
+
+        Raises:
+            UnderDeterminedError: something is not tied down; the column is the skeleton's.
+        """
+        kept, own = self._kept(state), self.arrowhead
+        system, _, rows = own.scratch
+        for _ in range(steps):
+            own.linearise(kept, out=system)
+            kept = own.moved(kept, -own.factorise(system, out=rows).solve_in_order(system.gradient), self.index[anchor])
+        return self._expanded(kept)
+
+    def _kept(self, state: State) -> State:
+        return State(state.poses[self.index >= 0], state.tags, state.calibration)
+
+    def _expanded(self, kept: State) -> State:
+        poses = np.empty((len(self.index), 3))
+        expand(self.whole.odometry, self.index, self.arrowhead.odometry, kept.poses, kept.calibration, poses)
+        return State(poses, kept.tags, kept.calibration)

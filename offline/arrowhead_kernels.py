@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.arrays import FloatArray
-from offline.arrowhead_tree import LEVELS, Tree
+from offline.arrowhead_cut import LEVELS
+from offline.arrowhead_tree import Tree
 from offline.jit import jitted
 
 
@@ -40,8 +41,8 @@ class Rows(NamedTuple):
     """What elimination leaves.
 
     Attributes:
-        pose: (P, 3, 3) upper triangular R of the poses in leaves, with 1 / R on the diagonal.
-        pose_next: (P, 3, 3) R by the next pose of the leaf or the separator after it.
+        pose: (P, 3, 3) of the poses in leaves U with ones on the diagonal, and 1 / D in their place: R = sqrt(D) U.
+        pose_next: (P, 3, 3) U by the next pose of the leaf or the separator after it.
         inner: rows (n_eliminated, front) of the nodes between leaves and top.
         workspace: fronts being built up, one a level; the last one is the top's.
     """
@@ -107,7 +108,10 @@ def _eliminate_leaf(
     now: FloatArray,
     following: FloatArray,
 ) -> int:
-    """Pose by pose; `now` (3, w) couples the pose to the border seen so far: R^T R = D, Y = R^-T now, Z = R^-T next."""
+    """Pose by pose; `now` (3, w) couples the pose to the border seen so far.
+
+    U^T D U = H, Y = U^-T now, Z = U^-T next.
+    """
     first, end, n_left = tree.first[leaf], tree.end[leaf], tree.calibration_at[leaf]
     n_slots = n_slots_of(tree, leaf)
     width = n_left + n_slots
@@ -123,16 +127,15 @@ def _eliminate_leaf(
             for a in range(n_slots):
                 now[i, n_left + a] += system.pose_calibration[pose, i, a]
         width = _add_readings(tree, system, pose, now, width)
-        R, Z = rows.pose[pose], rows.pose_next[pose]
-        failed = _square_root(block, R)
+        U, Z = rows.pose[pose], rows.pose_next[pose]
+        failed = _square_root(block, U)
         if failed >= 0:
             return int(3 * pose + failed)
-        _solve_transposed(R, now, width)
+        _solve_transposed(U, now, width)
         if pose + 1 < end or tree.right[leaf] >= 0:
-            Z[:] = system.pose_next[pose]
-            _solve_transposed(R, Z, 3)
-            _carry_on(Z, now, width, carried, following)
-        _subtract_square(front, now, width)
+            _solve_next(U, system.pose_next[pose], Z)
+            _carry_on(U, Z, now, width, carried, following)
+        _subtract_square(front, U, now, width)
         now, following = following, now
     if tree.right[leaf] >= 0:
         at = front.shape[0] - 3
@@ -142,10 +145,21 @@ def _eliminate_leaf(
 
 
 @jitted
-def _carry_on(Z: FloatArray, Y: FloatArray, width: int, carried: FloatArray, following: FloatArray) -> None:
-    """What is left of a pose for the next one: carried = -Z^T Z, following = -Z^T Y."""
+def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
+    """Z = U^-T N."""
+    for j in range(3):
+        z0 = N[0, j]
+        z1 = N[1, j] - U[0, 1] * z0
+        Z[0, j], Z[1, j], Z[2, j] = z0, z1, N[2, j] - U[0, 2] * z0 - U[1, 2] * z1
+
+
+@jitted
+def _carry_on(
+    U: FloatArray, Z: FloatArray, Y: FloatArray, width: int, carried: FloatArray, following: FloatArray
+) -> None:
+    """What is left of a pose for the next one: carried = -Z^T D^-1 Z, following = -Z^T D^-1 Y."""
     for i in range(3):
-        z0, z1, z2 = Z[0, i], Z[1, i], Z[2, i]
+        z0, z1, z2 = U[0, 0] * Z[0, i], U[1, 1] * Z[1, i], U[2, 2] * Z[2, i]
         for j in range(3):
             carried[i, j] = -(z0 * Z[0, j] + z1 * Z[1, j] + z2 * Z[2, j])
         for a in range(width):
@@ -174,39 +188,40 @@ def _add_readings(tree: Tree, system: System, pose: int, coupled: FloatArray, wi
 
 
 @jitted
-def _square_root(block: FloatArray, R: FloatArray) -> int:
-    """Upper triangular R with R^T R = block, 1 / R on the diagonal; -1, or the column without a positive pivot."""
-    for i in range(3):
-        for j in range(i, 3):
-            rest = block[i, j]
-            for k in range(i):
-                rest -= R[k, i] * R[k, j]
-            if i == j:
-                if not rest > 0.0:
-                    return i
-                R[i, i] = 1.0 / np.sqrt(rest)
-            else:
-                R[i, j] = rest * R[i, i]
+def _square_root(block: FloatArray, U: FloatArray) -> int:
+    """U^T D U = block, 1 / D on the diagonal; -1, or the column without a positive pivot. Roots would take longer."""
+    if not block[0, 0] > 0.0:
+        return 0
+    i0 = 1.0 / block[0, 0]
+    u01, u02 = block[0, 1] * i0, block[0, 2] * i0
+    d1, rest = block[1, 1] - u01 * block[0, 1], block[1, 2] - u01 * block[0, 2]
+    if not d1 > 0.0:
+        return 1
+    i1 = 1.0 / d1
+    u12 = rest * i1
+    d2 = block[2, 2] - u02 * block[0, 2] - u12 * rest
+    if not d2 > 0.0:
+        return 2
+    U[0, 0], U[0, 1], U[0, 2], U[1, 1], U[1, 2], U[2, 2] = i0, u01, u02, i1, u12, 1.0 / d2
     return -1
 
 
 @jitted
-def _solve_transposed(R: FloatArray, B: FloatArray, width: int) -> None:
-    """B <- R^-T B for the first columns of B (3, w)."""
-    r01, r02, r12 = R[0, 1], R[0, 2], R[1, 2]
-    i0, i1, i2 = R[0, 0], R[1, 1], R[2, 2]
+def _solve_transposed(U: FloatArray, B: FloatArray, width: int) -> None:
+    """B <- U^-T B for the first columns of B (3, w)."""
+    u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
     for a in range(width):
-        y0 = B[0, a] * i0
-        y1 = (B[1, a] - r01 * y0) * i1
-        B[0, a], B[1, a], B[2, a] = y0, y1, (B[2, a] - r02 * y0 - r12 * y1) * i2
+        y0 = B[0, a]
+        y1 = B[1, a] - u01 * y0
+        B[1, a], B[2, a] = y1, B[2, a] - u02 * y0 - u12 * y1
 
 
 @jitted
-def _subtract_square(front: FloatArray, Y: FloatArray, width: int) -> None:
-    """Upper triangle of front -= Y^T Y."""
+def _subtract_square(front: FloatArray, U: FloatArray, Y: FloatArray, width: int) -> None:
+    """Front -= Y^T D^-1 Y: both triangles, since loops of full length are the faster ones."""
     for a in range(width):
-        y0, y1, y2 = Y[0, a], Y[1, a], Y[2, a]
-        for b in range(a, width):
+        y0, y1, y2 = U[0, 0] * Y[0, a], U[1, 1] * Y[1, a], U[2, 2] * Y[2, a]
+        for b in range(width):
             front[a, b] -= y0 * Y[0, b] + y1 * Y[1, b] + y2 * Y[2, b]
 
 
@@ -271,7 +286,9 @@ def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> in
         if end - first == 4:
             _subtract_four(front, first)
         else:
-            _subtract_rows(front, first, end)
+            for k in range(first, end):
+                for r in range(end, size):
+                    _subtract_one(front, k, r)
     start = tree.rows_start[node]
     rows.inner[start : start + n * size] = front[:n].reshape(n * size)
     return -1
@@ -280,45 +297,38 @@ def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> in
 @jitted
 def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
     """Rows first to end - 1 of R; -1, or the row without a positive pivot."""
-    size = front.shape[0]
     for k in range(first, end):
         if not front[k, k] > 0.0:
             return k
         root = np.sqrt(front[k, k])
         inverse = 1.0 / root
         front[k, k] = root
-        for j in range(k + 1, size):
-            front[k, j] *= inverse
+        row = front[k, k + 1 :]
+        for j in range(len(row)):
+            row[j] *= inverse
         for r in range(k + 1, end):
-            factor = front[k, r]
-            for j in range(r, size):
-                front[r, j] -= factor * front[k, j]
+            _subtract_one(front, k, r)
     return -1
 
 
 @jitted
-def _subtract_four(front: FloatArray, first: int) -> None:
-    """The rows below four rows of R lose their products."""
-    size = front.shape[0]
-    for r in range(first + 4, size):
-        f0, f1, f2, f3 = front[first, r], front[first + 1, r], front[first + 2, r], front[first + 3, r]
-        if f0 == 0.0 and f1 == 0.0 and f2 == 0.0 and f3 == 0.0:
-            continue  # separators do not reach all tags
-        for j in range(r, size):
-            front[r, j] -= (
-                f0 * front[first, j] + f1 * front[first + 1, j] + f2 * front[first + 2, j] + f3 * front[first + 3, j]
-            )
+def _subtract_one(front: FloatArray, k: int, r: int) -> None:
+    """Row r loses its product with row k of R. Loops over slices need no look at the sign of an index."""
+    factor, row, rest = front[k, r], front[k, r:], front[r, r:]
+    for j in range(len(rest)):
+        rest[j] -= factor * row[j]
 
 
 @jitted
-def _subtract_rows(front: FloatArray, first: int, end: int) -> None:
-    """The same for fewer rows."""
-    size = front.shape[0]
-    for k in range(first, end):
-        for r in range(end, size):
-            factor = front[k, r]
-            for j in range(r, size):
-                front[r, j] -= factor * front[k, j]
+def _subtract_four(front: FloatArray, k: int) -> None:
+    """The rows below four rows of R, from k on, lose their products."""
+    for r in range(k + 4, len(front)):
+        f0, f1, f2, f3 = front[k, r], front[k + 1, r], front[k + 2, r], front[k + 3, r]
+        if f0 == 0.0 and f1 == 0.0 and f2 == 0.0 and f3 == 0.0:
+            continue  # separators do not reach all tags
+        rest, r0, r1, r2, r3 = front[r, r:], front[k, r:], front[k + 1, r:], front[k + 2, r:], front[k + 3, r:]
+        for j in range(len(rest)):
+            rest[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
 
 
 @jitted
@@ -326,11 +336,8 @@ def _add_to_parent(tree: Tree, node: int, front: FloatArray, workspace: FloatArr
     """What is left of a front is added to the parent's."""
     above = _front_of(tree, tree.parent[node], workspace)
     start, size = tree.front_start[node], front.shape[0]
+    up = tree.up[start : start + size]
     for a in range(tree.n_eliminated[node], size):
-        row = tree.up[start + a]
+        row = up[a]
         for b in range(a, size):
-            column = tree.up[start + b]
-            if row <= column:
-                above[row, column] += front[a, b]
-            else:
-                above[column, row] += front[a, b]
+            above[min(row, up[b]), max(row, up[b])] += front[a, b]

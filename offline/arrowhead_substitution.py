@@ -77,28 +77,28 @@ def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
     first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
     x0, x1, x2 = 0.0, 0.0, 0.0
     for k in range(n):
-        R = rows.pose[first + k]
+        U = rows.pose[first + k]
         b0, b1, b2 = inside[k, 0], inside[k, 1], inside[k, 2]
         if k:
             Z = rows.pose_next[first + k - 1]
             b0 -= Z[0, 0] * x0 + Z[1, 0] * x1 + Z[2, 0] * x2
             b1 -= Z[0, 1] * x0 + Z[1, 1] * x1 + Z[2, 1] * x2
             b2 -= Z[0, 2] * x0 + Z[1, 2] * x1 + Z[2, 2] * x2
-        x0 = b0 * R[0, 0]
-        x1 = (b1 - R[0, 1] * x0) * R[1, 1]
-        x2 = (b2 - R[0, 2] * x0 - R[1, 2] * x1) * R[2, 2]
-        inside[k, 0], inside[k, 1], inside[k, 2] = x0, x1, x2
+        b1 -= U[0, 1] * b0
+        b2 -= U[0, 2] * b0 + U[1, 2] * b1
+        x0, x1, x2 = b0 * U[0, 0], b1 * U[1, 1], b2 * U[2, 2]
+        inside[k, 0], inside[k, 1], inside[k, 2] = b0, b1, b2
     for k in range(n - 1, -1, -1):
-        R = rows.pose[first + k]
+        U = rows.pose[first + k]
         b0, b1, b2 = inside[k, 0], inside[k, 1], inside[k, 2]
         if k + 1 < n:
             Z = rows.pose_next[first + k]
             b0 -= Z[0, 0] * x0 + Z[0, 1] * x1 + Z[0, 2] * x2
             b1 -= Z[1, 0] * x0 + Z[1, 1] * x1 + Z[1, 2] * x2
             b2 -= Z[2, 0] * x0 + Z[2, 1] * x1 + Z[2, 2] * x2
-        x2 = b2 * R[2, 2]
-        x1 = (b1 - R[1, 2] * x2) * R[1, 1]
-        x0 = (b0 - R[0, 1] * x1 - R[0, 2] * x2) * R[0, 0]
+        x2 = b2 * U[2, 2]
+        x1 = b1 * U[1, 1] - U[1, 2] * x2
+        x0 = b0 * U[0, 0] - U[0, 1] * x1 - U[0, 2] * x2
         inside[k, 0], inside[k, 1], inside[k, 2] = x0, x1, x2
 
 

@@ -8,18 +8,13 @@ separators at both ends, the calibration of the chain, tags that others read too
 Columns are numbered 3 for each pose, 2 for each tag, then the calibration that is free.
 """
 
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from calib.arrays import IntArray
+from offline.arrowhead_cut import LEVELS, Pieces, cut, nodes_of_poses
 from offline.jit import jitted
-
-_LEAF_POSES: Final = 30
-_LEAVES_IN_MIDDLE: Final = 8
-_MIDDLES_IN_LARGE: Final = 4
-LEVELS: Final = 4  # leaf, middle, large, top
 
 
 class Tree(NamedTuple):
@@ -57,8 +52,8 @@ class Tree(NamedTuple):
     n_eliminated: IntArray
     front_start: IntArray
     front: IntArray
-    up: IntArray
     calibration_at: IntArray
+    up: IntArray
     separator_start: IntArray
     separators: IntArray
     separator_chain: IntArray
@@ -78,17 +73,20 @@ class Tree(NamedTuple):
     n_slots: int
 
 
-class _Pieces(NamedTuple):
-    """The tree before tags: fields as in Tree, and the level (P,) at which each pose is eliminated."""
+class _Lists(NamedTuple):
+    """What belongs to each node, one list after the other: members of `values` from start[node] to start[node + 1]."""
 
-    level: IntArray
-    parent: IntArray
-    chain: IntArray
-    first: IntArray
-    end: IntArray
-    left: IntArray
-    right: IntArray
-    pose_level: IntArray
+    start: IntArray
+    values: IntArray
+
+
+class _Fronts(NamedTuple):
+    """Fields as in Tree."""
+
+    n_eliminated: IntArray
+    front_start: IntArray
+    front: IntArray
+    calibration_at: IntArray
 
 
 def build_tree(
@@ -96,7 +94,8 @@ def build_tree(
     reading_pose: IntArray,
     reading_tag: IntArray,
     n_tags: int,
-    slots: list[IntArray],
+    slot_start: IntArray,
+    slots: IntArray,
     n_free: int,
 ) -> Tree:
     """The tree of a problem.
@@ -106,65 +105,43 @@ def build_tree(
         reading_pose: (M,) rising.
         reading_tag: (M,).
         n_tags: how many there are.
-        slots: for each chain the free calibration that it is coupled to.
+        slot_start: (number of chains + 1,) where each chain's slots begin.
+        slots: the free calibration that each chain is coupled to.
         n_free: how much calibration is free.
     """
-    pieces = _cut(chain_start)
+    pieces = cut(chain_start)
     n_poses, n_nodes = int(chain_start[-1]), len(pieces.level)
-    slot_start, all_slots = _starts(slots), _joined(slots)
-    node_of = _nodes_of_poses(pieces)
+    node_of = nodes_of_poses(pieces.level, pieces.first, pieces.end, pieces.pose_level)
     home = _homes_of_tags(node_of, reading_pose, reading_tag, n_tags)
     inner = np.flatnonzero(pieces.pose_level > 0)
     separators = _grouped(node_of[inner, pieces.pose_level[inner]], inner, n_nodes)
     tags = _grouped(home, np.arange(n_tags), n_nodes)
     shared_tags = _grouped(*_tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
-
-    def calibration(node: int) -> IntArray:
-        chain = pieces.chain[node]
-        return np.arange(n_free) if chain < 0 else slots[chain]
-
-    columns, n_eliminated, calibration_at = [], [], []
-    for node in range(n_nodes):
-        own = [_pose_columns(separators[node]), _tag_columns(tags[node], n_poses)]
-        left, right = (_pose_columns(end[node : node + 1][end[node : node + 1] >= 0]) for end in pieces[5:7])
-        n_eliminated.append(len(own[0]) + len(own[1]))
-        calibration_at.append(n_eliminated[-1] + len(left))
-        free = 3 * n_poses + 2 * n_tags + calibration(node)
-        columns.append(np.concatenate([*own, left, free, _tag_columns(shared_tags[node], n_poses), right]))
-    n_eliminated[-1] += n_free
-    front_start, front = _starts(columns), _joined(columns)
-    size = np.diff(front_start)
-    eliminated = np.array(n_eliminated)
+    fronts = _fronts(pieces, separators, tags, shared_tags, _Lists(slot_start, slots), n_poses, n_tags, n_free)
     home_of_reading = node_of[reading_pose, pieces.pose_level[reading_pose]]
+    column_of_reading, n_columns = 3 * n_poses + 2 * reading_tag, 3 * n_poses + 2 * n_tags + n_free
     up, reading_at = _places(
-        pieces.parent,
-        front_start,
-        front,
-        home_of_reading,
-        3 * n_poses + 2 * reading_tag,
-        3 * n_poses + 2 * n_tags + n_free,
+        pieces.parent, fronts.front_start, fronts.front, home_of_reading, column_of_reading, n_columns
     )
-    up[_within(front_start, eliminated)] = -1
+    up[_within(fronts.front_start, fronts.n_eliminated)] = -1
+    size = np.diff(fronts.front_start)
     widest = [int(size[pieces.level == level].max(initial=0)) for level in range(LEVELS)]
     return Tree(
         *pieces[:7],
-        n_eliminated=eliminated,
-        front_start=front_start,
-        front=front,
+        *fronts,
         up=up,
-        calibration_at=np.array(calibration_at),
-        separator_start=_starts(separators),
-        separators=_joined(separators),
-        separator_chain=np.searchsorted(chain_start, _joined(separators), side="right") - 1,
-        tag_start=_starts(tags),
-        tags=_joined(tags),
-        rows_start=np.concatenate([[0], np.cumsum((eliminated * size)[:-1])]),
+        separator_start=separators.start,
+        separators=separators.values,
+        separator_chain=np.searchsorted(chain_start, separators.values, side="right") - 1,
+        tag_start=tags.start,
+        tags=tags.values,
+        rows_start=np.concatenate([[0], np.cumsum((fronts.n_eliminated * size)[:-1])]),
         workspace_start=np.concatenate([[0], np.cumsum(np.square(widest))]),
-        reading_start=np.searchsorted(reading_pose, np.arange(n_poses + 1)).astype(np.int64),
+        reading_start=np.searchsorted(reading_pose, np.arange(n_poses + 1)),
         reading_tag=reading_tag,
         reading_at=reading_at,
         slot_start=slot_start,
-        slots=all_slots,
+        slots=slots,
         chain_start=chain_start,
         n_poses=n_poses,
         n_tags=n_tags,
@@ -173,20 +150,72 @@ def build_tree(
     )
 
 
-def _starts(lists: Sequence[IntArray]) -> IntArray:
-    return np.concatenate([[0], np.cumsum([len(own) for own in lists])]).astype(np.int64)
+def _grouped(node: IntArray, values: IntArray, n_nodes: int) -> _Lists:
+    """Values by node, order kept."""
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
+    return _Lists(start, values[np.argsort(node, kind="stable")])
 
 
-def _joined(lists: Sequence[IntArray]) -> IntArray:
-    return np.concatenate([np.zeros(0, dtype=np.int64), *lists]).astype(np.int64)
+@jitted
+def _fronts(
+    pieces: Pieces,
+    separators: _Lists,
+    tags: _Lists,
+    shared_tags: _Lists,
+    slots: _Lists,
+    n_poses: int,
+    n_tags: int,
+    n_free: int,
+) -> _Fronts:
+    """Lays out each front: separators, own tags, separator on the left, calibration, others' tags, right separator."""
+    n_nodes = len(pieces.level)
+    n_eliminated, calibration_at = np.empty(n_nodes, dtype=np.int64), np.empty(n_nodes, dtype=np.int64)
+    start, front = np.zeros(n_nodes + 1, dtype=np.int64), np.empty(0, dtype=np.int64)
+    first_tag, first_free = 3 * n_poses, 3 * n_poses + 2 * n_tags
+    for is_filling in (False, True):  # counted first
+        at = 0
+        for node in range(n_nodes):
+            at = _add_columns(separators, node, 0, 3, front, at, is_filling)
+            at = _add_columns(tags, node, first_tag, 2, front, at, is_filling)
+            n_eliminated[node] = at - start[node]
+            at = _add_pose(pieces.left[node], front, at, is_filling)
+            calibration_at[node] = at - start[node]
+            if pieces.chain[node] >= 0:
+                at = _add_columns(slots, pieces.chain[node], first_free, 1, front, at, is_filling)
+            else:
+                n_eliminated[node] += n_free
+                for a in range(n_free):
+                    if is_filling:
+                        front[at + a] = first_free + a
+                at += n_free
+            at = _add_columns(shared_tags, node, first_tag, 2, front, at, is_filling)
+            at = _add_pose(pieces.right[node], front, at, is_filling)
+            start[node + 1] = at
+        if not is_filling:
+            front = np.empty(at, dtype=np.int64)
+    return _Fronts(n_eliminated, start, front, calibration_at)
 
 
-def _pose_columns(poses: IntArray) -> IntArray:
-    return (3 * poses[:, None] + np.arange(3)).reshape(-1)
+@jitted
+def _add_columns(lists: _Lists, member: int, base: int, width: int, front: IntArray, at: int, is_filling: bool) -> int:
+    """The columns of a list's variables, each `width` wide; returns where the next go."""
+    for k in range(lists.start[member], lists.start[member + 1]):
+        if is_filling:
+            for i in range(width):
+                front[at + i] = base + width * lists.values[k] + i
+        at += width
+    return at
 
 
-def _tag_columns(tags: IntArray, n_poses: int) -> IntArray:
-    return (3 * n_poses + 2 * tags[:, None] + np.arange(2)).reshape(-1)
+@jitted
+def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
+    """The columns of a separator at an end, unless it is a chain's end."""
+    if pose < 0:
+        return at
+    if is_filling:
+        for i in range(3):
+            front[at + i] = 3 * pose + i
+    return at + 3
 
 
 def _within(start: IntArray, length: IntArray) -> IntArray:
@@ -223,55 +252,6 @@ def _places(
                 up[i] = place[front[i]]
             next_child += 1
     return up, reading_at
-
-
-def _cut(chain_start: IntArray) -> _Pieces:
-    """Cuts each chain evenly into leaves, and joins these."""
-    n_poses = int(chain_start[-1])
-    pose_level = np.zeros(n_poses, dtype=np.int64)
-    rows = []  # level, chain, cut on the left, cut on the right
-    for chain, (first, end) in enumerate(zip(chain_start[:-1].tolist(), chain_start[1:].tolist(), strict=True)):
-        # A cut is a pose, a separator; those at the chain's ends lie outside of it.
-        cuts = _thinned(np.arange(first - 1, end + 1), _LEAF_POSES + 1)
-        for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):
-            pose_level[cuts[1:-1]] = level + 1
-            n = len(cuts) - 1
-            rows.append(np.stack([np.full(n, level), np.full(n, chain), cuts[:-1], cuts[1:]]))
-            cuts = _thinned(cuts, n_joined)
-    level, chain_of, left, right = np.concatenate(rows, axis=1)
-    order = np.lexsort([level, right])
-    level, chain_of, left, right = level[order], chain_of[order], left[order], right[order]
-    top = len(level)
-    parent = np.full(top, top)
-    for lower in range(LEVELS - 2):
-        above = np.flatnonzero(level == lower + 1)
-        children = np.flatnonzero(level == lower)
-        parent[children] = above[np.searchsorted(above, children)]
-    return _Pieces(
-        level=np.append(level, LEVELS - 1),
-        parent=np.append(parent, top),
-        chain=np.append(chain_of, -1),
-        first=np.append(left + 1, 0),
-        end=np.append(right, n_poses),
-        left=np.append(np.where(left < chain_start[chain_of], -1, left), -1),
-        right=np.append(np.where(right == chain_start[chain_of + 1], -1, right), -1),
-        pose_level=pose_level,
-    )
-
-
-def _thinned(cuts: IntArray, n_joined: int) -> IntArray:
-    """The first, the last and evenly some between, so that about `n_joined` pieces become one."""
-    n = max(1, round((len(cuts) - 1) / n_joined))
-    return cuts[(np.arange(n + 1) * (len(cuts) - 1)) // n]
-
-
-def _nodes_of_poses(pieces: _Pieces) -> IntArray:
-    """(P, LEVELS) node of each level that a pose lies in; -1 below the level at which it is eliminated."""
-    node_of = np.full((len(pieces.pose_level), LEVELS), -1)
-    for node, (level, first, end) in enumerate(zip(pieces.level, pieces.first, pieces.end, strict=True)):
-        node_of[first:end, level] = node
-    node_of[pieces.pose_level[:, None] > np.arange(LEVELS)] = -1
-    return node_of
 
 
 @jitted
@@ -314,9 +294,3 @@ def _tags_in_nodes(
                     node[n_found], tag[n_found] = here, seen
                     n_found += 1
     return node[:n_found].copy(), tag[:n_found].copy()
-
-
-def _grouped(node: IntArray, values: IntArray, n_nodes: int) -> list[IntArray]:
-    """Values by node, order kept."""
-    order = np.argsort(node, kind="stable")
-    return np.split(values[order], np.cumsum(np.bincount(node, minlength=n_nodes))[:-1])

@@ -13,7 +13,8 @@ import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray, IntArray
-from offline.arrowhead import Arrowhead, Factorisation, UnderDeterminedError, build_arrowhead
+from offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from offline.arrowhead_build import build_arrowhead, build_skeleton
 from offline.arrowhead_kernels import Rows, System
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
@@ -76,6 +77,11 @@ class Problem:
     def arrowhead(self) -> Arrowhead:
         """The order of elimination, settled once."""
         return build_arrowhead(self.odometry, self.readings, self.prior, self.columns)
+
+    @cached_property
+    def skeleton(self) -> Skeleton:
+        """The smaller problem for starting values."""
+        return build_skeleton(self.arrowhead)
 
     @property
     def n_residuals(self) -> int:
@@ -167,6 +173,10 @@ class Solution:
     def condition(self) -> float:
         """Estimate of H's condition number at the end."""
         return self.factorisation.condition()
+
+    def relative_error(self) -> float:
+        """Estimate of what rounding, and the floor, do to covariances, as a share."""
+        return self.factorisation.relative_error()
 
 
 def solve(
@@ -262,13 +272,12 @@ def _factorised(
 
 def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
     """After some relaxed steps, and how many there were: none where something is not tied down."""
-    state = start
-    for step in range(steps):
-        try:
-            state = problem.arrowhead.relaxed_step(state, problem.anchor)
-        except UnderDeterminedError:
-            return state, step
-    return state, steps
+    if not steps:
+        return start, 0
+    try:
+        return problem.skeleton.relaxed(start, problem.anchor, steps), steps
+    except UnderDeterminedError:
+        return start, 0
 
 
 def _expected_decrease(system: System, step: FloatArray, damping: float) -> float:

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.arrays import FloatArray
-from offline.arrowhead import Arrowhead, UnderDeterminedError, build_arrowhead
+from offline.arrowhead import Arrowhead, UnderDeterminedError
+from offline.arrowhead_build import build_arrowhead
 from offline.factors import Linearised, State
 from offline.robust import SQUARES, Loss, cauchy, graduated, huber, truncated
 from offline.solver import DEFAULT_LOSSES, Problem

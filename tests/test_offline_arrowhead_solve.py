@@ -20,7 +20,7 @@ PLAIN = Losses(SQUARES, SQUARES)
 def our_start(fleet: Fleet) -> State:
     sigma = np.tile(SIGMA_START, (fleet.n_robots, 1))
     sigma[0] = 1e-6
-    return fleet.problem.arrowhead.starting_values(fleet.dead_reckoned, sigma)
+    return fleet.problem.skeleton.starting_values(fleet.dead_reckoned, sigma)
 
 
 @pytest.mark.parametrize("seed", range(4))

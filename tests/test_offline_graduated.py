@@ -51,7 +51,7 @@ def spoilt_start(fleet: Fleet, problem: Problem) -> State:
     """From the pass in order of time, which believes each reading: metres off."""
     sigma = np.tile(SIGMA_START, (fleet.n_robots, 1))
     sigma[0] = 1e-6
-    return problem.arrowhead.starting_values(fleet.dead_reckoned, sigma)
+    return problem.skeleton.starting_values(fleet.dead_reckoned, sigma)
 
 
 @pytest.mark.parametrize("seed", range(6))

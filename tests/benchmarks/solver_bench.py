@@ -41,7 +41,7 @@ def our_start(fleet: Fleet) -> State:
     """The pass in order of time, from dead reckoning."""
     sigma = np.tile(SIGMA_START, (fleet.n_robots, 1))
     sigma[0] = 1e-6  # held
-    return fleet.problem.arrowhead.starting_values(fleet.dead_reckoned, sigma)
+    return fleet.problem.skeleton.starting_values(fleet.dead_reckoned, sigma)
 
 
 def ours(fleet: Fleet) -> tuple[float, float, int, State]:
@@ -144,13 +144,13 @@ def measure(case: str, solver: str, seed: int) -> dict[str, Any]:
         "gtsam": lambda: gtsam(fleet, fleet.dead_reckoned),
         "gtsam_our_start": lambda: gtsam(fleet, our_start(fleet)),
     }
-    _ = fleet.problem.arrowhead  # graph building is not counted
+    skeleton = fleet.problem.skeleton  # graph building is not counted
     reset_peak()
     seconds, each, iterations, state = run[solver]()
     return {
         "robots": n_robots,
         "keyframes": n_keyframes,
-        "tags": len(fleet.truth.tags),
+        "tags": skeleton.whole.tree.n_tags,
         "solver": solver,
         "seed": seed,
         "seconds": seconds,

@@ -45,7 +45,7 @@ def growth() -> None:
 def many_tags() -> None:
     """Prints what 2,000 tags and 20,000 keyframes take."""
     fleet = made_fleet(1, 10, 2000, 2600, n_crossings=14)
-    _ = fleet.problem.arrowhead
+    _ = fleet.problem.skeleton
     before = memory_mib("VmRSS")
     reset_peak()
     found: list[str] = []

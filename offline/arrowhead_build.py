@@ -1,0 +1,144 @@
+"""Sets up the arrowhead system of a problem, and that of its skeleton: factors by pose, order of elimination."""
+
+import numpy as np
+
+from calib.arrays import BoolArray, IntArray
+from offline.arrowhead import Arrowhead, Skeleton
+from offline.arrowhead_skeleton import add_moments, compose
+from offline.arrowhead_tree import build_tree
+from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
+from offline.linearise_kernels import Free, Odometry, Readings
+
+
+def build_arrowhead(
+    odometry: OdometryFactors, readings: ReadingFactors, prior: CalibrationPrior, columns: Columns
+) -> Arrowhead:
+    """Sorts factors by pose and settles the order of elimination.
+
+    Poses that odometry joins to the next one form a chain.
+    """
+    n_poses, n_tags = len(columns.poses), len(columns.tags)
+    starts_chain = np.ones(n_poses + 1, dtype=np.bool_)
+    starts_chain[odometry.first + 1] = False
+    chain_start = np.flatnonzero(starts_chain)
+    chain_of = np.cumsum(starts_chain[:-1]) - 1
+    is_free = columns.calibration >= 0
+    free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
+    by_pose = _sorted_readings(readings)
+    in_order = np.argsort(odometry.first, kind="stable")
+    first, parameters = odometry.first[in_order], odometry.parameters[in_order]
+    uses = np.zeros((len(chain_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
+    for chain, used in ((chain_of[first], parameters), (chain_of[by_pose.pose], by_pose.parameters)):
+        uses[chain[:, None], free_calibration[used]] = True
+    uses[:, -1] = False  # where held
+    slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
+    slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
+    tree = build_tree(
+        chain_start, by_pose.pose, by_pose.tag, n_tags, slot_start, np.nonzero(uses)[1], int(is_free.sum())
+    )
+    motion = odometry.motion[in_order]
+    own = Odometry(
+        first=first,
+        motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
+        information=np.empty((len(first), 3, 3)),
+        covariance=np.empty((len(first), 3, 3)),
+        jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
+        parameters=parameters,
+        slots=slot[chain_of[first][:, None], free_calibration[parameters]],
+    )
+    add_moments(own, np.ascontiguousarray(odometry.whitening[in_order]))
+    return Arrowhead(
+        tree=tree,
+        odometry=own,
+        readings=by_pose._replace(slots=slot[chain_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
+        prior_sigma=prior.sigma,
+        free=_free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose),
+        tangent=_tangent_order(columns),
+    )
+
+
+def build_skeleton(whole: Arrowhead) -> Skeleton:
+    """Keeps the poses that read something, those that are held in part, and the first of each chain."""
+    tree, odometry, readings = whole.tree, whole.odometry, whole.readings
+    is_kept = np.diff(tree.reading_start) > 0
+    is_kept[whole.free.held_poses] = True
+    is_kept[tree.chain_start[:-1]] = True
+    index = np.where(is_kept, np.cumsum(is_kept) - 1, -1)
+    chain_start = np.concatenate([index[tree.chain_start[:-1]], [int(is_kept.sum())]])
+    n = int(is_kept.sum())
+    # From each kept pose to the next, but for the last of a chain; the parameters are those of its motions.
+    first = np.delete(np.arange(n), chain_start[1:] - 1)
+    begins = np.searchsorted(odometry.first, np.flatnonzero(is_kept)[first])
+    composed = Odometry(
+        first=first,
+        motion=np.empty((len(first), 5)),
+        information=np.empty((len(first), 3, 3)),
+        covariance=np.empty((len(first), 3, 3)),
+        jacobian=np.empty((len(first), 3, 3)),
+        parameters=odometry.parameters[begins],
+        slots=odometry.slots[begins],
+    )
+    compose(odometry, index, composed)
+    places = _relaxed(readings)._replace(pose=index[readings.pose])
+    own = Arrowhead(
+        tree=build_tree(
+            chain_start, places.pose, places.tag, tree.n_tags, tree.slot_start, tree.slots, tree.n_calibration
+        ),
+        odometry=composed,
+        readings=places,
+        prior_sigma=whole.prior_sigma,
+        free=_free(whole.free.poses[is_kept] > 0.0, whole.free.tags > 0.0, whole.free.calibration, places),
+        tangent=np.arange(3 * n + 2 * tree.n_tags + tree.n_calibration),
+    )
+    return Skeleton(own, whole, index)
+
+
+def _sorted_readings(readings: ReadingFactors) -> Readings:
+    """By rising pose; slots are still missing."""
+    order = np.argsort(readings.pose, kind="stable")
+    parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter])[order]
+    return Readings(
+        pose=readings.pose[order],
+        tag=readings.tag[order],
+        value=readings.value[order],
+        polar=readings.polar[order],
+        whitening=readings.whitening[order],
+        mount=readings.mount[order],
+        parameters=parameters,
+        slots=parameters,
+    )
+
+
+def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Readings) -> Free:
+    held_pose, held_tag = np.any(~poses, axis=1), np.any(~tags, axis=1)
+    return Free(
+        poses=poses.astype(np.float64),
+        tags=tags.astype(np.float64),
+        calibration=calibration,
+        held_poses=np.flatnonzero(held_pose),
+        held_tags=np.flatnonzero(held_tag),
+        held_readings=np.flatnonzero(held_pose[readings.pose] | held_tag[readings.tag]),
+    )
+
+
+def _relaxed(readings: Readings) -> Readings:
+    """The same as places (x, y), with the covariance that the reading had there."""
+    x, y = readings.value.T
+    range_m, cos, sin = np.maximum(x, 1e-6), np.cos(y), np.sin(y)
+    by_place = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1) / range_m[:, None]], axis=-2)
+    polar = readings.polar[:, None]
+    return readings._replace(
+        value=np.where(polar, np.column_stack([x * cos, x * sin]), readings.value),
+        polar=np.zeros_like(readings.polar),
+        whitening=np.where(polar[..., None], readings.whitening @ by_place, readings.whitening),
+    )
+
+
+def _tangent_order(columns: Columns) -> IntArray:
+    """(n,) the arrowhead's column of each column of the tangent vector."""
+    tangent = np.empty(columns.n, dtype=np.int64)
+    is_free = columns.calibration >= 0
+    all_columns = np.concatenate([columns.poses.reshape(-1), columns.tags.reshape(-1), columns.calibration[is_free]])
+    free = all_columns >= 0
+    tangent[all_columns[free]] = np.flatnonzero(free)
+    return tangent
