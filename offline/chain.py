@@ -60,6 +60,10 @@ class Chain:
             readings=replace(readings, tag=tag),
         )
 
+    def weighed(self, noise: NoiseParameters) -> "Chain":
+        """The same measurements under other noise."""
+        return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
+
 
 def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:
     """A run's stretches as chains."""

@@ -15,9 +15,13 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
 from calib.errors import CalibError
 from calib.noise import NoiseParameters
+from offline.covariance_parts import CovarianceParts, concatenated
 from offline.errors import OfflineError
 from offline.run import Detections, Positions, Run
 from offline.tag_pose import TagReadings, general_readings, upright_readings
+
+# What the covariance of an imported position without one is made of.
+POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -46,6 +50,7 @@ class Readings:
         tag: (M,) index into the tags of the run.
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
+        parts: what the covariance is made of.
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
     """
@@ -54,6 +59,7 @@ class Readings:
     tag: IntArray
     value: FloatArray
     covariance: FloatArray
+    parts: CovarianceParts
     polar: BoolArray
     in_camera: BoolArray
 
@@ -61,16 +67,21 @@ class Readings:
         """Number of readings."""
         return len(self.tag)
 
-    def where(self, mask: BoolArray) -> "Readings":
-        """Those of the mask."""
+    def where(self, mask: BoolArray | IntArray) -> "Readings":
+        """Those of a mask, or of indices."""
         return Readings(
             self.keyframe[mask],
             self.tag[mask],
             self.value[mask],
             self.covariance[mask],
+            self.parts.where(mask),
             self.polar[mask],
             self.in_camera[mask],
         )
+
+    def weighed(self, noise: NoiseParameters) -> "Readings":
+        """The same readings under other noise."""
+        return replace(self, covariance=self.parts.under(noise))
 
 
 def read_detections(
@@ -119,6 +130,7 @@ def read_detections(
             tag=tag[good],
             value=value[good],
             covariance=found.covariance[good],
+            parts=_corner_parts(found.where(good), noise.sigma_corner_px),
             polar=np.ones(int(good.sum()), dtype=np.bool_),
             in_camera=np.ones(int(good.sum()), dtype=np.bool_),
         ),
@@ -164,7 +176,10 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
     covariance[modelled, 0, 0] = noise.sigma_range_m**2 + (noise.sigma_range_per_m * range_m[modelled]) ** 2
     covariance[modelled, 1, 1] = noise.sigma_bearing_rad**2
     good &= _are_covariances(covariance)
-    readings = Readings(keyframe, positions.tag, value, covariance, positions.polar | unknown, positions.in_camera)
+    parts = _position_parts(range_m, modelled, covariance)
+    readings = Readings(
+        keyframe, positions.tag, value, covariance, parts, positions.polar | unknown, positions.in_camera
+    )
     if good.all():
         return readings, []
     left_out = (
@@ -188,18 +203,26 @@ def joined(a: Readings, b: Readings) -> Readings:
         np.concatenate([a.tag, b.tag]),
         np.concatenate([a.value, b.value]),
         np.concatenate([a.covariance, b.covariance]),
+        concatenated(a.parts, b.parts),
         np.concatenate([a.polar, b.polar]),
         np.concatenate([a.in_camera, b.in_camera]),
     )
-    order = np.argsort(both.keyframe, kind="stable")
-    return Readings(
-        both.keyframe[order],
-        both.tag[order],
-        both.value[order],
-        both.covariance[order],
-        both.polar[order],
-        both.in_camera[order],
+    return both.where(np.argsort(both.keyframe, kind="stable"))
+
+
+def _corner_parts(found: TagReadings, sigma_corner_px: float) -> CovarianceParts:
+    return CovarianceParts(
+        ("sigma_corner_px",), (found.covariance - found.rest)[None] / sigma_corner_px**2, found.rest.copy()
     )
+
+
+def _position_parts(range_m: FloatArray, modelled: BoolArray, covariance: FloatArray) -> CovarianceParts:
+    """Of imported positions: by the noise model, or as the log says."""
+    unit = np.zeros((len(POSITION_NOISE), len(range_m), 2, 2))
+    unit[0, modelled, 0, 0] = 1.0
+    unit[1, modelled, 0, 0] = range_m[modelled] ** 2
+    unit[2, modelled, 1, 1] = 1.0
+    return CovarianceParts(POSITION_NOISE, unit, np.where(modelled[:, None, None], 0.0, covariance))
 
 
 def check_tag_sizes(runs: Sequence[Run]) -> None:
@@ -268,4 +291,6 @@ def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tupl
 def _no_readings() -> Readings:
     empty_int = np.zeros(0, dtype=np.int64)
     empty_bool = np.zeros(0, dtype=np.bool_)
-    return Readings(empty_int, empty_int, np.zeros((0, 2)), np.zeros((0, 2, 2)), empty_bool, empty_bool)
+    none = np.zeros((0, 2, 2))
+    parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
+    return Readings(empty_int, empty_int, np.zeros((0, 2)), none, parts, empty_bool, empty_bool)

@@ -42,7 +42,7 @@ class TagReadings:
 
     Attributes:
         range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
-        covariance: (M, 2, 2) for the given corner sigma.
+        covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part of it that does not come from that.
         height_m: (M,) of the tag's centre above the camera.
         chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
@@ -50,6 +50,7 @@ class TagReadings:
 
     range_bearing: FloatArray
     covariance: FloatArray
+    rest: FloatArray
     height_m: FloatArray
     chi2: FloatArray
     valid: BoolArray
@@ -90,7 +91,9 @@ def upright_readings(
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
         information = jacobian.swapaxes(-1, -2) @ jacobian / sigma_corner_px**2
         covariance_full = _solve(information, np.broadcast_to(np.eye(_N_PARAMETERS), information.shape))
-        return _polar(parameters[:, :3], covariance_full[:, :3, :3], (residual**2).sum(-1) / sigma_corner_px**2)
+        covariance = covariance_full[:, :3, :3]
+        chi2 = (residual**2).sum(-1) / sigma_corner_px**2
+        return _polar(parameters[:, :3], covariance, np.zeros_like(covariance), chi2)
 
 
 def general_readings(
@@ -121,10 +124,9 @@ def general_readings(
         direction = centres / distance_m[:, None]
         across = (_GENERAL_ACROSS * distance_m * sigma_corner_px / camera.fx_px) ** 2
         along = (_GENERAL_ALONG * distance_m) ** 2
-        covariance = across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * (
-            direction[:, :, None] * direction[:, None, :]
-        )
-        return _polar(centres, covariance, chi2)
+        sight = direction[:, :, None] * direction[:, None, :]
+        rest = along[:, None, None] * sight
+        return _polar(centres, rest + across[:, None, None] * (np.eye(3) - sight), rest, chi2)
 
 
 def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray) -> FloatArray:
@@ -180,8 +182,8 @@ def _linearise(
     return (pixels - corners_px).reshape(m, 8), (d_pixel_d_point @ d_point).reshape(m, 8, _N_PARAMETERS)
 
 
-def _polar(centre_m: FloatArray, covariance: FloatArray, chi2: FloatArray) -> TagReadings:
-    """Centres (M, 3) in axes parallel to base, about the camera, with their covariance (M, 3, 3), as readings."""
+def _polar(centre_m: FloatArray, covariance: FloatArray, rest: FloatArray, chi2: FloatArray) -> TagReadings:
+    """Centres (M, 3) in axes parallel to base, about the camera, with their covariances (M, 3, 3), as readings."""
     x, y = centre_m[:, 0], centre_m[:, 1]
     range_m = np.hypot(x, y)
     jacobian = np.zeros((len(x), 2, 3))
@@ -189,7 +191,7 @@ def _polar(centre_m: FloatArray, covariance: FloatArray, chi2: FloatArray) -> Ta
     jacobian[:, 0, 1] = y / range_m
     jacobian[:, 1, 0] = -y / range_m**2
     jacobian[:, 1, 1] = x / range_m**2
-    polar_covariance = jacobian @ covariance @ jacobian.swapaxes(-1, -2)
+    polar_covariance, polar_rest = (jacobian @ each @ jacobian.swapaxes(-1, -2) for each in (covariance, rest))
     range_bearing = np.stack([range_m, np.arctan2(y, x)], axis=-1)
     valid = (
         np.isfinite(range_bearing).all(-1)
@@ -198,7 +200,7 @@ def _polar(centre_m: FloatArray, covariance: FloatArray, chi2: FloatArray) -> Ta
         & (polar_covariance[:, 1, 1] > 0.0)
         & np.isfinite(chi2)
     )
-    return TagReadings(range_bearing, polar_covariance, centre_m[:, 2], chi2, valid)
+    return TagReadings(range_bearing, polar_covariance, polar_rest, centre_m[:, 2], chi2, valid)
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:
