@@ -29,6 +29,7 @@ from calib.camera_model import CameraModel
 UNIT_CORNERS: Final[FloatArray] = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 _ITERATIONS: Final = 8
+_ARRIVED: Final = 1e-9  # m and rad: of a last step; the next one would be far smaller still
 _N_PARAMETERS: Final = 6  # c (3), u (2), rho
 # Sigmas of a general pose that its bias stays well below, down to 15 px of side: along the line of sight as a share of
 # the range, across it in sigmas of one corner.
@@ -83,11 +84,18 @@ def upright_readings(
     """
     with np.errstate(all="ignore"):
         parameters = _start(corners_px, sides_m, camera, R_base_camera)
+        moving = np.arange(len(parameters))
         for _ in range(_ITERATIONS):
-            residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
+            residual, jacobian = _linearise(
+                parameters[moving], corners_px[moving], sides_m[moving], camera, R_base_camera
+            )
             normal = jacobian.swapaxes(-1, -2) @ jacobian
             gradient = jacobian.swapaxes(-1, -2) @ residual[..., None]
-            parameters = parameters - _solve(normal, gradient)[..., 0]
+            step = _solve(normal, gradient)[..., 0]
+            parameters[moving] -= step
+            moving = moving[np.abs(step).max(axis=-1) > _ARRIVED]  # those without a solution stay as they are: NaN
+            if not len(moving):
+                break
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
         information = jacobian.swapaxes(-1, -2) @ jacobian / sigma_corner_px**2
         covariance_full = _solve(information, np.broadcast_to(np.eye(_N_PARAMETERS), information.shape))
