@@ -136,6 +136,40 @@ def salvage(
 
 
 @app.command()
+def detect(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder that holds pictures.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="New run folder, or new .mcap file.")],
+    family: Annotated[
+        list[str] | None, typer.Option(help="Family to look for; repeatable. [default: those in the log's robot.yaml]")
+    ] = None,
+    decimate: Annotated[
+        float, typer.Option(min=1.0, max=8.0, help="Search at a fraction of the picture's size; 1 finds the smallest.")
+    ] = 1.0,
+    detector: Annotated[
+        str | None, typer.Option(help="pupil-apriltags or pyapriltags. [default: as in the log's robot.yaml]")
+    ] = None,
+    drop_others: Annotated[
+        bool, typer.Option("--drop-others", help="Leave out the old detections of pictures that were not kept.")
+    ] = False,
+    processes: Annotated[int | None, typer.Option(min=1, help="[default: one for each core]")] = None,
+) -> None:
+    """Looks for tags again in the pictures of a log; writes a new log that keeps all else.
+
+    The old log is not touched. Exit 3: pictures are of no use, or the log is damaged; it is said what.
+    """
+    from offline.detect import DetectOptions, detect_again
+    from offline.progress import progress_bar
+
+    options = DetectOptions(tuple(family) if family else None, detector, decimate, drop_others, processes)
+    with progress_bar() as show:
+        report = detect_again(log, output, options, show)
+    for line in report.lines():
+        typer.echo(line)
+    if report.n_unusable or report.losses.n_lost:
+        raise typer.Exit(EXIT_WITH_LOSSES)
+
+
+@app.command()
 def compare(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")],
     truth: Annotated[Path | None, typer.Option(help="truth.json of the simulation.")] = None,

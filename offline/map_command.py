@@ -2,8 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
@@ -17,9 +16,10 @@ from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
 from offline.picture import write_picture
 from offline.pipeline import map_logs
+from offline.progress import progress_bar
 from offline.result import AlignmentResult, Component, MapResult
 from offline.run import RobotFile, read_robot_file
-from offline.stages import Progress, StageCost, Stages
+from offline.stages import StageCost, Stages
 from onboard.log_reader import find_logs
 
 
@@ -47,7 +47,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     _check_output(options.output, logs, overwrite=options.overwrite)
     robot_files = _read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
-    with compilation_announced(_say), _progress_bar() as show:
+    with compilation_announced(_say), progress_bar() as show:
         stages = Stages(show)
         result = map_logs(logs, robot_files, noise, stages)
         with folder_written_whole(options.output) as folder:
@@ -154,31 +154,3 @@ def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> Non
         raise OfflineError(
             f"-o {output}: --overwrite replaces maps only, and there is no {JSON_FILE} in it; name another folder"
         )
-
-
-@contextmanager
-def _progress_bar() -> Iterator[Progress]:
-    """A bar on a terminal, gone when done; nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield lambda _what, _done, _total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=None)
-        current = ""
-
-        def show(what: str, done: int, total: int) -> None:
-            nonlocal current
-            if what != current:
-                bar.reset(task)
-                current = what
-            if total == 1:
-                bar.update(task, description=what, total=None)  # a bar that moves and tells no share
-            else:
-                bar.update(task, description=f"{what} {done}/{total}", completed=done, total=total)
-
-        yield show

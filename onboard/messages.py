@@ -106,6 +106,7 @@ class EventKind(StrEnum):
     MESSAGE_REFUSED = "message_refused"
     DISK = "disk"
     SALVAGED = "salvaged"
+    DETECTED_AGAIN = "detected_again"
 
 
 def timestamp(stamp_ns: int) -> Timestamp:

@@ -193,7 +193,7 @@ class MortalDisk:
 def _write(content: bytearray, act: Act, rng: np.random.Generator | None) -> None:
     """A write whole; or, with `rng`, page by page: there, not there, or rubbish."""
     end = act.offset + len(act.data)
-    if rng is not None:
+    if rng is not None and rng.random() < 0.5:
         end = int(rng.integers(act.offset, end + 1))
     content.extend(b"\0" * max(0, end - len(content)))
     start = act.offset

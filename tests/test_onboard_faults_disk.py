@@ -74,7 +74,7 @@ def test_row_01b_a_power_cut_at_any_point(tmp_path: Path, count: int) -> None:
     """Everything older than a second is there, in whatever state the cut leaves the rest."""
     disk = MortalDisk()
     entries = drive(6.0, picture_hz=10, picture_bytes=9000)
-    keeper = make_keeper(Path("logs"), disk, SegmentLimits(2 * S, 1 << 40), pictures=True)
+    keeper = make_keeper(Path("logs"), disk, SegmentLimits(1700 * MS, 1 << 40), pictures=True)
     done_ns: list[int] = []  # by act: when it was done
     for at_ns in stepped(keeper, entries):
         done_ns += [at_ns] * (len(disk.acts) - len(done_ns))
@@ -131,6 +131,28 @@ def test_row_11_disk_full_in_mid_chunk(tmp_path: Path) -> None:
     assert [text for text in texts(keeper) if "recording again, in 0001.core.mcap" in text]
 
 
+class GreedyDisk(TroubledDisk):
+    """Somebody else takes whatever room there comes to be."""
+
+    def remove(self, path: Path) -> None:
+        super().remove(path)
+        self.capacity_bytes = self.used()
+
+
+def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
+    """The file cannot be finished, and still holds whole chunks only."""
+    disk = GreedyDisk(BALLAST_BYTES + 5 * MB)
+    entries = drive(6.0, picture_hz=10, picture_bytes=300_000)
+    keeper = make_keeper(tmp_path, disk, pictures=True)
+    for _ in stepped(keeper, entries):
+        pass
+    assert names(tmp_path / "run1") == ["0000.camera.mcap.active", f"{CORE}.active"]
+    found, losses = read_all(tmp_path / "run1")
+    assert set(found) < set(seen(entries))
+    assert len(losses.unfinished) == 2
+    assert not losses.n_lost
+
+
 def test_row_11_on_a_real_disk_that_is_full(tmp_path: Path) -> None:
     """A tmpfs of 30 MiB in a mount namespace of its own, where that is permitted."""
     script = f"""
@@ -165,6 +187,7 @@ def test_row_12_disk_full_from_the_start(tmp_path: Path) -> None:
             assert keeper.status.problem is not None
         elif at_ns == START_NS + 4 * S:
             disk.capacity_bytes = 1 << 40
+    assert keeper.status.problem is None
     keeper.finish(100.0)
     assert names(tmp_path / "run1") == [CORE]
     assert seen_in(tmp_path) == seen(entries)
@@ -243,6 +266,8 @@ def test_row_14_a_file_that_fails(tmp_path: Path, act: str, number: int) -> None
     keeper.finish(100.0)
     assert seen_in(tmp_path) == seen(entries)
     assert f"{CORE}.active" in names(tmp_path / "run1")
+    n_stored = sum(len(read_all(file)[0]) for file in (tmp_path / "run1").iterdir())
+    assert (n_stored > len(entries)) == (number == errno.EROFS and act == "sync")
     told = texts(keeper)
     assert any(os.strerror(number) in text for text in told)
     assert any(text.startswith("recording again") for text in told)

@@ -21,6 +21,7 @@ COMMANDS = [
     ("offline.cli", "import"),
     ("offline.cli", "info"),
     ("offline.cli", "salvage"),
+    ("offline.cli", "detect"),
     ("offline.cli", "compare"),
     ("fixtures.__main__",),
     ("fixtures.__main__", "simulate"),
