@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.robot import parse_robot_yaml
 from offline.errors import OfflineError
-from offline.new_log import new_log, synced
+from offline.new_log import new_log
 from offline.stages import Progress
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
 from onboard.log_losses import LogLosses
@@ -97,8 +97,6 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
         found = _detect_all(log, old, settings, options, report, progress)
         target = folder / output.name if output.suffix == ".mcap" else folder
         _write(log, target, old, found, options, report)
-        for file in folder.iterdir():
-            synced(file)
     return report
 
 

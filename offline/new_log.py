@@ -1,11 +1,12 @@
 """New logs made of old ones: there whole or not at all."""
 
 import os
-import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from calib.files import folder_written_whole
 from offline.errors import OfflineError
 
 
@@ -16,29 +17,31 @@ def new_log(output: Path) -> Iterator[Path]:
     If `output` ends in `.mcap`, it becomes the file of that name in the folder.
 
     Raises:
-        OfflineError: `output` exists, or it cannot be written.
+        GroundsbotError: `output` exists, or it cannot be written.
     """
     if os.path.lexists(output):
         raise OfflineError(f"{output}: exists already; nothing is written over, give another output")
-    folder = output.with_name(f".{output.name}.{os.getpid()}.partial")
-    try:
-        folder.mkdir(parents=True)
-        try:
+    if output.suffix != ".mcap":
+        with folder_written_whole(output) as folder:
             yield folder
-            made = folder / output.name if output.suffix == ".mcap" else folder
-            synced(folder)
-            made.rename(output)
-            synced(output.parent)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            _sync([*folder.iterdir(), folder])
+        return
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", suffix=".partial", dir=output.parent) as name:
+            folder = Path(name)
+            yield folder
+            _sync([folder / output.name])
+            (folder / output.name).rename(output)
+        _sync([output.parent])
     except OSError as error:
         raise OfflineError(f"{output}: cannot be written: {error.strerror or error}; choose another place") from error
 
 
-def synced(path: Path) -> None:
-    """Returns once a file or a folder's names are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _sync(paths: list[Path]) -> None:
+    """Returns once files and folders' names are on the disk: a power cut must not leave a name without its content."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -7,7 +7,7 @@ from pathlib import Path
 from google.protobuf.message import Message
 
 from offline.errors import OfflineError
-from offline.new_log import new_log, synced
+from offline.new_log import new_log
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, files_of, read_head, read_log
@@ -60,9 +60,6 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     names = {source: finished_name(source) if log.is_dir() else output.name for source in sources}
     with new_log(output) as folder:
         salvaged = [_salvaged(source, folder / name, head) for source, name in names.items()]
-        for each in salvaged:
-            if each.target is not None:
-                synced(each.target)
     return [each.placed(output / names[each.source] if log.is_dir() else output) for each in salvaged]
 
 
