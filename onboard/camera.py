@@ -26,7 +26,7 @@ class CameraEndedError(CameraLostError):
     """A video file is over; it does not come back."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # each is one of its kind
 class Frame:
     """One picture as it came; times on the run's clock."""
 

@@ -87,7 +87,7 @@ class LiveRecorder:
         self._served_s = time.monotonic()
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # for the core, in its thread
         self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
-        self._under_way = 0
+        self._under_way: dict[Frame, bool] = {}  # pictures in detection, and whether they are to be kept
         self._detector: ChildDetector | None = None
 
     def now_ns(self) -> int:
@@ -155,15 +155,15 @@ class LiveRecorder:
         end_ns = self._clock.now_ns() + _END_LIMIT_NS
         self._serve(
             lambda: (
-                (self._under_way > 0 or any(each.is_alive() for each in threads) or not self._work.empty())
+                (self._under_way or any(each.is_alive() for each in threads) or not self._work.empty())
                 and self._clock.now_ns() < end_ns
             )
         )
         while not self._work.empty():  # only if time ran out
             self._work.get()()
-        if self._under_way:
+        for frame, is_wanted in self._under_way.items():
             reason = f"pictures: detection had not ended {_END_LIMIT_NS / _NS_PER_S:g} s after the stop"
-            self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, self._clock.now_ns(), self._under_way)
+            self._undetected(frame, is_wanted, reason, self._clock.now_ns())
 
     def _device_threads(self) -> list[DeviceThread]:
         files, devices = self.files, self.files.robot.devices
@@ -205,21 +205,23 @@ class LiveRecorder:
     def _detect(self, frame: Frame, _now_ns: int) -> None:
         if self._detector is None:
             return
-        self._under_way += 1
-        want_jpeg = self.core.wants_picture(frame.stamp_ns)
+        self._under_way[frame] = want_jpeg = self.core.wants_picture(frame.stamp_ns)
         self._detector.submit(
             frame.picture, want_jpeg, lambda result: self._put(partial(self._detected, frame, result))
         )
 
     def _drop(self, frame: Frame, now_ns: int) -> None:
-        """Keeps the picture of a dropped frame where one is due: its tags can be found later."""
-        picture, wanted = frame.picture, self.core.wants_picture(frame.stamp_ns)
-        if wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
+        self._undetected(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
+
+    def _undetected(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
+        """Keeps the picture alone, where it is one to keep: its tags can be found later."""
+        picture = frame.picture
+        if is_wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
             self.core.on_picture(picture, frame.stamp_ns, frame.receive_ns)
-        self.core.on_frames_lost(EventKind.FRAME_DROPPED, "pictures: detection is too slow", now_ns)
+        self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, now_ns)
 
     def _detected(self, frame: Frame, result: DetectionResult, now_ns: int) -> None:
-        self._under_way -= 1
+        self._under_way.pop(frame)
         self._slots.release()
         if self._detector is None:
             return

@@ -23,6 +23,7 @@ from onboard.messages import StampSource
 from onboard.picture import is_jpeg
 from onboard.picture_folder import FolderCamera
 from onboard.v4l2_camera import V4l2Camera
+from tests.fake_capture import FakeCapture
 from tests.tag_pictures import draw_tag
 
 MS = 1_000_000
@@ -117,57 +118,41 @@ def test_a_video_file_is_played_once(tmp_path: Path) -> None:
     camera.close()
 
 
-class FakeCapture:
-    """Stands in for cv2.VideoCapture of a camera that keeps its own size and stamps by the monotonic clock."""
-
-    def __init__(self, late_ms: float) -> None:
-        self.late_ms = late_ms
-        self.stamp_ms = 0.0
-
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, _setting: int, _value: float) -> bool:
-        return True
-
-    def get(self, setting: int) -> float:
-        if setting == cv2.CAP_PROP_POS_MSEC:
-            return self.stamp_ms
-        sizes = {cv2.CAP_PROP_FRAME_WIDTH: 640.0, cv2.CAP_PROP_FRAME_HEIGHT: 480.0}
-        return sizes.get(setting, 15.0 if setting == cv2.CAP_PROP_FPS else float(cv2.VideoWriter.fourcc(*"MJPG")))
-
-    def read(self) -> tuple[bool, "np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]"]:
-        self.stamp_ms = time.monotonic_ns() // MS - self.late_ms
-        return True, np.zeros((480, 640, 3), np.uint8)
-
-    def release(self) -> None:
-        return
-
-
-@pytest.mark.parametrize(
-    ("late_ms", "source"),
-    [
-        (20.0, StampSource.STAMP_SOURCE_CAMERA),
-        (-50.0, StampSource.STAMP_SOURCE_ARRIVAL),
-        (1e7, StampSource.STAMP_SOURCE_ARRIVAL),
-    ],
-)
-def test_a_drivers_stamp_is_believed_only_when_sane(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late_ms: float, source: int
+@pytest.mark.parametrize("padding", [0, 5000])
+def test_a_cameras_jpeg_is_taken_as_it_comes_and_what_it_would_not_be_set_to_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, padding: int
 ) -> None:
-    clock, capture = RunClock(), FakeCapture(late_ms)
+    clock, capture = RunClock(), FakeCapture([JPEG], padding=padding)
     device = tmp_path / "video0"
     device.touch()
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: capture)
-    camera: Camera = V4l2Camera(CameraSettings(str(device), 1280, 720, 15.0, exposure_s=0.008), clock)
-    refused = camera.open()
-    assert "width_px is 640, asked for 1280" in refused
-    assert "height_px is 480, asked for 720" in refused
+    camera: Camera = V4l2Camera(CameraSettings(str(device), 1280, 720, 15.0, exposure_s=0.008, gain=3.0), clock)
+    assert camera.open() == ["width_px is 160, asked for 1280", "height_px is 120, asked for 720"]
+    assert capture.settings[cv2.CAP_PROP_CONVERT_RGB] == 0.0
+    assert capture.settings[cv2.CAP_PROP_EXPOSURE] == 80.0  # of 0.1 ms
+    assert next(iter(capture.settings)) == cv2.CAP_PROP_FOURCC
     (frame,) = camera.read(1.0)
-    assert frame.source == source
-    if source == StampSource.STAMP_SOURCE_CAMERA:
-        assert frame.stamp_ns == clock.from_monotonic(round(capture.stamp_ms * MS)) + 4 * MS  # half the exposure later
+    assert frame.picture == JPEG
+    assert frame.source == StampSource.STAMP_SOURCE_CAMERA
+    driver_ns = clock.from_monotonic(round(capture.get(cv2.CAP_PROP_POS_MSEC) * MS))
+    assert frame.stamp_ns == driver_ns + 4 * MS  # half the exposure later
     camera.close()
+    assert capture.released == 1
+
+
+@pytest.mark.parametrize(("name", "grey_at"), [("YUYV", 0), ("UYVY", 1)])
+def test_of_yuv_only_the_grey_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, grey_at: int
+) -> None:
+    raw = np.full((120, 160, 2), 128, np.uint8)
+    raw[:, :, grey_at] = TAG_PICTURE
+    capture = FakeCapture([raw], fourcc=float(cv2.VideoWriter.fourcc(*name)))
+    (tmp_path / "video0").touch()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: capture)
+    camera = V4l2Camera(CameraSettings(str(tmp_path / "video0"), 160, 120, 15.0), RunClock())
+    assert camera.open() == [f"format is {name}, asked for MJPG: kept pictures are encoded here"]
+    (frame,) = camera.read(1.0)
+    np.testing.assert_array_equal(np.asarray(frame.picture), TAG_PICTURE)
 
 
 def test_an_absent_camera_is_waited_for() -> None:

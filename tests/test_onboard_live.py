@@ -1,13 +1,10 @@
 """The recorder as a process of its own: wheels through a pseudo terminal, pictures through a folder."""
 
-import os
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
-import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,49 +14,20 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera_model import CameraModel, write_camera_yaml
-from onboard.encoder_protocol import WheelLine, format_line
+from fixtures.devices import PtyPort, wheel_line
 from onboard.log_reader import find_logs, read_log, read_run_info
 from onboard.messages import Event, TagDetections, WheelEncoders
+from tests.live_recording import CORNERS, robot_yaml
 from tests.tag_pictures import draw_tag
 
-CAMERA = CameraModel("front", 160, 120, 150.0, 150.0, 79.5, 59.5, "plumb_bob", (0.0,) * 5)
-CORNERS = np.array([[50.0, 30.0], [110.0, 32.0], [108.0, 92.0], [52.0, 90.0]])
 MS = 1_000_000
 
 
-def robot_yaml(folder: Path, devices: str, recorder: str = "{picture_rate_hz: 5}") -> Path:
-    write_camera_yaml(CAMERA, folder / "camera.yaml")
-    path = folder / "robot.yaml"
-    path.write_text(f"""
-robot_id: gb1
-wheels: {{radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}}
-camera: camera.yaml
-devices: {devices}
-recorder: {recorder}
-""")
-    return path
-
-
-class FakePort:
-    """A pseudo terminal with a name that stays, as udev gives a port one."""
-
-    def __init__(self, link: Path) -> None:
-        self.master, slave = os.openpty()
-        tty.setraw(slave, termios.TCSANOW)
-        link.unlink(missing_ok=True)
-        link.symlink_to(os.ttyname(slave))
-        os.close(slave)
-
-    def send(self, index: int, boot_id: int = 3) -> int:
-        """Sends line `index`; returns the monotonic time of its measurement. The clock runs 200 ppm fast."""
-        now_ns = time.monotonic_ns()
-        t_us = now_ns // 1000 + now_ns // 5_000_000 + 77
-        os.write(self.master, format_line(WheelLine(boot_id, index, t_us, 5 * index, 6 * index, 0)))
-        return now_ns
-
-    def unplug(self) -> None:
-        os.close(self.master)
+def send(port: PtyPort, index: int) -> int:
+    """Sends line `index`; returns the monotonic time of its measurement."""
+    now_ns = time.monotonic_ns()
+    port.send(wheel_line(index, now_ns))
+    return now_ns
 
 
 @contextmanager
@@ -84,12 +52,12 @@ def wait_for(output: IO[str] | None, *words: str) -> list[str]:
     return lines
 
 
-def feed_wheels(port: FakePort, seconds: float) -> list[int]:
+def feed_wheels(port: PtyPort, seconds: float) -> list[int]:
     start = time.monotonic()
     measured = []
     for index in range(round(seconds * 100)):
         time.sleep(max(0.0, start + index * 0.01 - time.monotonic()))
-        measured.append(port.send(index))
+        measured.append(send(port, index))
     return measured
 
 
@@ -118,7 +86,7 @@ def test_a_live_recording_has_every_line_and_picture_on_one_clock(tmp_path: Path
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     (pictures / "1000.png").write_bytes(b"an old one, left alone")
-    port = FakePort(tmp_path / "wheels")
+    port = PtyPort(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     exposed: list[int] = []
     with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
@@ -156,13 +124,13 @@ def test_a_live_recording_has_every_line_and_picture_on_one_clock(tmp_path: Path
 def test_what_the_devices_hold_when_recording_ends_belongs_to_it(tmp_path: Path) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    port = FakePort(tmp_path / "wheels")
+    port = PtyPort(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     picture = cv2.imencode(".png", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
     with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
         wait_for(process.stdout, "port_connected", "camera_connected")
         for index in range(60):
-            port.send(index)
+            send(port, index)
         for _ in range(20):
             (pictures / f"{time.time_ns()}.png").write_bytes(picture)
         process.send_signal(signal.SIGTERM)
@@ -178,17 +146,17 @@ def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path) -> None:
     robot = robot_yaml(tmp_path, f"{{encoder_port: {link}}}")
     with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
         wait_for(process.stdout, "waiting for the wheels")  # absent at the start
-        port = FakePort(link)
+        port = PtyPort(link)
         wait_for(process.stdout, "port_connected")
         for index in range(20):
-            port.send(index)
+            send(port, index)
         time.sleep(0.2)
         port.unplug()
         wait_for(process.stdout, "port_lost")
-        port = FakePort(link)
+        port = PtyPort(link)
         wait_for(process.stdout, "port_connected")
         for index in range(30, 50):  # ten were sent while nobody listened
-            port.send(index)
+            send(port, index)
         time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=10)
@@ -207,7 +175,7 @@ def test_check_tells_of_each_device(tmp_path: Path) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     cv2.imwrite(str(pictures / f"{time.time_ns()}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
-    port = FakePort(tmp_path / "wheels")
+    port = PtyPort(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     with program("check", "--robot", robot) as process:
         feeder = threading.Thread(target=feed_wheels, args=(port, 5.0))

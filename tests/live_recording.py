@@ -1,0 +1,153 @@
+"""The real recorder in a thread of the test, on devices without hardware."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.camera_model import CameraModel, write_camera_yaml
+from fixtures.devices import PtyPort, wheel_line
+from onboard.live_recorder import LiveRecorder
+from onboard.messages import Event
+from onboard.robot_files import RobotFiles
+from tests.tag_pictures import draw_tag
+
+CAMERA = CameraModel("front", 160, 120, 150.0, 150.0, 79.5, 59.5, "plumb_bob", (0.0,) * 5)
+CORNERS = np.array([[50.0, 30.0], [110.0, 32.0], [108.0, 92.0], [52.0, 90.0]])
+_PATIENCE_S = 20.0
+
+
+def tag_jpeg() -> bytes:
+    """A picture of tag36h11 9, as large as the calibration says."""
+    return cv2.imencode(".jpg", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
+
+
+def robot_yaml(folder: Path, devices: str, recorder: str = "{picture_rate_hz: 5}") -> Path:
+    """Writes robot.yaml and camera.yaml."""
+    write_camera_yaml(CAMERA, folder / "camera.yaml")
+    path = folder / "robot.yaml"
+    path.write_text(f"""
+robot_id: gb1
+wheels: {{radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}}
+camera: camera.yaml
+devices: {devices}
+recorder: {recorder}
+""")
+    return path
+
+
+def until(true: Callable[[], bool], what: str) -> None:
+    """Waits for something that is to come."""
+    end_s = time.monotonic() + _PATIENCE_S
+    while not true():
+        assert time.monotonic() < end_s, f"never came: {what}"
+        time.sleep(0.005)
+
+
+class Recording:
+    """A recording under way."""
+
+    def __init__(self, robot: Path, output: Path) -> None:
+        self.events: list[Event] = []
+        self.notices: list[str] = []
+        self.stop = threading.Event()
+        self.recorder = LiveRecorder(RobotFiles(robot), output, self.stop, self.events.append, self.notices.append)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        try:
+            self.recorder.run()
+        except BaseException as error:
+            self._error = error
+
+    def start(self) -> None:
+        self._thread.start()
+        until(lambda: self.recorder.begun.is_set() or self._error is not None, "a beginning")
+        self._raise()
+
+    def end(self, limit_s: float = _PATIENCE_S) -> None:
+        """Stops it; fails where it does not end within the limit."""
+        self.stop.set()
+        self._thread.join(limit_s)
+        assert not self._thread.is_alive(), f"did not end within {limit_s} s"
+        self._raise()
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    @property
+    def log(self) -> Path:
+        return self.recorder.core.folder
+
+    @property
+    def losses(self) -> dict[str, int]:
+        return dict(self.recorder.core.losses)
+
+    def count(self, kind: str) -> int:
+        """Events of a kind so far."""
+        return sum(event.kind == kind for event in list(self.events))
+
+    def wait_for(self, kind: str, times: int = 1) -> None:
+        """Waits until so many events of a kind have come."""
+        until(lambda: self.count(kind) >= times, f"{times} {kind}")
+
+    def wait_for_messages(self, topic: str, times: int) -> None:
+        """Waits until so many messages of a topic have come."""
+        until(lambda: self.recorder.core.counts[topic] >= times, f"{times} {topic}")
+
+
+@contextmanager
+def recording(robot: Path, output: Path) -> Iterator[Recording]:
+    """Records while the block runs."""
+    made = Recording(robot, output)
+    made.start()
+    try:
+        yield made
+    finally:
+        made.end()
+
+
+class Driver:
+    """Sends lines at 100 Hz into whatever port is plugged in, from a thread."""
+
+    def __init__(self, link: Path, rate_hz: float = 100.0) -> None:
+        self.port: PtyPort | None = None
+        self.sent = 0
+        self._link = link
+        self._period_s = 1.0 / rate_hz
+        self._over = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._drive, daemon=True)
+
+    def plug_in(self) -> str:
+        """Returns the name that the port has this time."""
+        with self._lock:
+            self.port = PtyPort(self._link)
+            return self.port.name
+
+    def unplug(self) -> None:
+        with self._lock:
+            assert self.port is not None
+            self.port.unplug()
+            self.port = None
+
+    def _drive(self) -> None:
+        while not self._over.wait(self._period_s):
+            with self._lock:
+                if self.port is not None:
+                    self.port.send(wheel_line(self.sent, time.monotonic_ns()))
+            self.sent += 1
+
+    def __enter__(self) -> "Driver":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
