@@ -102,9 +102,10 @@ def summary(result: MapResult, output: Path) -> list[str]:
 
 def stage_lines(costs: Sequence[StageCost]) -> list[str]:
     """What each stage took, as a table."""
-    lines = [f"{'stage':<28}{'seconds':>8}  peak MiB"]
-    for name, seconds, peak_mib in costs:
-        lines.append(f"{name:<28}{seconds:8.2f}" + ("" if peak_mib is None else f"{peak_mib:10.0f}"))
+    lines = [f"{'stage':<28}{'seconds':>8}{'of CPU':>8}{'peak MiB':>10}"]
+    for name, seconds, cpu_seconds, peak_mib in costs:
+        peak = "" if peak_mib is None else f"{peak_mib:10.0f}"
+        lines.append(f"{name:<28}{seconds:8.2f}{cpu_seconds:8.2f}{peak}")
     return lines
 
 

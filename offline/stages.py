@@ -17,6 +17,7 @@ class StageCost(NamedTuple):
 
     name: str
     seconds: float
+    cpu_seconds: float  # of them this process was at work, on all its threads
     peak_mib: float | None  # the most memory that the process held until the stage's end; None where no kernel tells
 
 
@@ -39,12 +40,13 @@ class Stages:
             self._tell(name, done, total)
 
         self._tell(name, 0, total)
-        began_s = time.perf_counter()
+        before = self._costs.get(name, StageCost(name, 0.0, 0.0, None))
+        began_s, began_cpu_s = time.perf_counter(), time.process_time()
         try:
             yield tick
         finally:
-            before_s = self._costs[name].seconds if name in self._costs else 0.0
-            self._costs[name] = StageCost(name, before_s + time.perf_counter() - began_s, _peak_mib())
+            seconds, cpu_seconds = time.perf_counter() - began_s, time.process_time() - began_cpu_s
+            self._costs[name] = StageCost(name, before.seconds + seconds, before.cpu_seconds + cpu_seconds, _peak_mib())
 
     @property
     def costs(self) -> tuple[StageCost, ...]:
