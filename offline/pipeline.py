@@ -14,6 +14,7 @@ from offline.observations import check_tag_sizes
 from offline.result import AlignmentResult, CalibrationResult, Component, MapResult
 from offline.run import RobotFile, Run, load_run
 from offline.stages import Stages
+from offline.weak_parts import weak_parts
 
 # A good calibration goes beyond this once in 16,000 times.
 MAX_PRIOR_SIGMAS: Final = 4.0
@@ -79,6 +80,7 @@ def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> Map
             calibration.extend(calibration_of(graph, solution, i))
         if not solution.converged:
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
+        warnings += weak_parts(graph, solution)
     warnings += _calibration_warnings(calibration)
     warnings += _alignment_warnings(maps, pairs) + _chain_warnings(chains) + _reasons_apart(maps, groups, pairs)
     return MapResult(
@@ -149,6 +151,8 @@ def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
     for chain in chains:
         if float(chain.odometry.distance_m.sum()) < 0.05:
             warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
+        if not chain.tags and len(chains) == 1:
+            warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
         if len(chain.tags) == 1:
             warnings.append(
                 f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two are needed to join it to a run"
