@@ -33,11 +33,10 @@ class CovarianceParts:
         return CovarianceParts(self.names, self.unit[:, which], self.rest[which])
 
     def of(self, names: tuple[str, ...]) -> FloatArray:
-        """(len(names), M, n, n) unit matrices in the order of these names; zero for those that have no part."""
-        unit = np.zeros((len(names), *self.rest.shape))
-        for name, matrices in zip(self.names, self.unit, strict=True):
-            unit[names.index(name)] = matrices
-        return unit
+        """(len(names), M, n, n) unit matrices by names in another order; zero for those that have no part."""
+        own = dict(zip(self.names, self.unit, strict=True))
+        none = np.zeros_like(self.rest)
+        return np.stack([own.get(name, none) for name in names]) if names else np.zeros((0, *self.rest.shape))
 
 
 def concatenated(a: CovarianceParts, b: CovarianceParts) -> CovarianceParts:

@@ -35,6 +35,8 @@ MAX_SHARE_LEFT_OUT: Final = 0.05
 _UPRIGHT_DOF: Final = 2
 _MEDIAN_CHI2: Final = float(2.0 * np.log(2.0))  # of two degrees of freedom
 _FALSE_ALARM: Final = 1e-6
+# By so many the level of a sigma that was given is known to some 15 %; by fewer, a lucky few could make it too small.
+_READINGS_FOR_LEVEL: Final = 100
 # A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its own general
 # pose, which has as many degrees of freedom, is said to hang askew. A camera whose roll is a degree off stays below it;
 # a tag that leans by half a right angle and is seen from a few metres does not.
@@ -109,7 +111,7 @@ def read_detections(
     keyframe, tag, corners_px = _averaged(keyframe[known], detections.tag[known], detections.corners_px[known])
     if not len(tag):
         return _no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
-    found, is_askew = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
+    found, is_askew, level = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in np.unique(tag[is_askew])
@@ -118,7 +120,7 @@ def read_detections(
     # From base's axes to the camera's yaw, about which all readings in_camera are.
     value = np.stack([range_m, se2.wrap_angle(found.range_bearing[:, 1] - run.robot.mount.yaw_rad)], axis=-1)
     with np.errstate(invalid="ignore"):
-        sure = found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
+        sure = min(level, 1.0) * found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
         good = found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew)
     if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
         warnings.append(
@@ -140,20 +142,24 @@ def read_detections(
 
 def _upright_or_askew(
     run: Run, camera: CameraModel, tag: IntArray, corners_px: FloatArray, sigma_corner_px: float
-) -> tuple[TagReadings, BoolArray]:
-    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; and (M,) which those are."""
+) -> tuple[TagReadings, BoolArray, float]:
+    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are; level.
+
+    The level is how many times the corners' variance is what it is said to be.
+    """
     seen, index = np.unique(tag, return_inverse=True)
     sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
     rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
     upright = upright_readings(corners_px, sides_m, camera, rotation, sigma_corner_px)
-    doubted = np.isin(tag, _doubted(tag, upright.chi2))
+    level = _level(upright.chi2)
+    doubted = np.isin(tag, _doubted(tag, upright.chi2 / min(level, 1.0)))
     general = upright.replaced(
         doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, sigma_corner_px)
     )
     is_askew = np.isin(tag, _askew(tag, upright.chi2, general.chi2, doubted))
-    spoilt = _spoilt(upright.chi2, is_askew)
+    spoilt = ~is_askew & ~(upright.chi2 < _level(upright.chi2[~is_askew]) * chdtri(_UPRIGHT_DOF, _FALSE_ALARM))
     found = upright.replaced(is_askew, general.where(is_askew))
-    return replace(found, valid=found.valid & ~spoilt), is_askew
+    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, level
 
 
 def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
@@ -271,11 +277,13 @@ def _askew(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, do
     return np.flatnonzero(upright > _ASKEW_FACTOR * np.maximum(general, 1.0))
 
 
-def _spoilt(upright_chi2: FloatArray, is_askew: BoolArray) -> BoolArray:
-    """(M,) readings of upright tags whose corners no tag has, by the level of the run's residuals."""
-    finite = upright_chi2[np.isfinite(upright_chi2) & ~is_askew]
-    level = max(1.0, float(np.median(finite)) / _MEDIAN_CHI2) if len(finite) else 1.0
-    return np.asarray(~is_askew & ~(upright_chi2 < level * chdtri(_UPRIGHT_DOF, _FALSE_ALARM)))
+def _level(chi2: FloatArray) -> float:
+    """How many times residuals of readings, most of them good, are what the corners' sigma makes expect."""
+    finite = chi2[np.isfinite(chi2)]
+    if not len(finite):
+        return 1.0
+    level = float(np.median(finite)) / _MEDIAN_CHI2
+    return level if len(finite) >= _READINGS_FOR_LEVEL else max(1.0, level)
 
 
 def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

@@ -81,7 +81,8 @@ class FittedVariances:
         log_covariance: (K, K) of the logarithms, the prior included.
         redundancy: (K,) of how many squares of its own each sigma is the mean: one over twice the variance of its
             logarithm, the prior's share taken off.
-        told: (K,) whether the data say enough of it; else it stands where it began, unless they speak against that.
+        told: (K,) whether the data say enough of it; else it stands where it began, or where they are more content
+            with if that is more, unless they speak against that.
         states: of the parts, solved under these sigmas.
     """
 
@@ -101,7 +102,7 @@ class FittedVariances:
 def fit_variances(parts: Sequence[Part], sigma: FloatArray) -> FittedVariances:
     """Fits K sigmas to all parts at once, from `sigma` (K,), which is also the middle of the prior.
 
-    Sigmas of which the data say next to nothing are put back to where they began, unless the data speak against it.
+    Sigmas of which the data say next to nothing are put back up to where they began, unless the data speak against it.
 
     Raises:
         UnderDeterminedError: a part has something that nothing ties down.
@@ -111,10 +112,11 @@ def fit_variances(parts: Sequence[Part], sigma: FloatArray) -> FittedVariances:
     fitted = search.log_sigma.copy()
     told = search.redundancy() >= _LEAST_REDUNDANCY
     if not told.all():
-        search.log_sigma = np.where(told, fitted, search.middle)
+        # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
+        search.log_sigma = np.where(told, fitted, np.maximum(fitted, search.middle))
         search.look()
         contradicted = -search.score > _CONTRADICTED * np.sqrt(2.0 * np.maximum(search.expected, 1e-300))
-        search.log_sigma = np.where(told | contradicted, fitted, search.middle)
+        search.log_sigma = np.where(contradicted, fitted, search.log_sigma)
         converged &= search.run(told)
     return FittedVariances(
         np.exp(search.log_sigma), search.covariance(), search.redundancy(), told, tuple(search.states), converged
