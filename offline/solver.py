@@ -195,7 +195,7 @@ def solve(
       the cost by no more than the tolerance. At an optimum that is before the first step.
     - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
     - "stopped after 100 steps".
-    - "a variable is in no factor": or something in the factors is no number.
+    - "a variable is in no factor", "the cost is no number at the start".
 
     What nothing ties down stays where it was: damping holds it.
 
@@ -218,6 +218,8 @@ def solve(
     def ended(reason: str, *, converged: bool) -> Solution:
         return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
 
+    if not np.isfinite(cost):
+        return ended("the cost is no number at the start", converged=False)
     for _ in range(_MAX_ITERATIONS):
         try:
             factorisation, used = _factorised(arrowhead, system, max(damping, floor), rows)

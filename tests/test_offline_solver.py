@@ -1,5 +1,7 @@
 """The solve: the same optimum as plain dense algebra, from any start nearby, with covariances and scale to believe."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,17 +9,18 @@ from calib import se2, wheels
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline.chain import chains_of
-from offline.factors import State
+from offline.factors import OdometryFactors, State
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import WheelTrack, chained
-from offline.robust import losses_and_weights
+from offline.robust import cauchy, losses_and_weights
 from offline.run import TagKey
-from offline.solver import DEFAULT_LOSSES, Problem, solve
+from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, START_NS, made_positions, made_robot, made_run
-from tests.made_problems import made_problem, random_state
+from tests.made_problems import CHAINS, N_TAGS, made_problem, random_state
 
 SEEDS = range(3)
+ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
 
 
 def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
@@ -124,6 +127,65 @@ def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
     solution = solve(made.problem, random_state(seed, made.truth, spread=0.1))
     assert solution.cost < 1e-12
     assert distance(made.problem, solution.state, made.truth) < 1e-7
+
+
+@pytest.mark.parametrize("losses", [DEFAULT_LOSSES, PLAIN_SQUARES, Losses(cauchy(3.0), cauchy(3.0))], ids=str)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
+    """One linearisation, no step: by the linear model there is nothing left to win."""
+    made = made_problem(seed, n_outliers=4)
+    found = solve(made.problem, made.truth, losses=losses)
+    assert found.converged
+    again = solve(made.problem, found.state, losses=losses)
+    assert (again.reason, again.converged, again.costs, again.n_linearised) == ("converged", True, (found.cost,), 1)
+    np.testing.assert_array_equal(again.state.poses, found.state.poses)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_truth_of_exact_measurements_is_left_alone(seed: int) -> None:
+    made = made_problem(seed, noise=0.0, true_calibration=True)
+    found = solve(made.problem, made.truth)
+    assert found.converged
+    assert found.n_linearised == 1
+
+
+def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
+    made = made_problem(0)
+    value = made.problem.readings.value.copy()
+    value[3] = np.nan
+    spoilt = replace(made.problem, readings=replace(made.problem.readings, value=value))
+    found = solve(spoilt, made.truth)
+    assert not found.converged
+    assert found.reason == "the cost is no number at the start"
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_neither_order_of_chains_nor_of_tags_matters(seed: int) -> None:
+    """The same factors and the same held pose, everything numbered anew."""
+    made = made_problem(seed, n_outliers=2)
+    problem, truth = made.problem, made.truth
+    rng = np.random.default_rng(seed)
+    n_first, n_poses = CHAINS[0], sum(CHAINS)
+    new_pose = np.concatenate([np.arange(n_first) + n_poses - n_first, np.arange(n_poses - n_first)])
+    new_tag = rng.permutation(N_TAGS)
+    old_pose, old_tag = np.argsort(new_pose), np.argsort(new_tag)
+    order = np.argsort(new_pose[problem.odometry.first])
+    odometry = OdometryFactors(**{name: getattr(problem.odometry, name)[order] for name in ODOMETRY_FIELDS})
+    readings = problem.readings
+    mixed = Problem(
+        replace(odometry, first=new_pose[odometry.first]),
+        replace(readings, pose=new_pose[readings.pose], tag=new_tag[readings.tag]),
+        problem.prior,
+        replace(problem.columns, poses=problem.columns.poses[old_pose], tags=problem.columns.tags[old_tag]),
+        new_pose[problem.anchor[old_tag]],
+    )
+    start = random_state(seed, truth, spread=0.1)
+    one = solve(problem, start)
+    other = solve(mixed, State(start.poses[old_pose], start.tags[old_tag], start.calibration))
+    assert one.converged
+    assert other.converged
+    back = State(other.state.poses[new_pose], other.state.tags[new_tag], other.state.calibration)
+    assert distance(problem, one.state, back) < 1e-6
 
 
 # An eight past twelve tags, true to its calibration. Readings are so sharp that they show the wheels' noise: what is
