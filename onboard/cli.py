@@ -10,6 +10,8 @@ from calib.command_line import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
 if TYPE_CHECKING:
     from onboard.messages import Event
 
+PRIORITY = -10  # the recorder's among the processes of its computer, as `nice` counts
+
 app = new_app("Record a drive of a robot: wheels, camera and the tags it sees, on one clock.")
 
 RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The robot's robot.yaml.")]
@@ -32,6 +34,8 @@ def record(
 
     Exit code 0: nothing was lost; 3: something was, said in words and in the log.
     """
+    import contextlib
+    import os
     import signal
     import threading
 
@@ -45,6 +49,8 @@ def record(
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(each) is not signal.SIG_IGN:
             signal.signal(each, lambda *_: stop.set())
+    with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
+        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
     path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
 

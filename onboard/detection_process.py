@@ -2,11 +2,12 @@
 
 import ctypes
 import multiprocessing
+import os
 import queue
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Final, NamedTuple
@@ -184,6 +185,8 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
     for each in (signal.SIGINT, signal.SIGTERM):  # the parent decides when recording ends
         signal.signal(each, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, 0)  # the recorder goes first, also where it is allowed to be in a hurry
     # A detection that hangs would not notice that its parent was killed.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
     import cv2

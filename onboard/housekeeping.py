@@ -63,8 +63,6 @@ class Housekeeper(threading.Thread):
         self._notifier.ready()
         while not self._over.wait(self._period_s):
             state: Literal["recording", "stopping"] = "stopping" if self._recorder.is_stopping else "recording"
-            if state == "stopping":
-                self._notifier.stopping()
             status = self._look(state)
             write_status(status, self._path)
             text = "; ".join(status.problems) or f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
@@ -75,6 +73,7 @@ class Housekeeper(threading.Thread):
 
     def end(self) -> None:
         """Writes the last status; the recording is closed, or never began."""
+        self._notifier.stopping()
         self._over.set()
         self.join(2.0 * self._period_s)
         if self._recorder.begun.is_set() and not self.is_alive():  # else its disk blocks

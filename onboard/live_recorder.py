@@ -53,7 +53,7 @@ class LiveRecorder:
         begun: set once both are there.
         files: the robot.
         output: where run folders go.
-        start_ns: on the run's clock.
+        start_ns: on the run's clock, once it has begun.
     """
 
     core: RecorderCore
@@ -83,7 +83,7 @@ class LiveRecorder:
         self._on_event = on_event
         self._on_notice = on_notice
         self._clock = RunClock()
-        self.start_ns = self._clock.now_ns()
+        self.start_ns = 0
         self._served_s = time.monotonic()
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # for the core, in its thread
         self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
@@ -113,6 +113,7 @@ class LiveRecorder:
         files = self.files
         if files.camera_settings is not None:
             self._detector = ChildDetector(files.detector_settings, self._detector_restarted)
+        self.start_ns = self._clock.now_ns()  # only now: what came before, nobody listened to
         try:
             run = Run(
                 files.robot,

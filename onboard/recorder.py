@@ -41,6 +41,7 @@ _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a m
 _WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s
 _CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
 _WAIT_FOR_WHEELS_NS: Final = 500_000_000
+_PICTURE_JITTER: Final = 0.4  # of the period between pictures to keep: how early one may be
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
 
@@ -257,7 +258,7 @@ class RecorderCore:
             return False
         period_ns = round(_NS_PER_S / self._options.picture_rate_hz)
         late_ns = stamp_ns - self._next_picture_ns
-        if late_ns < -period_ns // 10:  # stamps jitter
+        if late_ns < -_PICTURE_JITTER * period_ns:
             return False
         self._next_picture_ns = stamp_ns + period_ns if late_ns > period_ns else self._next_picture_ns + period_ns
         return True

@@ -5,6 +5,7 @@ from pathlib import Path
 from calib.camera_model import CameraModel
 from calib.robot import parse_robot_yaml
 from onboard.encoder_protocol import WheelLine, format_line
+from onboard.log_losses import LogLosses
 from onboard.log_reader import read_log
 from onboard.messages import Event, TagDetections, WheelEncoders
 from onboard.recorder import RecorderCore, Run
@@ -13,7 +14,7 @@ ROBOT_YAML = """
 robot_id: gb1
 wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}
 camera: camera.yaml
-recorder: {picture_rate_hz: 5}
+recorder: {picture_rate_hz: 5, segment_s: 15}
 """
 CAMERA = CameraModel("front", 160, 120, 150.0, 150.0, 79.5, 59.5, "plumb_bob", (0.0,) * 5)
 START_NS = 1_800_000_000_000_000_000
@@ -50,8 +51,9 @@ def events_of(log: Path, kind: str | None = None) -> list[Event]:
 
 
 def wheels_of(log: Path) -> list[WheelEncoders]:
-    """The wheel readings in a log."""
-    return [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
+    """The wheel readings in a log, damaged or not."""
+    messages = (each.message for each in read_log(log, ["/wheels"], LogLosses()))
+    return [message for message in messages if isinstance(message, WheelEncoders)]
 
 
 def frames_of(log: Path) -> list[TagDetections]:

@@ -1,0 +1,262 @@
+"""How a recording ends: told to, told twice, blocked, stalled; and how it never begins. Rows of the table of faults."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
+
+from fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
+from onboard.errors import OnboardError
+from onboard.log_reader import find_logs, read_log
+from onboard.status import read_status
+from tests.live_recording import robot_yaml, tag_jpeg, until
+from tests.made_cores import frames_of, wheels_of
+
+LIMIT_S = 5.0
+BOTH_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+# Devices that never come back from a read, and a detection that never answers.
+BLOCKED = """
+import os, signal, time
+from onboard.encoder_port import EncoderPort
+from onboard.picture_folder import FolderCamera
+reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}
+def blocking(device):
+    def read(self, timeout_s):
+        if os.path.exists("block"):
+            print("blocked", device.__name__, flush=True)
+            time.sleep(1e6)
+        return reads[device](self, timeout_s)
+    return read
+for device in reads:
+    device.read = blocking(device)
+"""
+# A disk that never comes back from a sync.
+STALLED = """
+import os, time
+fdatasync = os.fdatasync
+def stalling(file):
+    while os.path.exists("stall"):
+        time.sleep(0.05)
+    fdatasync(file)
+os.fdatasync = stalling
+"""
+
+
+@contextmanager
+def recorder(folder: Path, robot: Path, before: str = "", **environment: str) -> Iterator["subprocess.Popen[str]"]:
+    """`groundsbot-onboard record` as a process of its own, working in `folder`."""
+    program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
+    command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **environment}
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(process: "subprocess.Popen[str]", *words: str) -> None:
+    """Reads what the process says until each word has come."""
+    assert process.stdout is not None
+    left = set(words)
+    while left:
+        line = process.stdout.readline()
+        assert line, f"ended without {left}"
+        left -= {word for word in left if word in line}
+
+
+def wait_for_load(folder: Path) -> None:
+    """Waits until the recorder says by its status that all is flowing."""
+
+    def flows() -> bool:
+        try:
+            counts = read_status(folder / "logs").counts
+        except OnboardError:
+            return False
+        return counts.get("/wheels", 0) > 1000 and counts.get("/tags/detections", 0) > 30
+
+    until(flows, "the load")
+
+
+def only_log(folder: Path) -> Path:
+    (log,) = find_logs([folder / "logs"])
+    return log
+
+
+def check_finished(log: Path) -> None:
+    """Every file has its index, and one end."""
+    files = sorted(log.iterdir())
+    assert files
+    assert [path.suffix for path in files] == [".mcap"] * len(files)
+    for path in files:
+        assert path.read_bytes().count(MCAP0_MAGIC) == 2  # at its beginning and its end
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert summary.chunk_indexes
+
+
+@contextmanager
+def full_load(folder: Path) -> Iterator[None]:
+    """1 kHz of lines and 30 pictures a second, until the block ends."""
+    port = PtyPort(folder / "wheels", patient=True)  # a busy machine may hold up the test as well as the recorder
+    camera, picture = PictureFolder(folder / "pictures"), tag_jpeg()
+    over = threading.Event()
+
+    def drive() -> None:
+        at_rate(1000.0, 60.0, lambda i: None if over.is_set() else port.send(wheel_line(i, time.monotonic_ns())))
+
+    def show() -> None:
+        at_rate(30.0, 60.0, lambda _: None if over.is_set() else (camera.show(picture), None)[1])
+
+    threads = [threading.Thread(target=each, daemon=True) for each in (drive, show)]
+    for each in threads:
+        each.start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
+@pytest.fixture
+def both(tmp_path: Path) -> Path:
+    return robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}", "{picture_rate_hz: 30}")
+
+
+@pytest.mark.parametrize("number", BOTH_SIGNALS)
+def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: signal.Signals) -> None:
+    with full_load(tmp_path), recorder(tmp_path, both) as process:
+        wait_for_load(tmp_path)
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0, said
+    log = only_log(tmp_path)
+    check_finished(log)
+    sequences = [reading.sequence for reading in wheels_of(log)]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    assert len(sequences) > 500
+    assert len(frames_of(log)) > 20
+    assert len(list(read_log(log, ["/camera/image"]))) == len(frames_of(log))
+
+
+def test_row_17_told_again_and_again_while_closing(tmp_path: Path, both: Path) -> None:
+    with full_load(tmp_path), recorder(tmp_path, both) as process:
+        wait_for_load(tmp_path)
+        end_s = time.monotonic() + LIMIT_S
+        while process.poll() is None and time.monotonic() < end_s:
+            process.send_signal(BOTH_SIGNALS[time.monotonic_ns() % 2])
+            time.sleep(0.003)
+        said, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode in (0, -signal.SIGTERM, -signal.SIGINT), said  # the latter: as it was leaving already
+    check_finished(only_log(tmp_path))
+    assert "Traceback" not in said
+
+
+def test_row_18_told_to_end_while_port_camera_and_detection_block(tmp_path: Path, both: Path) -> None:
+    with full_load(tmp_path), recorder(tmp_path, both, BLOCKED) as process:
+        wait_for_load(tmp_path)
+        for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+                os.kill(int(child), signal.SIGSTOP)
+        time.sleep(0.2)
+        (tmp_path / "block").touch()
+        wait_for(process, "blocked EncoderPort", "blocked FolderCamera")
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 3, said  # the pictures that the detection had
+    assert "detection had not ended" in said
+    log = only_log(tmp_path)
+    check_finished(log)
+    sequences = [reading.sequence for reading in wheels_of(log)]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+
+
+class Systemd:
+    """Listens as systemd does."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.settimeout(0.05)
+        self.heard: list[str] = []
+
+    def listen(self, seconds: float) -> list[str]:
+        """What comes within the time."""
+        end_s, before = time.monotonic() + seconds, len(self.heard)
+        while time.monotonic() < end_s:
+            try:
+                self.heard += self._socket.recv(4096).decode().splitlines()
+            except TimeoutError:
+                continue
+        return self.heard[before:]
+
+
+def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> None:
+    """What systemd then does, the test does: it kills the recorder and starts it again."""
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
+    systemd = Systemd(tmp_path / "notify")
+    listening = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "2000000"}
+    with full_load(tmp_path):
+        with recorder(tmp_path, robot, STALLED, **listening) as process:
+            wait_for(process, "port_connected")
+            until(lambda: systemd.listen(0.1)[:1] == ["READY=1"], "READY=1")
+            assert systemd.listen(2.0).count("WATCHDOG=1") >= 2
+            safe = tmp_path / "stall"
+            safe.touch()
+            systemd.listen(1.6)  # the log has not come forward for half the watchdog's time after this
+            assert "WATCHDOG=1" not in systemd.listen(1.5)
+            process.kill()
+            process.wait()
+            safe.unlink()
+        with recorder(tmp_path, robot, STALLED, **listening) as process:
+            wait_for(process, "port_connected")
+            assert "WATCHDOG=1" in systemd.listen(3.0)
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=LIMIT_S)
+    systemd.listen(0.5)
+    assert systemd.heard[-1] == "STOPPING=1"
+    first, second = find_logs([tmp_path / "logs"])
+    assert len(wheels_of(first)) > 1000  # what came before the stall
+    check_finished(second)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("radius_left_m: 0.05", "radius_left_m: 50", ["robot.yaml", "wheels.radius_left_m", "50", "10"]),
+        ("radius_left_m: 0.05", "radius_left_m: -1", ["robot.yaml", "wheels.radius_left_m", "-1", "0"]),
+        ("ticks_per_turn: 1024", "ticks: 1024", ["robot.yaml", "wheels.ticks"]),
+        ("camera: camera.yaml", "camera: gone.yaml", ["gone.yaml"]),
+        ("camera: camera.yaml\n", "", ["robot.yaml", "devices.camera", "calibration"]),
+        ("encoder_baud: 115200", "encoder_baud: 0", ["robot.yaml", "devices.encoder_baud", "0"]),
+        ("camera_fps: 15", "camera_fps: .nan", ["robot.yaml", "devices.camera_fps", "nan"]),
+        ("quad_decimate: 2.0", "quad_decimate: 9.0", ["robot.yaml", "recorder.quad_decimate", "9", "8"]),
+        ("detector: pupil-apriltags", "detector: magic", ["robot.yaml", "recorder.detector", "magic"]),
+        ("robot_id: gb1", "robot_id: [", ["robot.yaml"]),
+    ],
+)
+def test_row_41_a_bad_file_is_one_line_at_the_start(tmp_path: Path, old: str, new: str, expected: list[str]) -> None:
+    devices = "{encoder_port: wheels, encoder_baud: 115200, camera: pictures, camera_fps: 15}"
+    robot = robot_yaml(tmp_path, devices, "{quad_decimate: 2.0, detector: pupil-apriltags}")
+    assert old in robot.read_text()
+    robot.write_text(robot.read_text().replace(old, new))
+    with recorder(tmp_path, robot) as process:
+        said, _ = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert [word for word in expected if word not in said] == []
+    assert not (tmp_path / "logs").exists()
