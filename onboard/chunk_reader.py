@@ -17,9 +17,9 @@ from onboard.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_te
 
 # A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
 RECORD_LIMIT_BYTES: Final = 64 << 20
-# Our chunks shrink to a tenth at best; a bomb's to a thousandth.
+# Our chunks shrink to an eighth at best; a bomb's to a thousandth.
 _UNFOLDED_FREE_BYTES: Final = 1 << 20
-_UNFOLDED_SHARE: Final = 32
+_UNFOLDED_SHARE: Final = 24
 _SEARCH_FREE_BYTES: Final = 64 << 20  # false beginnings of chunks that a search may check
 _SEARCH_SHARE: Final = 4
 _WINDOW_BYTES: Final = 1 << 20
@@ -54,6 +54,7 @@ class ChunkReader:
         n_chunks: yielded so far.
         is_finished: whether the end mark was met.
         end_offset: where reading ended, if it was not.
+        offset: behind the chunk yielded last.
     """
 
     def __init__(self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None]) -> None:
@@ -69,7 +70,7 @@ class ChunkReader:
         """
         self.n_chunks = 0
         self.is_finished = False
-        self.end_offset = 0
+        self.end_offset = self.offset = 0
         self._stream = stream
         self._path = path
         self._on_damage = on_damage
@@ -102,6 +103,7 @@ class ChunkReader:
                 if record.opcode == Opcode.CHUNK:
                     chunk = self._uncompressed(record.content)
                     self.n_chunks += 1
+                    self.offset = record.following
                     yield chunk
                     trusted = record.following
                 offset = record.following

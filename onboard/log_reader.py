@@ -19,6 +19,9 @@ from onboard.messages import TOPICS, RunInfo
 
 __all__ = ["LogMessage", "files_of", "find_logs", "read_head", "read_log", "read_run_info"]
 
+# A hostile file may hold millions of records in a few kB. Ours shrink to 14 bytes at best.
+_RECORDS_FREE: Final = 50_000
+_SMALLEST_RECORD_BYTES: Final = 4
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
@@ -111,10 +114,8 @@ def read_head(path: Path) -> dict[str, Message]:
     """
     head: dict[str, Message] = {}
     for file in files_of(path):
-        with suppress(LogError):
-            for each in _read_file(file, None, LogLosses()):
-                if each.topic not in _HEADS:
-                    break
+        for each in _beginning(file):
+            if each.topic in _HEADS:
                 head.setdefault(each.topic, each.message)
     return head
 
@@ -202,10 +203,16 @@ def _identity(each: LogMessage) -> bytes:
 
 def _first_time_ns(file: Path) -> int | None:
     """Log time of the first message behind a file's head, which has the time of the file's beginning."""
-    with suppress(LogError):
-        for each in _read_file(file, None, LogLosses()):
-            return each.log_time_ns
-    return None
+    return next((each.log_time_ns for each in _beginning(file)), None)
+
+
+def _beginning(file: Path) -> list[LogMessage]:
+    """The messages of a file's first whole chunk, which holds its head unless that is lost."""
+    losses = LogLosses()
+    found: list[LogMessage] = []
+    with suppress(LogError, OSError), file.open("rb") as stream:
+        found += _messages(ChunkReader(stream, file, losses.add), file, None, losses, only_first=True)
+    return found
 
 
 def _check_same_run(files: list[Path]) -> None:
@@ -223,8 +230,7 @@ def _check_same_run(files: list[Path]) -> None:
 
 def _run_info(file: Path) -> RunInfo | None:
     """The `/run` at a file's head; None: the head is damaged."""
-    first = next(_read_file(file, None, LogLosses()), None)
-    return first.message if first is not None and isinstance(first.message, RunInfo) else None
+    return next((each.message for each in _beginning(file) if isinstance(each.message, RunInfo)), None)
 
 
 def _read_file(path: Path, topics: Collection[str] | None, losses: LogLosses | None) -> Iterator[LogMessage]:
@@ -239,14 +245,17 @@ def _read_file(path: Path, topics: Collection[str] | None, losses: LogLosses | N
 
 
 def _messages(
-    reader: ChunkReader, path: Path, topics: Collection[str] | None, losses: LogLosses
+    reader: ChunkReader, path: Path, topics: Collection[str] | None, losses: LogLosses, only_first: bool = False
 ) -> Iterator[LogMessage]:
     decoder = MessageDecoder(path, topics, lambda reason: losses.add_undecodable(path, reason))
     n_damaged = losses.n_places
     for chunk in reader:
         if reader.n_chunks == 1 and losses.n_places > n_damaged:
             decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
+        decoder.allow(_RECORDS_FREE + reader.offset // _SMALLEST_RECORD_BYTES)
         yield from decoder.messages(chunk)
+        if only_first:
+            return
     if not reader.is_finished:
         losses.add_unfinished(path, reader.end_offset)
     elif reader.summary is not None and reader.summary.n_chunks is not None:

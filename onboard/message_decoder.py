@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 from google.protobuf.message import DecodeError, Message
 from mcap.opcode import Opcode
@@ -12,7 +12,8 @@ from onboard.errors import LogError
 from onboard.messages import TOPICS
 from onboard.record_bytes import MESSAGE_HEAD, RECORD_HEAD, U16, read_text
 
-_MESSAGE_FIXED_BYTES = MESSAGE_HEAD.size - RECORD_HEAD.size
+_MESSAGE_FIXED_BYTES: Final = MESSAGE_HEAD.size - RECORD_HEAD.size
+_HEAD_RECORDS: Final = 1000
 
 
 class LogMessage(NamedTuple):
@@ -47,7 +48,13 @@ class MessageDecoder:
         self._channels: dict[int, tuple[str, type[Message]] | None] = {}
         self._run_channel: int | None = None
         self._first = True
+        self._n_allowed = _HEAD_RECORDS
+        self._n_records = 0
         self.seen_run = False
+
+    def allow(self, n_records: int) -> None:
+        """Bounds how many records there may be, from the first on."""
+        self._n_allowed = n_records
 
     def begin_without_head(self, declarations: bytes) -> None:
         """Learns the channels from what an index repeats: the chunk that declared them is lost, and `/run` with it."""
@@ -70,10 +77,7 @@ class MessageDecoder:
         position, end = 0, len(chunk)
         message_head, head_size, fixed_size = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size, _MESSAGE_FIXED_BYTES
         while position < end:
-            opcode, length = RECORD_HEAD.unpack_from(chunk, position)
-            following = position + RECORD_HEAD.size + length
-            if following > end:
-                raise struct.error("a record does not fit in its chunk")
+            opcode, length, following = self._next_record(chunk, position)
             if opcode == Opcode.MESSAGE:
                 if length < fixed_size:
                     raise struct.error(f"a message of {length} bytes")
@@ -91,6 +95,17 @@ class MessageDecoder:
             elif opcode == Opcode.CHANNEL:
                 self._add_channel(chunk, position + RECORD_HEAD.size)
             position = following
+
+    def _next_record(self, chunk: bytes, position: int) -> tuple[int, int, int]:
+        """A record's code, its length and where the next one begins."""
+        opcode, length = RECORD_HEAD.unpack_from(chunk, position)
+        following = position + RECORD_HEAD.size + length
+        if following > len(chunk) or opcode == 0:
+            raise struct.error("a record does not fit in its chunk")
+        self._n_records += 1
+        if self._n_records > self._n_allowed:
+            raise struct.error(f"more than {self._n_allowed} records up to here")
+        return opcode, length, following
 
     def _target(self, channel: int) -> tuple[str, type[Message]] | None:
         if channel == self._run_channel:

@@ -351,6 +351,8 @@ def test_row_40_a_stalled_disk_shows_and_earlier_data_are_intact(tmp_path: Path)
         found, losses = read_all(tmp_path / "run1")  # as a restarted recorder's user finds it
         assert found[:100] == seen(early)
         assert not losses.n_lost
+        disk.may_sync.set()
+        wait_until(lambda: thread.stalled_s < 1.0)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

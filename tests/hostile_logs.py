@@ -1,0 +1,308 @@
+"""Logs of at most 1 MiB made to take memory and time, and what a command takes of both for each."""
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import zstandard
+from google.protobuf.message import Message
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema, Statistics
+from mcap.writer import MCAP0_MAGIC
+
+from onboard.messages import (
+    TOPICS,
+    CameraCalibration,
+    CompressedImage,
+    PlanarOdometry,
+    RunInfo,
+    TagDetection,
+    TagDetections,
+    TagObservation,
+    TagObservations,
+    WheelEncoders,
+)
+from tests.made_logs import ROBOT_YAML, START_NS
+
+LIMIT_BYTES = 1 << 20
+MS = 1_000_000
+_NUMBERS = {name: number for number, name in enumerate(TOPICS, 1)}
+_MESSAGE = struct.Struct("<BQHIQQ")
+
+
+def bytes_of(*records: object) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)  # type: ignore[attr-defined]  # every record has it
+    return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
+
+
+def declared() -> bytes:
+    schemas = [
+        Schema(id=number, data=b"", encoding="protobuf", name=TOPICS[name].schema.DESCRIPTOR.full_name)
+        for name, number in _NUMBERS.items()
+    ]
+    channels = [
+        Channel(id=number, topic=name, message_encoding="protobuf", metadata={}, schema_id=number)
+        for name, number in _NUMBERS.items()
+    ]
+    return bytes_of(*schemas, *channels)
+
+
+def message(topic: str, content: Message | bytes, at_ns: int = START_NS) -> bytes:
+    data = content if isinstance(content, bytes) else content.SerializeToString()
+    head = _MESSAGE.pack(5, _MESSAGE.size - 9 + len(data), _NUMBERS[topic], 0, at_ns, at_ns)
+    return head + data
+
+
+def run(robot_yaml: str = ROBOT_YAML) -> bytes:
+    return declared() + message("/run", RunInfo(run_id="r", robot_id="gb1", robot_yaml=robot_yaml))
+
+
+def chunk(records: bytes, compressed: bool = True, claimed: int | None = None) -> bytes:
+    data = zstandard.compress(records, 9) if compressed else records
+    size = len(records) if claimed is None else claimed
+    return bytes_of(Chunk("zstd" if compressed else "", data, START_NS, START_NS, zlib.crc32(records), size))
+
+
+def log(*chunks: bytes) -> bytes:
+    return MCAP0_MAGIC + bytes_of(Header("", "")) + b"".join(chunks) + bytes_of(DataEnd(0))
+
+
+Content = tuple[str, Message | bytes, int]
+
+
+def of_messages(*contents: Content, robot_yaml: str = ROBOT_YAML) -> bytes:
+    first, rest = run(robot_yaml), b"".join(message(*each) for each in contents)
+    hidden = chunk(first + rest)
+    padding = random_bytes(len(first + rest) // 23 - len(hidden))
+    private = struct.pack("<BQ", 0x80, len(padding)) + padding  # readers pass over it
+    return log(*[chunk(run())] * (robot_yaml == ROBOT_YAML), chunk(private, compressed=False), hidden)
+
+
+def random_bytes(count: int) -> bytes:
+    return np.random.default_rng(0).bytes(max(0, count))
+
+
+def wheels(count: int, make: Callable[[int], WheelEncoders]) -> bytes:
+    return of_messages(*(("/wheels", make(index), START_NS + index) for index in range(count)))
+
+
+def full(make: Callable[[int], bytes], start: int = 10_000) -> bytes:
+    """As large as the limit lets it be."""
+    count, data = start, b""
+    while True:
+        larger = make(count)
+        if len(larger) > LIMIT_BYTES or count > 1 << 22:
+            return data or larger[:LIMIT_BYTES]
+        data, count = larger, count * 5 // 4
+
+
+def reading(index: int, period_ns: int, boot_id: int = 1) -> WheelEncoders:
+    return WheelEncoders(stamp_ns=START_NS + index * period_ns, boot_id=boot_id, sequence=index)
+
+
+def extreme_reading(index: int) -> WheelEncoders:
+    most = (-1) ** index * ((1 << 63) - 1)
+    return WheelEncoders(stamp_ns=most, sequence=(1 << 64) - 1 - index, ticks_left=most)
+
+
+def claims() -> bytes:
+    heads = [struct.pack("<BQ", code, 1 << bits) for code in (1, 3, 4, 6, 7, 9, 12) for bits in (30, 40, 62, 63)]
+    return log(chunk(run()), *heads)
+
+
+def bombs(mib: int, count: int) -> bytes:
+    bomb = chunk(b"\0" * (mib << 20))
+    return log(chunk(run()), *[bomb] * min(count, (LIMIT_BYTES - 4000) // len(bomb)))
+
+
+def false_chunks() -> bytes:
+    """Forms of chunks one in another, each of which has to be checked."""
+    body = b""
+    while len(body) < LIMIT_BYTES - 4000:
+        head = struct.pack("<QQQIIQ", 0, 0, len(body), 5, 0, len(body))
+        body = struct.pack("<BQ", 6, len(head) + len(body)) + head + body
+    return log(chunk(run()), body)
+
+
+def absurd_summary() -> bytes:
+    most = (1 << 64) - 1
+    counts = Statistics(
+        attachment_count=1,
+        channel_count=(1 << 32) - 1,
+        channel_message_counts=dict.fromkeys(range(1000), most),
+        chunk_count=(1 << 32) - 1,
+        message_count=most,
+        message_end_time=most,
+        message_start_time=0,
+        metadata_count=1,
+        schema_count=1,
+    )
+    data = log(chunk(run()))
+    summary = bytes_of(counts)
+    footer = struct.pack("<BQQQ", 2, 20, len(data), 0)
+    crc = zlib.crc32(footer, zlib.crc32(summary))
+    return data + summary + bytes_of(Footer(0, len(data), crc)) + MCAP0_MAGIC
+
+
+def many_channels() -> bytes:
+    name = "/" + "x" * 300
+    channels = [
+        Channel(id=number, topic=f"{name}{number}", message_encoding="", metadata={}, schema_id=0)
+        for number in range(100, 65_000)
+    ]
+    return log(chunk(run() + bytes_of(*channels)))
+
+
+def yaml_bomb() -> str:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)]
+    return ROBOT_YAML + "\n".join(lines) + "\n"
+
+
+def tags_seen(count: int, per_message: int) -> bytes:
+    corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
+    lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
+    camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
+    contents: list[Content] = [("/camera/calibration", camera, START_NS)]
+    for index in range(0, count, per_message):
+        at_ns = START_NS + index * MS
+        tags = [TagDetection(family="tag36h11", tag_id=index + k, corners_px=corners) for k in range(per_message)]
+        found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
+        contents.append(("/wheels", WheelEncoders(stamp_ns=at_ns, sequence=index, ticks_left=index), at_ns))
+        contents.append(("/tags/detections", found, at_ns))
+    return of_messages(*contents)
+
+
+def observed(count: int) -> bytes:
+    contents: list[Content] = []
+    for index in range(count):
+        at_ns = START_NS + index * 100 * MS
+        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
+        place = TagObservation.Cartesian(x_m=1.0, y_m=0.1)
+        tags = [TagObservation(family="tag36h11", tag_id=index + k, cartesian=place) for k in (0, 1)]
+        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
+        seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
+        contents.append(("/tags/observations", seen, at_ns))
+    return of_messages(*contents)
+
+
+def pictures(encoded: Iterable[bytes]) -> bytes:
+    contents: list[Content] = [("/wheels", WheelEncoders(stamp_ns=START_NS), START_NS)]
+    for number, data in enumerate(encoded):
+        contents.append(("/camera/image", CompressedImage(data=data, format="jpeg"), START_NS + number))
+    return of_messages(*contents)
+
+
+def huge_jpeg() -> bytes:
+    data = bytearray(cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].tobytes())
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = b"\xff\xff\xff\xff"
+    return bytes(data)
+
+
+def png(side: int) -> bytes:
+    return cv2.imencode(".png", np.zeros((side, side), np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+
+
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "claimed lengths": claims,
+    "one bomb of 60 MiB": lambda: bombs(60, 1),
+    "many bombs of 1 MiB": lambda: bombs(1, 1 << 20),
+    "many bombs of 30 MiB": lambda: bombs(30, 1 << 20),
+    "chunks in chunks": false_chunks,
+    "absurd index": absurd_summary,
+    "65 thousand channels": many_channels,
+    "empty readings": lambda: full(lambda n: wheels(n, lambda _: WheelEncoders())),
+    "readings, one a ns": lambda: full(lambda n: wheels(n, lambda k: reading(k, 1))),
+    "readings, one a s": lambda: full(lambda n: wheels(n, lambda k: reading(k, 1000 * MS))),
+    "a reset each reading": lambda: full(lambda n: wheels(n, lambda k: reading(k, 10 * MS, boot_id=k))),
+    "extreme numbers": lambda: wheels(2000, extreme_reading),
+    "YAML aliases": lambda: of_messages(robot_yaml=yaml_bomb()),
+    "YAML of 16 MiB": lambda: of_messages(robot_yaml=ROBOT_YAML + "# x\n" * (4 << 20)),
+    "YAML list": lambda: of_messages(
+        robot_yaml=ROBOT_YAML.replace("tags:", "tags: [" + "{default_size_m: 0.1}, " * 200_000 + "]\nother:")
+    ),
+    "YAML brackets": lambda: of_messages(robot_yaml="a: " + "[" * 500_000),
+    "long calibration": lambda: of_messages(("/camera/calibration", CameraCalibration(K=[1.0] * 3_000_000), START_NS)),
+    "tags in one picture": lambda: full(lambda n: tags_seen(n, n)),
+    "a new tag in each picture": lambda: full(lambda n: tags_seen(n, 1)),
+    "tags in a row": lambda: full(observed),
+    "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
+    "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),
+    "PNG of 12000 x 12000": lambda: pictures([png(12000)]),
+}
+
+
+class Taken(NamedTuple):
+    """What one command took of one file."""
+
+    code: int
+    seconds: float
+    extra_bytes: int  # above the idle size
+    said: str
+
+
+# Measures in one process what each file takes; the peak is reset in between. Children count too.
+_MEASURE = """
+import contextlib, importlib, io, json, re, shutil, sys, tempfile, time
+from pathlib import Path
+from offline import cli
+for name in sys.argv[1].split(","):
+    importlib.import_module(name)
+
+def status(name, pid="self"):
+    return int(re.search(name + r":\\s+(\\d+)", Path(f"/proc/{pid}/status").read_text())[1]) * 1024
+
+for line in sys.stdin:
+    command, path = json.loads(line)
+    place = Path(tempfile.mkdtemp())
+    output = {"info": [], "salvage": ["-o", place / "new.mcap"]}.get(command, ["-o", place / "new"])
+    sys.argv = ["groundsbot-offline", command, path, *map(str, output)]
+    Path("/proc/self/clear_refs").write_text("5")
+    idle = status("VmRSS")
+    out, start = io.StringIO(), time.monotonic()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        try:
+            cli.main()
+        except SystemExit as ended:
+            code = ended.code
+        except BaseException as error:
+            code = 99
+            print("TRACEBACK", type(error).__name__, error)
+    taken = time.monotonic() - start, status("VmHWM") - idle
+    shutil.rmtree(place)
+    print(json.dumps([code or 0, *taken, out.getvalue()[-300:]]), flush=True)
+"""
+
+
+_MODULES = {
+    "info": "offline.info",
+    "salvage": "offline.salvage",
+    "detect": "offline.detect,onboard.picture",
+    "map": "offline.map_command",
+}
+
+
+def measure(command: str, files: dict[str, Path]) -> dict[str, Taken]:
+    """What `groundsbot-offline COMMAND` takes of each file."""
+    asked = "".join(json.dumps([command, str(path)]) + "\n" for path in files.values())
+    ended = subprocess.run(
+        [sys.executable, "-c", _MEASURE, _MODULES[command]],
+        input=asked,
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[1],
+    )
+    lines = ended.stdout.splitlines()
+    assert len(lines) == len(files), ended.stderr
+    return {name: Taken(*json.loads(line)) for name, line in zip(files, lines, strict=True)}
