@@ -37,6 +37,7 @@ def fuzz(
     seconds: float | None = None,
     mutations: Sequence[Mutation] = (),
     findings_folder: Path | None = None,
+    longest: int = _LONGEST,
 ) -> Findings:
     """Feeds changed inputs to `check` until it raises, or the runs or seconds are over.
 
@@ -49,6 +50,7 @@ def fuzz(
         seconds: how long.
         mutations: ways to change an input that suit its format, besides the common ones.
         findings_folder: where an input that makes `check` raise is put.
+        longest: bytes of an input; what is longer is cut.
     """
     chance = random.Random(seed)
     corpus, edges, n = list(seeds), set(), 0
@@ -57,7 +59,7 @@ def fuzz(
     end_s = time.monotonic() + seconds if seconds is not None else float("inf")
     while (runs is None or n < runs) and time.monotonic() < end_s:
         n += 1
-        data = _changed(corpus, chance, mutations)
+        data = _changed(corpus, chance, mutations)[:longest]
         found = _traced(check, data, modules, findings_folder)
         if not found <= edges:
             edges |= found
@@ -72,7 +74,7 @@ def _changed(corpus: Sequence[bytes], chance: random.Random, mutations: Sequence
             data = chance.choice(mutations)(data, chance)
         else:
             data = _common(data, corpus, chance)
-    return data[:_LONGEST]
+    return data
 
 
 def _common(data: bytes, corpus: Sequence[bytes], chance: random.Random) -> bytes:
