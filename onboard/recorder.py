@@ -42,6 +42,7 @@ _WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: tol
 _CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
 _WAIT_FOR_WHEELS_NS: Final = 500_000_000
 _PICTURE_JITTER: Final = 0.4  # of the period between pictures to keep: how early one may be
+_PICTURE_CATCH_UP_NS: Final = _NS_PER_S  # pictures that were held up so long are made up for
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
 
@@ -260,7 +261,8 @@ class RecorderCore:
         late_ns = stamp_ns - self._next_picture_ns
         if late_ns < -_PICTURE_JITTER * period_ns:
             return False
-        self._next_picture_ns = stamp_ns + period_ns if late_ns > period_ns else self._next_picture_ns + period_ns
+        in_step = late_ns <= max(period_ns, _PICTURE_CATCH_UP_NS)
+        self._next_picture_ns = (self._next_picture_ns if in_step else stamp_ns) + period_ns
         return True
 
     def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
