@@ -52,18 +52,24 @@ class Load:
     keep: bool = True
 
 
-TABLE: Final = [
-    dict(zip(("lines_hz", "fps", "width_px", "height_px", "keep"), each, strict=True))
-    for each in (
-        (100.0, 15.0, 640, 480, False),
-        (100.0, 15.0, 640, 480, True),
-        (100.0, 15.0, 1280, 720, False),
-        (100.0, 15.0, 1280, 720, True),
-        (100.0, 30.0, 1280, 720, True),
-        (1000.0, 30.0, 1280, 720, True),
-        (100.0, 15.0, 1920, 1080, True),
-    )
-]
+_ROWS: Final = (  # lines and pictures a second, size, pictures kept
+    (100.0, 15.0, 640, 480, False),
+    (100.0, 15.0, 640, 480, True),
+    (100.0, 15.0, 1280, 720, False),
+    (100.0, 15.0, 1280, 720, True),
+    (100.0, 30.0, 1280, 720, True),
+    (1000.0, 30.0, 1280, 720, True),
+    (100.0, 15.0, 1920, 1080, True),
+)
+
+
+def table(seconds: float) -> list[Load]:
+    """Loads for the page about the recorder."""
+    return [
+        Load(seconds, lines_hz, fps, width_px, height_px, detector, keep)
+        for lines_hz, fps, width_px, height_px, keep in _ROWS
+        for detector in ("pupil-apriltags", "pyapriltags")
+    ]
 
 
 def pictures(load: Load) -> list[bytes]:
@@ -222,13 +228,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--table", action="store_true")
     arguments = parser.parse_args()
-    loads = [Load(arguments.seconds)]
-    if arguments.table:
-        loads = [
-            Load(arguments.seconds, detector=detector, **row)
-            for row in TABLE
-            for detector in ("pupil-apriltags", "pyapriltags")
-        ]
+    loads = table(arguments.seconds) if arguments.table else [Load(arguments.seconds)]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     for load in loads:
         with tempfile.TemporaryDirectory(prefix="recorder_load_") as folder:
