@@ -12,7 +12,7 @@ import numpy as np
 from calib.arrays import FloatArray
 from offline.arrowhead_cut import LEVELS
 from offline.arrowhead_tree import Tree
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 
 
 class System(NamedTuple):
@@ -71,11 +71,20 @@ def eliminate(tree: Tree, system: System, damping: float, rows: Rows) -> int:
     for node in range(len(tree.level) - 1):
         if tree.level[node] == 0:
             widest = max(widest, tree.front_start[node + 1] - tree.front_start[node])
-    now, following = np.zeros((3, widest)), np.zeros((3, widest))
+    return _eliminate_nodes(tree, system, damping, rows, np.zeros((2, 3, widest)), np.zeros((2, 3, 3)))
+
+
+@jitted
+def _eliminate_nodes(
+    tree: Tree, system: System, damping: float, rows: Rows, border: FloatArray, blocks: FloatArray
+) -> int:
+    """Children first, with room for what couples two poses to a leaf's border, and for two blocks."""
+    tree, system, rows = borrowed(tree), borrowed(system), borrowed(rows)
+    border, blocks = borrowed(border), borrowed(blocks)
     for node in range(len(tree.level)):
         front = _front_of(tree, node, rows.workspace)
         if tree.level[node] == 0:
-            failed = _eliminate_leaf(tree, system, damping, node, rows, front, now, following)
+            failed = _eliminate_leaf(tree, system, damping, node, rows, front, border, blocks)
         else:
             _add_separators(tree, system, damping, node, front)
             _add_tags(tree, system, damping, node, front)
@@ -105,8 +114,8 @@ def _eliminate_leaf(
     leaf: int,
     rows: Rows,
     front: FloatArray,
-    now: FloatArray,
-    following: FloatArray,
+    border: FloatArray,
+    blocks: FloatArray,
 ) -> int:
     """Pose by pose; `now` (3, w) couples the pose to the border seen so far.
 
@@ -115,7 +124,8 @@ def _eliminate_leaf(
     first, end, n_left = tree.first[leaf], tree.end[leaf], tree.calibration_at[leaf]
     n_slots = n_slots_of(tree, leaf)
     width = n_left + n_slots
-    block, carried = np.empty((3, 3)), np.zeros((3, 3))
+    now, following, block, carried = border[0], border[1], blocks[0], blocks[1]
+    carried[:] = 0.0
     now[:, :width] = 0.0
     if n_left:
         now[:, :3] = system.pose_next[first - 1].T

@@ -8,7 +8,7 @@ factors of Lupton and Sukkarieh, "Visual-inertial-aided navigation for high-dyna
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 from offline.linearise_kernels import Odometry, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
 
@@ -46,6 +46,7 @@ def compose(odometry: Odometry, index: IntArray, out: Odometry) -> None:
         index: (P,) of each pose in the skeleton, -1 where it is not kept; the first of a chain is.
         out: its motion, covariance, information and jacobian are set.
     """
+    odometry, index, out = borrowed(odometry), borrowed(index), borrowed(out)
     motion, blocks, scratch = np.empty(5), np.empty((2, 3, 3)), np.empty((2, 3, 3))
     at = 0
     for m in range(len(odometry.first)):
@@ -121,6 +122,7 @@ def expand(
         calibration: (C,).
         out: (P, 3) takes all poses.
     """
+    odometry, index, composed = borrowed(odometry), borrowed(index), borrowed(composed)
     for pose in range(len(index)):
         if index[pose] >= 0:
             for i in range(3):

@@ -5,12 +5,13 @@ import numpy as np
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import Rows, System, n_slots_of
 from offline.arrowhead_tree import Tree
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 
 
 @jitted
 def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
+    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
     inside, outside = _scratch(tree)
     for node in range(len(tree.level) - 1):
         start, end = tree.front_start[node], tree.front_start[node + 1]
@@ -34,6 +35,7 @@ def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
 @jitted
 def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
+    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
     inside, outside = _scratch(tree)
     for node in range(len(tree.level) - 2, -1, -1):
         start, end = tree.front_start[node], tree.front_start[node + 1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import System
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 from offline.linearise_kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
 from offline.robust import Loss, loss_and_weight
 
@@ -22,6 +22,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 @jitted
 def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, system: System) -> float:
     """Adds all odometry factors to the blocks; returns the sum of their losses."""
+    odometry, values, free, system = borrowed(odometry), borrowed(values), borrowed(free), borrowed(system)
     scratch = np.empty((6, 3, 3))
     total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
     for m in range(len(odometry.first)):

@@ -4,7 +4,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import System
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 from offline.linearise_kernels import Free, Readings, Values
 from offline.robust import Loss, loss_and_weight
 
@@ -16,6 +16,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
     whitened derivative of the reading by the tag's place in the sensor.
     """
+    readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
     r, J = np.empty(2), np.empty((2, 9))
     total, g = 0.0, system.gradient
     for m in range(len(readings.pose)):

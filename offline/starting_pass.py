@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, FloatArray
 from offline.arrowhead_tree import Tree
-from offline.jit import jitted
+from offline.jit import borrowed, jitted
 from offline.linearise_kernels import Odometry, Readings, Values, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
 
@@ -34,10 +34,12 @@ class _Filter(NamedTuple):
 
     Attributes:
         pose: (number of chains, 6) covariance of the newest pose: xx, xy, yy, x heading, y heading, heading.
+        turn: (number of chains, 2) cosine and sine of its heading.
         tag: (T, 3) covariance xx, xy, yy; known: (T,) whether it has been placed.
     """
 
     pose: FloatArray
+    turn: FloatArray
     tag: FloatArray
     known: BoolArray
 
@@ -57,27 +59,49 @@ def starting_pass(
         out: takes the result.
     """
     n_chains = len(tree.chain_start) - 1
-    known = _Filter(np.zeros((n_chains, 6)), np.zeros((tree.n_tags, 3)), np.zeros(tree.n_tags, dtype=np.bool_))
+    known = _Filter(
+        pose=np.zeros((n_chains, 6)),
+        turn=np.empty((n_chains, 2)),
+        tag=np.zeros((tree.n_tags, 3)),
+        known=np.zeros(tree.n_tags, dtype=np.bool_),
+    )
     out.calibration[:] = start.calibration
     out.tags[:] = start.tags
+    _run(tree, odometry, readings, start, start_variance, known, out)
+
+
+@jitted
+def _run(
+    tree: Tree,
+    odometry: Odometry,
+    readings: Readings,
+    start: Values,
+    start_variance: FloatArray,
+    known: _Filter,
+    out: Values,
+) -> None:
+    tree, odometry, readings = borrowed(tree), borrowed(odometry), borrowed(readings)
+    start, known, out = borrowed(start), borrowed(known), borrowed(out)
+    n_chains = len(tree.chain_start) - 1
     for block in range(0, np.max(np.diff(tree.chain_start)), _BLOCK):
         for chain in range(n_chains):
             first, end = tree.chain_start[chain], tree.chain_start[chain + 1]
             for pose in range(first + block, min(first + block + _BLOCK, end)):
-                P = known.pose[chain]
+                P, turn = known.pose[chain], known.turn[chain]
                 if pose == first:
                     out.poses[pose] = start.poses[pose]
-                    _begin(start_variance[chain], start.poses[pose, 2], P)
+                    _begin(start_variance[chain], start.poses[pose, 2], P, turn)
                 else:
-                    # One motion less than poses in each chain.
-                    _predict(odometry, pose - 1 - chain, start.calibration, out.poses[pose - 1], out.poses[pose], P)
+                    m = pose - 1 - chain  # one motion less than poses in each chain
+                    _predict(odometry, m, start.calibration, out.poses[pose - 1], out.poses[pose], P, turn)
                 for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
-                    _read(readings, m, out.calibration, out.poses[pose], P, out.tags[readings.tag[m]], known)
+                    _read(readings, m, out.calibration, out.poses[pose], P, turn, out.tags[readings.tag[m]], known)
 
 
 @jitted
-def _begin(variance: FloatArray, heading: float, P: FloatArray) -> None:
-    P[0], P[1], P[2] = turned((variance[0], 0.0, variance[1]), np.cos(heading), np.sin(heading))
+def _begin(variance: FloatArray, heading: float, P: FloatArray, turn: FloatArray) -> None:
+    turn[0], turn[1] = np.cos(heading), np.sin(heading)
+    P[0], P[1], P[2] = turned((variance[0], 0.0, variance[1]), turn[0], turn[1])
     P[3], P[4], P[5] = 0.0, 0.0, variance[2]
 
 
@@ -94,14 +118,20 @@ def turned(C: _Covariance, cos: float, sin: float) -> _Covariance:
 
 @jitted
 def _predict(
-    odometry: Odometry, m: int, calibration: FloatArray, before: FloatArray, after: FloatArray, P: FloatArray
+    odometry: Odometry,
+    m: int,
+    calibration: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    P: FloatArray,
+    turn: FloatArray,
 ) -> None:
     """T <- T o M(c); P <- F P F^T + noise, where F moves the position by J d times the heading's error."""
-    x, y, turn, _, _ = motion_at(odometry, m, wheel_correction(odometry, m, calibration))
-    cos, sin = np.cos(before[2]), np.sin(before[2])
-    dx, dy = cos * x - sin * y, sin * x + cos * y
-    after[0], after[1], after[2] = before[0] + dx, before[1] + dy, wrapped(before[2] + turn)
+    x, y, turned_by, _, _ = motion_at(odometry, m, wheel_correction(odometry, m, calibration))
+    dx, dy = turn[0] * x - turn[1] * y, turn[1] * x + turn[0] * y
+    after[0], after[1], after[2] = before[0] + dx, before[1] + dy, wrapped(before[2] + turned_by)
     cos, sin = np.cos(after[2]), np.sin(after[2])
+    turn[0], turn[1] = cos, sin
     C = odometry.covariance[m]
     xx, xy, yy = turned((C[0, 0], C[0, 1], C[1, 1]), cos, sin)
     P[0], P[1], P[2] = P[0] + xx, P[1] + xy, P[2] + yy
@@ -120,12 +150,12 @@ def _read(
     calibration: FloatArray,
     pose: FloatArray,
     P: FloatArray,
+    turn: FloatArray,
     tag: FloatArray,
     known: _Filter,
 ) -> None:
     """Fuses one reading into pose or tag, or places the tag."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    x, y, R = _read_from_pose(readings, m, calibration, cos, sin)
+    x, y, R = _read_from_pose(readings, m, calibration, turn[0], turn[1])
     V = known.tag[readings.tag[m]]
     if not known.known[readings.tag[m]]:
         known.known[readings.tag[m]] = True
@@ -144,6 +174,7 @@ def _read(
         u, v = S[2] * off_x - S[1] * off_y, S[0] * off_y - S[1] * off_x
         if off_x * u + off_y * v <= _GATE**2 * determinant:
             _correct(pose, P, (-seen_y, seen_x), S, off_x, off_y)
+            turn[0], turn[1] = np.cos(pose[2]), np.sin(pose[2])
 
 
 @jitted
