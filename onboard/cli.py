@@ -78,13 +78,22 @@ def record(
 def check(
     robot: RobotOption,
     output: Annotated[Path, typer.Option(metavar="DIR", help="Where recordings will go.")] = Path(),
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Where to save a picture with the tags found.  [default: check.jpg beside robot.yaml]"
+        ),
+    ] = None,
 ) -> None:
-    """Check every device before driving; exit code 1 if one fails."""
+    """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, hours left.
+
+    Exit code 1 if one fails.
+    """
     from onboard.check import check_robot
     from onboard.robot_files import RobotFiles
 
     failed = False
-    for result in check_robot(RobotFiles(robot), output):
+    for result in check_robot(RobotFiles(robot), output, picture or robot.with_name("check.jpg")):
         typer.echo(f"{'ok  ' if result.passed else 'FAIL'} {result.name}: {result.text}")
         failed = failed or not result.passed
     if failed:

@@ -188,7 +188,12 @@ def test_check_tells_of_each_device(tmp_path: Path) -> None:
         f"ok   {name}" for name in ("wheels", "camera", "detection", "clock", "disk")
     ]
     assert "160x120 px" in said
-    assert "tag36h11 9" in said
+    assert f"tag36h11 9; picture: {tmp_path / 'check.jpg'}" in said
+    drawn = cv2.imread(str(tmp_path / "check.jpg"))
+    assert drawn is not None
+    green = (drawn[:, :, 1] > 150) & (drawn[:, :, 0] < 120) & (drawn[:, :, 2] < 120)
+    edge = np.linspace(CORNERS[1], CORNERS[2], 9)[1:-1]  # its right side
+    assert all(green[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3].any() for x, y in edge)
 
 
 def test_check_fails_for_what_is_missing_or_does_not_fit(tmp_path: Path) -> None:

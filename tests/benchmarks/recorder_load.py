@@ -94,7 +94,7 @@ def pictures(load: Load) -> list[bytes]:
 
 
 def _speak(load: Load, folder: Path, go: Any, measured: Any) -> None:
-    port = PtyPort(folder / "wheels")
+    port = PtyPort(folder / "wheels", patient=True)  # held up itself, it would send more at once than a wire can
     times: list[int] = []
 
     def act(index: int) -> None:
