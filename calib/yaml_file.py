@@ -16,6 +16,7 @@ from calib.files import written_whole
 Model = TypeVar("Model", bound=BaseModel)
 
 _LONGEST_VALUE = 60  # characters of a bad value worth repeating
+_LONGEST_TEXT = 1 << 17  # characters: a second's work; logs carry such texts, and anybody may have made a log
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 
@@ -71,8 +72,10 @@ def parse_mapping(text: str, source: str) -> dict[str, Any]:
         source: what to call it in errors, usually the path.
 
     Raises:
-        CalibError: not YAML, or not a mapping.
+        CalibError: too long, not YAML, or not a mapping.
     """
+    if len(text) > _LONGEST_TEXT:
+        raise CalibError(f"{source}: has {len(text)} characters, limit {_LONGEST_TEXT}; is this the right file?")
     try:
         # A loader built on SafeLoader makes plain data only.
         data = yaml.load(text, Loader=_Loader)

@@ -34,8 +34,11 @@ from onboard.messages import (
     TagDetections,
     WheelEncoders,
 )
+from onboard.picture import claimed_size
 
 _DETECTIONS: Final = "/tags/detections"
+# A camera's JPEG spends at least 6 bits on 64 pixels; a bomb takes minutes.
+_PIXELS_PER_BYTE: Final = 128
 _QUEUED: Final = 4  # pictures in memory for each process
 
 
@@ -187,6 +190,9 @@ def _detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[D
             idle.put(children[-1])
 
         def detect(picture: bytes) -> DetectionResult:
+            width_px, height_px = claimed_size(picture)
+            if width_px * height_px > _PIXELS_PER_BYTE * len(picture):
+                return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
             detector = idle.get()
             try:
                 return detector.detect(picture)

@@ -1,5 +1,6 @@
 """Pictures as bytes and as arrays."""
 
+import struct
 from typing import Final
 
 import cv2
@@ -8,6 +9,10 @@ from numpy.typing import NDArray
 
 from onboard.errors import OnboardError
 
+# Detecting takes 11 bytes of memory for each.
+_MOST_PIXELS: Final = 1 << 24
+_PNG_SIZE_AT: Final = 16
+_JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers that begin a frame
 _JPEG_END: Final = b"\xff\xd9"
 
 
@@ -32,10 +37,27 @@ def decode(encoded: bytes) -> NDArray[np.uint8]:
 def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
     if not is_complete(encoded):
         raise OnboardError(f"picture of {len(encoded)} bytes is cut short or neither PNG nor JPEG")
+    width_px, height_px = claimed_size(encoded)
+    if not 0 < width_px * height_px <= _MOST_PIXELS:
+        raise OnboardError(f"picture claims {width_px}x{height_px} pixels, limit {_MOST_PIXELS} in all")
     picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), mode)
     if picture is None:
         raise OnboardError(f"picture of {len(encoded)} bytes cannot be decoded")
     return np.asarray(picture, dtype=np.uint8)
+
+
+def claimed_size(encoded: bytes) -> tuple[int, int]:
+    """(width_px, height_px) as a PNG or JPEG file's head has them, (0, 0) where it has none; nothing is decoded."""
+    if not is_jpeg(encoded):
+        width_px, height_px = struct.unpack_from(">II", encoded.ljust(_PNG_SIZE_AT + 8, b"\0"), _PNG_SIZE_AT)
+        return width_px, height_px
+    at = 2
+    while at + 9 <= len(encoded):
+        _, marker, length, _, height_px, width_px = struct.unpack_from(">BBHBHH", encoded, at)
+        if marker in _JPEG_FRAMES:
+            return width_px, height_px
+        at += 2 + length
+    return 0, 0
 
 
 def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:

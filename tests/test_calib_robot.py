@@ -200,3 +200,8 @@ def test_a_bad_value_gives_one_clear_line(text: str, words: list[str]) -> None:
 def test_a_missing_file_gives_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match=r"robot\.yaml: cannot be read \(No such file or directory\); check the path"):
         read_robot_yaml(tmp_path / "robot.yaml")
+
+
+def test_a_file_that_would_take_minutes_is_refused_at_once() -> None:
+    with pytest.raises(CalibError, match=r"long\.yaml: has \d+ characters, limit 131072"):
+        parse_robot_yaml(SMALLEST + "# x\n" * 40_000, "long.yaml")
