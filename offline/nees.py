@@ -70,16 +70,17 @@ def turns_rad(component: Component, truth: Truth, T_world_map: FloatArray, place
             T_map_base = se2.between(T_world_map, T_world_base)
             positions.append(run.T_map_base[covered, :2])
             errors.append(se2.wrap_angle(run.T_map_base[:, 2] - T_map_base[:, 2])[covered])
-    keyframes_m = np.concatenate(positions)
-    errors_rad: FloatArray = np.concatenate(errors)
+    keyframes_m, errors_rad = np.concatenate(positions), np.concatenate(errors)
     nearest = [int(np.argmin(((keyframes_m - place) ** 2).sum(axis=1))) for place in places_m]
-    return np.array([errors_rad[i] for i in nearest], dtype=np.float64)
+    turns: FloatArray = np.array([errors_rad[i] for i in nearest], dtype=np.float64)
+    return turns
 
 
 def _differences(places_m: FloatArray) -> FloatArray:
     """(N + 1, N + 1, 2) from place to place, the origin being the last."""
     places = np.concatenate([places_m, np.zeros((1, 2))])
-    return places[:, None] - places[None]
+    differences: FloatArray = places[:, None] - places[None]
+    return differences
 
 
 def _weights(covariance: FloatArray) -> FloatArray:
