@@ -16,6 +16,8 @@ from onboard.messages import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
+_MOST_RESETS = 1000  # each begins a chain of its own, and between so many nothing is known
+
 
 def stretches_of(
     wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path
@@ -45,6 +47,10 @@ def _encoder_stretches(readings: Sequence[WheelRow], robot: Robot, log: Path) ->
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
+    if len(cuts) > _MOST_RESETS:
+        raise OfflineError(
+            f"{log}: /wheels: the controller restarted {len(cuts)} times, limit {_MOST_RESETS}; see to its power supply"
+        )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
     stretches: list[WheelTrack] = []
     warnings: list[str] = []
