@@ -29,6 +29,7 @@ class LogLosses:
     Attributes:
         places: the first of the damaged places.
         n_places: how many there are.
+        n_torn: at how many of these bytes were passed over.
         n_bytes: passed over there.
         n_chunks: whole chunks that an index names and that were not found.
         n_undecodable: messages in good chunks that no schema of ours fits.
@@ -38,6 +39,7 @@ class LogLosses:
 
     places: list[Damage] = field(default_factory=list)
     n_places: int = 0
+    n_torn: int = 0
     n_bytes: int = 0
     n_chunks: int = 0
     n_undecodable: int = 0
@@ -47,6 +49,7 @@ class LogLosses:
     def add(self, damage: Damage) -> None:
         """Notes one place."""
         self.n_places += 1
+        self.n_torn += damage.n_bytes > 0
         self.n_bytes += damage.n_bytes
         if len(self.places) < _PLACES_KEPT:
             self.places.append(damage)
@@ -69,8 +72,8 @@ class LogLosses:
 
     @property
     def n_lost(self) -> int:
-        """How many things are lost, as far as they can be counted; a file cut short as such is none."""
-        return self.n_places + self.n_chunks + self.n_undecodable
+        """How many things are lost, as far as they can be counted; a missing end or index as such is none."""
+        return self.n_torn + self.n_chunks + self.n_undecodable
 
     def __bool__(self) -> bool:
         """Whether anything is amiss, an unfinished file included."""
