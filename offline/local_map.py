@@ -1,32 +1,42 @@
-"""One chain solved alone, in the frame of its start."""
+"""One chain solved alone, in the frame of its start.
 
-from dataclasses import dataclass
-from typing import Final
+A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
+from there does not fit together, the drive is built up again with other draws of the wheels' noise, until one fits.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray
 from offline.chain import Chain
+from offline.coarse_chain import coarse_keyframes, coarsened, refined
+from offline.goodness import Goodness, fitted_windows
 from offline.graph import Graph, Parameter, build_graph
 from offline.odometry import chained
 from offline.run import TagKey
-from offline.solver import COST_TOLERANCE, Solution, solve
+from offline.solver import Solution, solve
 
-# A chain is built up in pieces over which dead reckoning stays in the right basin: what a wheel ratio 1 % off turns in
-# this distance (0.2 rad on a half-metre track) is far from losing a tag.
+# A chain is built up in pieces over which dead reckoning stays in the right valley: what a wheel ratio 1 % off turns in
+# this distance (0.2 rad on a half-metre track) is far from losing a tag. Later, when the wheels are known, they grow
+# with the way, so that the time does not grow with its square.
 _PIECE_M: Final = 10.0
+_PIECE_SHARE: Final = 0.01
 # In squared sigmas: a piece is only the next one's start.
 _PIECE_COST_TOLERANCE: Final = 1e-2
+_OTHER_STARTS: Final = 8
 
 
 @dataclass(frozen=True)
 class LocalMap:
-    """A chain in the frame of its start."""
+    """A chain in the frame of its start, and whether its readings fit together there."""
 
     chain: Chain
     graph: Graph
     solution: Solution
+    goodness: Goodness
 
     @property
     def T_start_base(self) -> FloatArray:
@@ -44,33 +54,70 @@ class LocalMap:
         return self.graph.calibration_of(self.solution.state)
 
 
+class _BuiltUp(NamedTuple):
+    """What is known of a chain as far as it has been built up."""
+
+    poses: FloatArray
+    wheel_calibration: FloatArray
+    tags: dict[TagKey, FloatArray]
+    calibration: dict[Parameter, float]
+
+
 def solve_local_map(chain: Chain) -> LocalMap:
-    """Builds the chain up piece by piece, each from the solution of the last; the last piece is the whole."""
-    poses = np.zeros((1, 3))
-    wheel_calibration = np.zeros(3)
-    tags: dict[TagKey, FloatArray] = {}
-    calibration: dict[Parameter, float] = {}
-    local_map: LocalMap | None = None
+    """Solves the whole chain from where building up leads.
+
+    Where the result does not fit together, other starts are tried; the first that fits counts, else the one of least
+    cost, whose `goodness` then says that it does not fit.
+    """
+    graph = build_graph([chain])
+    keyframes = coarse_keyframes(chain)
+    coarse = coarsened(chain, keyframes)
+    windows = fitted_windows(graph.problem)
+    rng = np.random.default_rng(0)
+    best: LocalMap | None = None
+    for attempt in range(1 + _OTHER_STARTS):
+        known = _built_up(coarse if attempt == 0 else _redrawn(coarse, rng))
+        poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
+        solution = solve(graph.problem, graph.start(poses, known.tags, known.calibration))
+        if best is None or solution.cost < best.solution.cost:
+            best = LocalMap(chain, graph, solution, windows.judge(solution.state))
+            if best.goodness.fits:
+                break
+    if best is None:
+        raise ValueError(f"{chain.name}: no start was tried")
+    return best
+
+
+def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The chain with one more draw of the wheels' noise: as likely a drive, whose valleys lie elsewhere."""
+    odometry = chain.odometry
+    error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
+    return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
+
+
+def _built_up(chain: Chain) -> _BuiltUp:
+    """Solves the chain piece by piece, each from the solution of the last."""
+    known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
     for n_keyframes in _pieces(chain):
         part = chain.prefix(n_keyframes)
         graph = build_graph([part])
-        start = graph.start(_extended(part, poses, wheel_calibration), tags, calibration)
-        whole = n_keyframes == len(chain.stamps_ns)
-        solution = solve(graph.problem, start, COST_TOLERANCE if whole else _PIECE_COST_TOLERANCE)
-        poses, wheel_calibration = solution.state.poses, graph.wheel_calibration(solution.state, 0)
-        tags, calibration = graph.tags_of(solution.state), graph.calibration_of(solution.state)
-        local_map = LocalMap(chain, graph, solution)
-    if local_map is None:
-        raise ValueError(f"{chain.name}: a chain has one keyframe at least")
-    return local_map
+        poses = _extended(part, known.poses, known.wheel_calibration)
+        start = graph.start(poses, known.tags, known.calibration)
+        state = solve(graph.problem, start, _PIECE_COST_TOLERANCE).state
+        known = _BuiltUp(
+            state.poses, graph.wheel_calibration(state, 0), graph.tags_of(state), graph.calibration_of(state)
+        )
+    return known
 
 
 def _pieces(chain: Chain) -> list[int]:
     """Numbers of keyframes at which to stop and solve; the last is all of them."""
-    distance_m = np.concatenate([[0.0], np.cumsum(chain.odometry.distance_m)])
-    piece = (distance_m / _PIECE_M).astype(np.int64)
-    cuts = np.flatnonzero(np.diff(piece)) + 1
-    return [*(int(cut) for cut in cuts if cut < len(distance_m)), len(distance_m)]
+    ends, last_m = [], 0.0
+    for keyframe, along_m in enumerate(np.cumsum(chain.odometry.distance_m).tolist(), start=1):
+        if along_m - last_m >= max(_PIECE_M, _PIECE_SHARE * along_m):
+            ends.append(keyframe)
+            last_m = along_m
+    return [*ends, len(chain.stamps_ns)]
 
 
 def _extended(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:

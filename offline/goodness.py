@@ -1,0 +1,221 @@
+"""Does a solve fit together? A check that knows no truth, for solves that may have ended in a wrong place.
+
+The chains are cut into windows of a few metres, each with its own start and its own place for each tag. In whichever
+valley the whole ended, a window is solved right, and what it leaves over shows how large the noise of wheels and
+readings is. The whole is the same problem under conditions: windows join, and a tag has one place. What the conditions
+cost, in squared sigmas of the noise so fitted, is chi-square with as many degrees of freedom as there are conditions
+(the test of nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise
+is fitted. A reading that is simply wrong costs the same on either side.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.factors import Columns, State, stacked
+from offline.odometry import chained
+from offline.robust import losses_and_weights
+from offline.solver import DEFAULT_LOSSES, Losses, Problem, Solution, solve
+
+# Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
+WINDOW_M: Final = 10.0
+# Once in a thousand good maps.
+FALSE_ALARM: Final = 1e-3
+# The sigmas that the estimate was told count like this many measurements of each kind.
+_TOLD: Final = 4.0
+# Fits end where a factor changes by less than this share; far below what the factors' own uncertainty moves the bound.
+_FACTOR_TOLERANCE: Final = 0.02
+_MAX_FITS: Final = 20
+_ROUNDING: Final = 1e-6
+_N_SIGNS: Final = 8
+_SEED: Final = 7
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """What it costs that all windows are one map.
+
+    Attributes:
+        chi_square: in squared sigmas of the fitted noise.
+        expected: how much of it noise accounts for: the number of conditions.
+        bound: what a good map exceeds once in a thousand times.
+        odometry_factor: the wheels' noise as a multiple of the sigmas that the estimate was told.
+        reading_factor: that of the readings.
+    """
+
+    chi_square: float
+    expected: int
+    bound: float
+    odometry_factor: float
+    reading_factor: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether noise accounts for it."""
+        return self.chi_square <= self.bound + _ROUNDING
+
+    def warnings(self, name: str) -> list[str]:
+        """A sentence where it does not; `name` is the run's or the component's."""
+        if self.fits:
+            return []
+        sentence = (
+            f"{name}: its readings contradict each other by more than their noise allows (chi-square "
+            f"{self.chi_square:.0f}, expected {self.expected}, at most {self.bound:.0f}): the solve may have ended in "
+            "a wrong place, tags may have been moved, or wheels or readings err in ways of their own; look at the map "
+            "before you trust it, and drive past known tags more often"
+        )
+        return [sentence]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What the windows of a problem say, whichever valley the whole may end in.
+
+    Attributes:
+        problem: the whole, by the sigmas that the estimate was told.
+        losses: of wheels and readings.
+        factors: (2,) the noise of wheels and of readings as a multiple of those sigmas.
+        redundancy: (2,) how many measurements each of the two rests on.
+        cost: of all windows apart, under that noise.
+        n_conditions: how many numbers more the windows have to fit with than the whole.
+    """
+
+    problem: Problem
+    losses: Losses
+    factors: FloatArray
+    redundancy: FloatArray
+    cost: float
+    n_conditions: int
+
+    def judge(self, state: State) -> Goodness:
+        """What it costs to join them in the valley of a state."""
+        together = solve(_scaled(self.problem, self.factors), state, losses=self.losses)
+        n = self.n_conditions
+        quantile = stats.f.isf(FALSE_ALARM, n, self.redundancy.min() + _TOLD) if n else 1.0
+        return Goodness(
+            chi_square=max(0.0, 2.0 * (together.cost - self.cost)),
+            expected=n,
+            bound=float(n * quantile),
+            odometry_factor=float(self.factors[0]),
+            reading_factor=float(self.factors[1]),
+        )
+
+
+def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows:
+    """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over."""
+    apart = in_windows(problem)
+    state = _dead_reckoned(problem, apart)
+    factors, redundancy = np.ones(2), np.zeros(2)
+    for _ in range(_MAX_FITS):
+        solution = solve(_scaled(apart, factors), state, losses=losses)
+        squares, redundancy = _left_over(solution)
+        before, factors = factors, np.sqrt((squares * factors**2 + _TOLD) / (redundancy + _TOLD))
+        state = solution.state
+        if np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
+            break
+    cost = solve(_scaled(apart, factors), state, losses=losses).cost
+    return Windows(problem, losses, factors, redundancy, cost, _freedom(problem) - _freedom(apart))
+
+
+def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
+    """The same poses cut into windows: no motion leads from one to the next, and each has tags of its own."""
+    window = _window_of_pose(problem, window_m)
+    odometry, readings = problem.odometry, problem.readings
+    inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
+    n_tags = len(problem.columns.tags)
+    seen, first_reading, tag = np.unique(
+        window[readings.pose] * n_tags + readings.tag, return_index=True, return_inverse=True
+    )
+    return Problem(
+        odometry=replace(
+            odometry,
+            first=odometry.first[inside],
+            motion=odometry.motion[inside],
+            whitening=odometry.whitening[inside],
+            jacobian=odometry.jacobian[inside],
+            parameters=odometry.parameters[inside],
+        ),
+        readings=replace(readings, tag=tag),
+        prior=problem.prior,
+        columns=_columns(window, len(seen), problem.columns.calibration >= 0),
+        anchor=readings.pose[first_reading],
+    )
+
+
+def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
+    """(P,) rising numbers, a new one at each chain's start."""
+    n_poses = len(problem.columns.poses)
+    driven_m, follows = np.zeros(n_poses), np.zeros(n_poses, dtype=np.bool_)
+    after = problem.odometry.first + 1
+    driven_m[after] = np.hypot(problem.odometry.motion[:, 0], problem.odometry.motion[:, 1])
+    follows[after] = True
+    starts = np.flatnonzero(~follows)
+    along_m = np.cumsum(driven_m)
+    along_m -= np.repeat(along_m[starts], np.diff(np.append(starts, n_poses)))
+    number = (along_m / window_m).astype(np.int64)
+    begins = ~follows
+    begins[1:] |= number[1:] != number[:-1]
+    return np.cumsum(begins) - 1
+
+
+def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
+    """Each window's first pose is held."""
+    free = np.append(False, window[1:] == window[:-1])
+    poses = np.where(free[:, None], 3 * (np.cumsum(free) - 1)[:, None] + np.arange(3), -1)
+    n = 3 * int(free.sum())
+    tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
+    n += 2 * n_tags
+    return Columns(poses, tags, np.where(calibrated, n + np.cumsum(calibrated) - 1, -1), n + int(calibrated.sum()))
+
+
+def _dead_reckoned(problem: Problem, windows: Problem) -> State:
+    """Motions one after the other, by nominal calibration; tags where their readings put them on average."""
+    first, motion = problem.odometry.first, problem.odometry.motion
+    poses = np.zeros((len(problem.columns.poses), 3))
+    for part in np.split(np.arange(len(first)), np.flatnonzero(np.diff(first) != 1) + 1):
+        if len(part):
+            poses[first[part[0]] : first[part[-1]] + 2] = chained(motion[part], np.zeros(3))
+    readings = windows.readings
+    n_tags = len(windows.columns.tags)
+    state = State(poses, np.zeros((n_tags, 2)), np.zeros(len(problem.prior.sigma)))
+    places, n = readings.places_in_map(state), np.bincount(readings.tag, minlength=n_tags)
+    mean = [np.bincount(readings.tag, places[:, axis], n_tags) / n for axis in (0, 1)]
+    return State(poses, np.stack(mean, axis=-1), state.calibration)
+
+
+def _scaled(problem: Problem, factors: FloatArray) -> Problem:
+    """With the noise of wheels and readings (2,) times as large."""
+    odometry, readings = problem.odometry, problem.readings
+    return replace(
+        problem,
+        odometry=replace(odometry, whitening=odometry.whitening / factors[0]),
+        readings=replace(readings, whitening=readings.whitening / factors[1]),
+    )
+
+
+def _freedom(problem: Problem) -> int:
+    """Measured numbers, priors included, over unknowns."""
+    return problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
+
+
+def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Losses (2,) of wheels and readings at the solution, and how much of them noise accounts for.
+
+    The latter is the number of residuals less the trace of J H^-1 J^T, an average over random signs z of
+    z^T J H^-1 J^T z (Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1989).
+    """
+    problem, state = solution.problem, solution.state
+    odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
+    readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))
+    jacobian, _ = stacked((problem.odometry.linearise(state, problem.columns),), problem.columns.n)
+    signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (_N_SIGNS, jacobian.shape[0]))
+    taken = 0.0
+    for z in signs:
+        pulled = jacobian.T @ z
+        taken += float(pulled @ solution.factorisation.solve(pulled)) / _N_SIGNS
+    free = max(0.0, jacobian.shape[0] - taken)
+    whole = max(0, _freedom(problem))
+    return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])
