@@ -94,6 +94,8 @@ class Run:
 
 # Readings with corrected bits are the ones that turn out to be phantoms.
 MAX_HAMMING = 0
+# The largest family has 587; a map's joint covariance grows with the square.
+_MOST_TAGS = 1000
 
 
 @dataclass
@@ -186,7 +188,7 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log)
     warnings += losses.lines()
-    tags, detections, positions = _tag_readings(collected)
+    tags, detections, positions = _tag_readings(collected, log)
     camera = _camera(collected, given.camera if given else None, log)
     if collected.n_other_size:
         pictures = counted(collected.n_other_size, "picture")
@@ -208,9 +210,11 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     )
 
 
-def _tag_readings(collected: _Collected) -> tuple[tuple[TagKey, ...], Detections, Positions]:
+def _tag_readings(collected: _Collected, log: Path) -> tuple[tuple[TagKey, ...], Detections, Positions]:
     keys = {key for _, key, _ in collected.sightings}
     keys |= {TagKey(o.family, o.tag_id) for message in collected.observations for o in message.observations}
+    if len(keys) > _MOST_TAGS:
+        raise OfflineError(f"{log}: {len(keys)} different tags, limit {_MOST_TAGS}; are their numbers right?")
     tags = tuple(sorted(keys))
     index = {key: i for i, key in enumerate(tags)}
     n = len(collected.sightings)
