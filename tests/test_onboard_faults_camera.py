@@ -212,6 +212,15 @@ def test_row_37_steps_of_the_wall_clock_are_told_and_the_log_goes_on_evenly(tmp_
     assert len(wheels_of(tmp_path / "run1")) == 400
 
 
+def test_row_37_the_runs_clock_does_not_step_with_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, real = RunClock(), time.time_ns
+    before_ns = clock.now_ns()
+    for step_ns in (HOUR_NS, -HOUR_NS, -real(), 2_145_916_800 * S - real()):
+        monkeypatch.setattr(time, "time_ns", lambda step_ns=step_ns: real() + step_ns)
+        assert 0 <= clock.now_ns() - before_ns < 60 * S
+        assert 0 <= clock.from_monotonic(time.monotonic_ns()) - before_ns < 60 * S
+
+
 def test_row_37_slewing_is_no_step(tmp_path: Path) -> None:
     core = made_core(tmp_path)
     for index in range(400):

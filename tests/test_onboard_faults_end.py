@@ -238,7 +238,8 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
     [
         ("radius_left_m: 0.05", "radius_left_m: 50", ["robot.yaml", "wheels.radius_left_m", "50", "10"]),
         ("radius_left_m: 0.05", "radius_left_m: -1", ["robot.yaml", "wheels.radius_left_m", "-1", "0"]),
-        ("ticks_per_turn: 1024", "ticks: 1024", ["robot.yaml", "wheels.ticks"]),
+        ("track_m: 0.3", "track_m: 0.3, wheelbase_m: 0.4", ["robot.yaml", "wheels.wheelbase_m"]),
+        ("ticks_per_turn: 1024", "tics_per_turn: 1024", ["robot.yaml", "wheels.ticks_per_turn"]),
         ("camera: camera.yaml", "camera: gone.yaml", ["gone.yaml"]),
         ("camera: camera.yaml\n", "", ["robot.yaml", "devices.camera", "calibration"]),
         ("encoder_baud: 115200", "encoder_baud: 0", ["robot.yaml", "devices.encoder_baud", "0"]),

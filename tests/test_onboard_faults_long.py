@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from fixtures.devices import PictureFolder
+from onboard.clock import RunClock
 from onboard.encoder_protocol import WheelLine, format_line
 from onboard.messages import StampSource
+from onboard.picture_folder import FolderCamera
 from tests.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.made_cores import MS, START_NS, S, made_core
 
@@ -80,3 +82,14 @@ def test_row_42_a_live_day_at_ten_times_the_speed(tmp_path: Path, seconds: float
     assert min(look[0] for look in last) < max(look[0] for look in first) + 20.0, looks
     for what in (1, 2, 3):
         assert min(look[what] for look in last) <= max(look[what] for look in first), looks
+
+
+def test_row_42_a_folder_that_is_emptied_behind_takes_no_memory(tmp_path: Path) -> None:
+    camera, shown = FolderCamera(tmp_path, RunClock(), since_ns=0), PictureFolder(tmp_path, keep=10)
+    camera.open()
+    n_seen = 0
+    for _ in range(300):
+        shown.show(tag_jpeg())
+        n_seen += len(camera.read(1.0))
+    assert n_seen == 300
+    assert len(camera._seen) + len(camera._unfinished) <= 11
