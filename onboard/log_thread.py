@@ -12,7 +12,7 @@ from onboard.log_writer import LogNote
 from onboard.messages import EventKind, Severity
 
 _PERIOD_S: Final = 0.5  # with the time that the disk takes, what is older than a second is safe
-_END_LIMIT_S: Final = 3.0
+_END_LIMIT_S: Final = 2.0  # with what devices and detection may take, a recording ends within 5 s
 
 
 class LogThread:

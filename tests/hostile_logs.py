@@ -1,13 +1,8 @@
-"""Logs of at most 1 MiB made to take memory and time, and what a command takes of both for each."""
+"""Logs of at most 1 MiB made to take memory and time."""
 
-import json
 import struct
-import subprocess
-import sys
 import zlib
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -240,69 +235,3 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),
     "PNG of 12000 x 12000": lambda: pictures([png(12000)]),
 }
-
-
-class Taken(NamedTuple):
-    """What one command took of one file."""
-
-    code: int
-    seconds: float
-    extra_bytes: int  # above the idle size
-    said: str
-
-
-# Measures in one process what each file takes; the peak is reset in between. Children count too.
-_MEASURE = """
-import contextlib, importlib, io, json, re, shutil, sys, tempfile, time
-from pathlib import Path
-from offline import cli
-for name in sys.argv[1].split(","):
-    importlib.import_module(name)
-
-def status(name, pid="self"):
-    return int(re.search(name + r":\\s+(\\d+)", Path(f"/proc/{pid}/status").read_text())[1]) * 1024
-
-for line in sys.stdin:
-    command, path = json.loads(line)
-    place = Path(tempfile.mkdtemp())
-    output = {"info": [], "salvage": ["-o", place / "new.mcap"]}.get(command, ["-o", place / "new"])
-    sys.argv = ["groundsbot-offline", command, path, *map(str, output)]
-    Path("/proc/self/clear_refs").write_text("5")
-    idle = status("VmRSS")
-    out, start = io.StringIO(), time.monotonic()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-        try:
-            cli.main()
-        except SystemExit as ended:
-            code = ended.code
-        except BaseException as error:
-            code = 99
-            print("TRACEBACK", type(error).__name__, error)
-    taken = time.monotonic() - start, status("VmHWM") - idle
-    shutil.rmtree(place)
-    print(json.dumps([code or 0, *taken, out.getvalue()[-300:]]), flush=True)
-"""
-
-
-_MODULES = {
-    "info": "offline.info",
-    "salvage": "offline.salvage",
-    "detect": "offline.detect,onboard.picture",
-    "map": "offline.map_command",
-}
-
-
-def measure(command: str, files: dict[str, Path]) -> dict[str, Taken]:
-    """What `groundsbot-offline COMMAND` takes of each file."""
-    asked = "".join(json.dumps([command, str(path)]) + "\n" for path in files.values())
-    ended = subprocess.run(
-        [sys.executable, "-c", _MEASURE, _MODULES[command]],
-        input=asked,
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parents[1],
-    )
-    lines = ended.stdout.splitlines()
-    assert len(lines) == len(files), ended.stderr
-    return {name: Taken(*json.loads(line)) for name, line in zip(files, lines, strict=True)}

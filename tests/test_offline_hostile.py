@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.hostile_logs import HOSTILE, LIMIT_BYTES, measure
+from tests.hostile_logs import HOSTILE, LIMIT_BYTES
+from tests.taken_by_commands import measure
 
 EXTRA_BYTES = 256 << 20
 # The others take seconds each: tests.benchmarks.hostile measures all.

@@ -9,7 +9,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.hostile_logs import HOSTILE, LIMIT_BYTES, measure
+from tests.hostile_logs import HOSTILE, LIMIT_BYTES
+from tests.taken_by_commands import measure
 
 _SECONDS = 10.0
 _EXTRA_BYTES = 256 << 20
