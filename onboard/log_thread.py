@@ -60,7 +60,7 @@ class LogThread:
         self._thread.join(_END_LIMIT_S)
         if self._thread.is_alive():
             text = f"the disk did not answer for {_END_LIMIT_S:g} s: the files stay unfinished"
-            self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"finished file": 1}))
+            self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"log left unfinished": 1}))
 
     def _work(self) -> None:
         while True:

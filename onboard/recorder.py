@@ -397,7 +397,7 @@ class RecorderCore:
 
     def _count(self, note: LogNote) -> None:
         for topic, count in note.lost.items():
-            self.losses["pictures" if topic == PICTURE_TOPIC else f"{topic} messages"] += count
+            self.losses["pictures" if topic == PICTURE_TOPIC else topic] += count
 
     def _write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
         log_time_ns = max(receive_ns, self._writer.last_log_time_ns)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from onboard import log_thread as log_thread_module
 from onboard.disk_room import one_recorder
 from onboard.errors import LogError, OnboardError
 from onboard.log_keeper import LogKeeper
@@ -174,6 +175,20 @@ def test_row_40_a_stalled_disk_shows_and_earlier_data_are_intact(tmp_path: Path)
         assert not losses.n_lost
         disk.may_sync.set()
         wait_until(lambda: thread.stalled_s < 1.0)
+
+
+def test_row_40_closing_gives_a_stalled_disk_up_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_thread_module, "_END_LIMIT_S", 0.1)
+    disk = TroubledDisk()
+    with log_thread(make_keeper(tmp_path, disk), disk) as thread:
+        wait_until(lambda: bool(thread.status.files))
+        disk.may_sync.clear()
+        thread.write(*wheel_entry(0, START_NS))
+        thread.close()
+        (note,) = thread.take_notes()
+        assert "the files stay unfinished" in note.text
+        assert note.lost == {"log left unfinished": 1}
+        assert read_all(tmp_path / "run1")[1].unfinished
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
