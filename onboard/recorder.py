@@ -134,6 +134,7 @@ class RecorderCore:
         else:
             self._writer = open_log(self.folder, head, run.start_ns, keep_pictures)
         self._keep_pictures = keep_pictures
+        self._keep_all = self._options.picture_rate_hz >= run.robot.devices.camera_fps
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
 
@@ -255,8 +256,8 @@ class RecorderCore:
 
     def wants_picture(self, stamp_ns: int) -> bool:
         """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
-        if not self._keep_pictures:
-            return False
+        if not self._keep_pictures or self._keep_all:
+            return self._keep_pictures
         period_ns = round(_NS_PER_S / self._options.picture_rate_hz)
         late_ns = stamp_ns - self._next_picture_ns
         if late_ns < -_PICTURE_JITTER * period_ns:

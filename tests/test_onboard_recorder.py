@@ -129,6 +129,12 @@ def test_pictures_whose_times_jitter_are_kept_all_the_same(tmp_path: Path) -> No
     assert all(kept)
 
 
+def test_at_the_cameras_own_rate_every_picture_is_kept(tmp_path: Path) -> None:
+    core = make_core(tmp_path, pictures_hz=15.0)
+    assert all(core.wants_picture(START_NS + index * MS) for index in range(100))
+    core.close(START_NS + S)
+
+
 def test_lost_lines_are_counted_and_told(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     core.close(drive(core, 300, skip=range(150, 215)))
