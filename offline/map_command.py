@@ -137,6 +137,7 @@ def _alignment_line(alignment: AlignmentResult) -> str:
         f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
         f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
         f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
+        + ("" if alignment.is_sure else "; not sure, so not used")
     )
 
 

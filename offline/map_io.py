@@ -23,6 +23,7 @@ from offline.result import (
     CalibrationResult,
     Component,
     MapResult,
+    RivalResult,
     RunResult,
     StartToStart,
     TagResult,
@@ -173,9 +174,17 @@ def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
         "n_shared": alignment.n_shared,
         "n_inliers": alignment.n_inliers,
         "inlier_rmse_m": _plain(alignment.inlier_rmse_m),
-        "outliers": [{"family": family, "tag_id": tag_id} for family, tag_id in alignment.outliers],
-        "rivals": None,
+        "outliers": _tag_names_json(alignment.outliers),
+        "is_sure": alignment.is_sure,
+        "rivals": [
+            {"transform": _plain(rival.T_from_to), "n_inliers": len(rival.tags), "tags": _tag_names_json(rival.tags)}
+            for rival in alignment.rivals
+        ],
     }
+
+
+def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
+    return [{"family": family, "tag_id": tag_id} for family, tag_id in tags]
 
 
 def _plain(value: FloatArray | float | int | str | None) -> Any:  # noqa: ANN401 - nested lists of any depth
@@ -312,8 +321,14 @@ def _alignment(entry: dict[str, Any]) -> AlignmentResult:
         n_shared=entry["n_shared"],
         n_inliers=entry["n_inliers"],
         inlier_rmse_m=_number(entry["inlier_rmse_m"]),
-        outliers=tuple((outlier["family"], outlier["tag_id"]) for outlier in entry["outliers"]),
+        outliers=_tag_names(entry["outliers"]),
+        is_sure=entry["is_sure"],
+        rivals=tuple(RivalResult(_array(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]),
     )
+
+
+def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:
+    return tuple((entry["family"], entry["tag_id"]) for entry in entries)
 
 
 def _number(value: float | None) -> float:

@@ -1,25 +1,43 @@
-"""Many local maps -> components, each with one frame: which chains the shared tags join, and where each starts."""
+"""Many local maps -> components, each with one frame: which chains the shared tags join, and where each starts.
 
-from collections.abc import Sequence
+Nothing here depends on the order of the maps but the frame: pairs are aligned in the order of names, and what is equal
+is settled by them.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import log, pi
 
 import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray
 from offline.alignment import Alignment, align
+from offline.condensed import CondensedMap, condense
+from offline.cycles import Contradiction, Link, consistent_links, spanning_tree
 from offline.local_map import LocalMap
+from offline.measured import Placement
+from offline.run import TagKey
 
 
 @dataclass(frozen=True)
 class PairAlignment:
-    """Two local maps, by index, and how the second lies in the first; None where they share too little."""
+    """Two local maps, by index, and how the second lies in the first.
+
+    Attributes:
+        a: whose name comes first.
+        b: the other.
+        shared: the tags in both.
+        alignment: by these; None where no two of them fit together.
+        placement: as somebody measured it, of the starts.
+    """
 
     a: int
     b: int
-    n_shared: int
+    shared: tuple[TagKey, ...]
     alignment: Alignment | None
+    placement: Placement | None = None
 
 
 @dataclass(frozen=True)
@@ -35,87 +53,125 @@ class Group:
     T_frame_start: FloatArray
 
 
-def align_pairs(maps: Sequence[LocalMap]) -> list[PairAlignment]:
-    """Every pair of local maps that shares a tag."""
+@dataclass(frozen=True)
+class Merge:
+    """What hangs together, and why.
+
+    Attributes:
+        pairs: all that share a tag or a measured placement, in order of the maps' names.
+        links: by which maps were joined, surest first.
+        contradictions: links that others overruled.
+        groups: largest first.
+    """
+
+    pairs: tuple[PairAlignment, ...]
+    links: tuple[Link, ...]
+    contradictions: tuple[Contradiction, ...]
+    groups: tuple[Group, ...]
+
+
+def merge(
+    maps: Sequence[LocalMap],
+    placements: Mapping[tuple[int, int], Placement] | None = None,
+    variance_factors: Sequence[float] | None = None,
+) -> Merge:
+    """Aligns all pairs, keeps the alignments that go together, and places what they join.
+
+    Args:
+        maps: solved, of distinct names.
+        placements: measured poses of the second map's start in the first one's, by indices.
+        variance_factors: by which each map's noise is larger than its solve was told; from what the solve left over
+            where None, 1 at least.
+    """
+    condensed = _condensed(maps, variance_factors or [_variance_factor(each) for each in maps])
+    pairs = tuple(_aligned_pairs(maps, condensed, placements or {}))
+    links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
+    return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
+
+
+def _variance_factor(local_map: LocalMap) -> float:
+    """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that."""
+    problem = local_map.graph.problem
+    n_priors = int((problem.prior.sigma > 0.0).sum())
+    freedom = problem.n_residuals + n_priors - problem.columns.n
+    return max(1.0, 2.0 * local_map.solution.cost / freedom) if freedom > 0 else 1.0
+
+
+def _condensed(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
+    """Each map reduced to the tags that others have too; None where there are none."""
+    count: dict[TagKey, int] = {}
+    for local_map in maps:
+        for tag in local_map.graph.tags:
+            count[tag] = count.get(tag, 0) + 1
+    shared = [[tag for tag in local_map.graph.tags if count[tag] > 1] for local_map in maps]
+    return [condense(m, tags, factor) if tags else None for m, tags, factor in zip(maps, shared, factors, strict=True)]
+
+
+def _aligned_pairs(
+    maps: Sequence[LocalMap],
+    condensed: Sequence[CondensedMap | None],
+    placements: Mapping[tuple[int, int], Placement],
+) -> list[PairAlignment]:
     pairs = []
-    for a, b in combinations(range(len(maps)), 2):
-        tags_a, tags_b = maps[a].tags_m, maps[b].tags_m
-        n_shared = len(tags_a.keys() & tags_b.keys())
-        if n_shared:
-            pairs.append(PairAlignment(a, b, n_shared, align(tags_a, tags_b)))
+    by_name = sorted(range(len(maps)), key=lambda i: maps[i].chain.name)
+    for a, b in combinations(by_name, 2):
+        placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
+        map_a, map_b = condensed[a], condensed[b]
+        shared: tuple[TagKey, ...] = ()
+        alignment = None
+        if map_a is not None and map_b is not None:
+            shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
+            alignment = align(map_a, map_b, placement)
+        if shared or placement is not None:
+            pairs.append(PairAlignment(a, b, shared, alignment, placement))
     return pairs
 
 
-def group(maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]) -> list[Group]:
-    """Components of the maps under the alignments found, largest first (most tags, then most keyframes).
+def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[CondensedMap | None]) -> list[Link]:
+    """One where the pair is joined: by its tags, or else by what was measured."""
+    names = maps[pair.a].chain.name, maps[pair.b].chain.name
+    alignment, placement = pair.alignment, pair.placement
+    if alignment is not None and alignment.is_sure:
+        return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.evidence_nats, names)]
+    if placement is None:
+        return []
+    # A link is of the frames that the maps' roots carry, what was measured of the starts themselves.
+    frame_a, frame_b = condensed[pair.a], condensed[pair.b]
+    covariance = placement.covariance.copy()
+    if frame_a is not None:
+        back = se2.adjoint(se2.inverse(placement.T_a_b))
+        covariance += back @ frame_a.frame_covariance @ back.T
+    if frame_b is not None:
+        covariance += frame_b.frame_covariance
+    # Against a start anywhere within a kilometre.
+    evidence_nats = log(2.0 * pi * 1e6) - 0.5 * float(np.linalg.slogdet(2.0 * pi * covariance)[1])
+    return [Link(pair.a, pair.b, placement.T_a_b, covariance, evidence_nats, names)]
 
-    Starts follow from the strongest alignments (a spanning tree by number of inliers, then by their spread), so that
-    they do not depend on the order of the logs.
-    """
-    tree = _spanning_tree(len(maps), pairs)
-    left = set(range(len(maps)))
+
+def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
+    """Components of the maps under a tree of links, largest first (most tags, then most keyframes)."""
+    neighbours: dict[int, list[Link]] = {i: [] for i in range(len(maps))}
+    for link in tree:
+        neighbours[link.a].append(link)
+        neighbours[link.b].append(link)
     groups = []
-    while left:
-        frame = min(left)
-        placed = {frame: np.zeros(3)}
-        queue = [frame]
-        while queue:
-            here = queue.pop(0)
-            for there, T_here_there in tree[here]:
+    placed: dict[int, FloatArray] = {}
+    for first in sorted(range(len(maps)), key=lambda i: maps[i].chain.name):
+        if first in placed:
+            continue
+        placed[first] = np.zeros(3)
+        members = [first]
+        for here in members:
+            for link in neighbours[here]:
+                there, T_here_there, _ = link.seen_from(here)
                 if there not in placed:
                     placed[there] = se2.compose(placed[here], T_here_there)
-                    queue.append(there)
-        members = tuple(sorted(placed))
-        left -= placed.keys()
-        groups.append(Group(members, np.array([placed[m] for m in members])))
+                    members.append(there)
+        members.sort()
+        groups.append(Group(tuple(members), se2.between(placed[members[0]], np.array([placed[m] for m in members]))))
 
     def size(candidate: Group) -> tuple[int, int, int]:
         tags = {tag for m in candidate.members for tag in maps[m].graph.tags}
         return -len(tags), -sum(len(maps[m].T_start_base) for m in candidate.members), candidate.members[0]
 
     return sorted(groups, key=size)
-
-
-def reason_apart(
-    name: str, others: Sequence[int], index: int, maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]
-) -> str:
-    """Why a local map is joined to none of the others, and what would help."""
-    if not maps[index].graph.tags:
-        return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"
-    best: PairAlignment | None = None
-    for pair in pairs:
-        if (
-            index in (pair.a, pair.b)
-            and (pair.a in others or pair.b in others)
-            and (best is None or pair.n_shared > best.n_shared)
-        ):
-            best = pair
-    if best is None:
-        return f"{name} shares no tag with the others; drive it past two tags that another run saw"
-    partner = maps[best.b if best.a == index else best.a].chain.name
-    if best.n_shared == 1:
-        return f"{name} shares only one tag with {partner}; one more shared tag would do"
-    return (
-        f"{name} shares {best.n_shared} tags with {partner}, but no two of them lie the same way in both maps "
-        "(within 0.5 m): were tags moved between the runs?"
-    )
-
-
-def _spanning_tree(n: int, pairs: Sequence[PairAlignment]) -> list[list[tuple[int, FloatArray]]]:
-    """Kruskal's: neighbours of each map with T_here_there, strongest alignments first."""
-    root = list(range(n))
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            i = root[i]
-        return i
-
-    tree: list[list[tuple[int, FloatArray]]] = [[] for _ in range(n)]
-    found = [(pair, pair.alignment) for pair in pairs if pair.alignment is not None]
-    for pair, alignment in sorted(found, key=lambda f: (-f[1].n_inliers, f[1].rmse_m)):
-        root_a, root_b = find(pair.a), find(pair.b)
-        if root_a != root_b:
-            root[root_a] = root_b
-            tree[pair.a].append((pair.b, alignment.T_a_b))
-            tree[pair.b].append((pair.a, se2.inverse(alignment.T_a_b)))
-    return tree

@@ -10,9 +10,10 @@ from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
 from offline.local_map import LocalMap, solve_local_map
-from offline.merge import Group, PairAlignment, align_pairs, group, reason_apart
+from offline.merge import Group, merge
+from offline.merge_report import alignment_results, merge_warnings
 from offline.observations import check_tag_sizes
-from offline.result import AlignmentResult, CalibrationResult, Component, MapResult
+from offline.result import CalibrationResult, Component, MapResult
 from offline.run import RobotFile, Run, load_run
 from offline.solver import Solution
 from offline.stages import Stages
@@ -70,12 +71,11 @@ def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> Map
             maps.append(solve_local_map(chain))
             done()
     with stages.stage("aligning local maps"):
-        pairs = align_pairs(maps)
-        groups = group(maps, pairs)
+        merged = merge(maps)
     components: list[Component] = []
     calibration: list[CalibrationResult] = []
     warnings = [w for run in runs for w in run.warnings] + [w for chain in chains for w in chain.warnings]
-    for i, members in enumerate(groups):
+    for i, members in enumerate(merged.groups):
         graph, solution = solve_global_map(maps, members, stages)
         with stages.stage("covariances"):
             components.append(component_of(graph, solution))
@@ -84,10 +84,10 @@ def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> Map
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
         warnings += weak_parts(graph, solution) + _contradictions(maps, members, i, solution)
     warnings += _calibration_warnings(calibration)
-    warnings += _alignment_warnings(maps, pairs) + _chain_warnings(chains) + _reasons_apart(maps, groups, pairs)
+    warnings += _chain_warnings(chains) + merge_warnings(maps, merged)
     return MapResult(
         components=tuple(components),
-        alignments=tuple(_alignment_result(maps, pair) for pair in pairs if pair.alignment is not None),
+        alignments=alignment_results(maps, merged),
         noise=noise,
         calibration=tuple(calibration),
         warnings=tuple(dict.fromkeys(warnings)),
@@ -115,37 +115,6 @@ def _check_distinct(runs: Sequence[Run]) -> None:
         seen[run.name] = run
 
 
-def _alignment_result(maps: Sequence[LocalMap], pair: PairAlignment) -> AlignmentResult:
-    alignment = pair.alignment
-    if alignment is None:
-        raise ValueError("no alignment to report")
-    return AlignmentResult(
-        from_run=maps[pair.a].chain.name,
-        to_run=maps[pair.b].chain.name,
-        T_from_to=alignment.T_a_b,
-        n_shared=pair.n_shared,
-        n_inliers=alignment.n_inliers,
-        inlier_rmse_m=alignment.rmse_m,
-        outliers=tuple((*tag,) for tag, fits in zip(alignment.shared, alignment.inlier, strict=True) if not fits),
-    )
-
-
-def _alignment_warnings(maps: Sequence[LocalMap], pairs: Sequence[PairAlignment]) -> list[str]:
-    """Tags that two runs saw in different places."""
-    warnings = []
-    for pair in pairs:
-        if pair.alignment is None:
-            continue
-        odd = [tag for tag, fits in zip(pair.alignment.shared, pair.alignment.inlier, strict=True) if not fits]
-        if odd:
-            names = ", ".join(str(tag.tag_id) for tag in odd)
-            warnings.append(
-                f"tag {names} lies elsewhere in {maps[pair.b].chain.name} than in {maps[pair.a].chain.name} "
-                "(more than 0.5 m): moved between the runs, or carried about?"
-            )
-    return warnings
-
-
 def _calibration_warnings(calibration: Sequence[CalibrationResult]) -> list[str]:
     """Corrections that what was known beforehand makes all but impossible."""
     return [
@@ -168,18 +137,3 @@ def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
                 f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two are needed to join it to a run"
             )
     return warnings
-
-
-def _reasons_apart(maps: Sequence[LocalMap], groups: Sequence[Group], pairs: Sequence[PairAlignment]) -> list[str]:
-    """For each component after the first: why it is one of its own, told of the run that is nearest to joining it."""
-    reasons = []
-    for i, members in enumerate(groups[1:], start=1):
-        others = {m for g in groups for m in g.members if g is not members}
-
-        def n_shared(member: int, others: set[int] = others) -> int:
-            ends = [(pair.b if pair.a == member else pair.a, pair) for pair in pairs if member in (pair.a, pair.b)]
-            return max((pair.n_shared for end, pair in ends if end in others), default=0)
-
-        nearest = max(members.members, key=n_shared)
-        reasons.append(f"component {i}: {reason_apart(maps[nearest].chain.name, sorted(others), nearest, maps, pairs)}")
-    return reasons

@@ -47,6 +47,14 @@ class TagResult:
 
 
 @dataclass(frozen=True)
+class RivalResult:
+    """Another transform that explains the shared tags almost as well."""
+
+    T_from_to: FloatArray  # (3,)
+    tags: tuple[tuple[str, int], ...]  # (family, tag id) of those that fit it
+
+
+@dataclass(frozen=True)
 class AlignmentResult:
     """Transform between two local maps, from the tags they share."""
 
@@ -57,6 +65,8 @@ class AlignmentResult:
     n_inliers: int
     inlier_rmse_m: float
     outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
+    is_sure: bool = True  # else the runs are not joined by it: chance or a rival explains the tags almost as well
+    rivals: tuple[RivalResult, ...] = ()
 
 
 @dataclass(frozen=True)

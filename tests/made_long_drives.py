@@ -39,6 +39,19 @@ _WAYS: Final = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
 
 @dataclass(frozen=True)
+class Town:
+    """What drives of one town share.
+
+    Attributes:
+        tags_m: (T, 2) by tag id.
+        tag_scale: of the batch that all tags were printed in.
+    """
+
+    tags_m: FloatArray
+    tag_scale: float
+
+
+@dataclass(frozen=True)
 class LongDrive:
     """A chain, and what its measurements are of, in the frame of its start."""
 
@@ -46,6 +59,7 @@ class LongDrive:
     T_start_base: FloatArray  # (K, 3)
     tags_m: dict[TagKey, FloatArray]
     calibration: dict[str, float]
+    T_town_start: FloatArray  # (3,)
 
     def true_state(self, graph: Graph) -> State:
         """As variables of the chain's own graph."""
@@ -57,7 +71,14 @@ class LongDrive:
 
 
 def made_long_drive(
-    seed: int, length_m: float = 1000.0, picture_every: int = 5, radius_sigma: float | None = None
+    seed: int,
+    length_m: float = 1000.0,
+    picture_every: int = 5,
+    radius_sigma: float | None = None,
+    *,
+    town: Town | None = None,
+    noise: NoiseParameters = NOISE,
+    noise_factors: tuple[float, float] = NOISE_FACTORS,
 ) -> LongDrive:
     """A robot that drives at random from crossing to crossing, past tags that hang 10 to 30 m apart.
 
@@ -69,15 +90,21 @@ def made_long_drive(
         length_m: driven, to the next crossing.
         picture_every: so many steps of 5 cm or 5 degrees.
         radius_sigma: the relative one of each wheel; robot.yaml's default where None.
+        town: a town of its own where None; a robot of its own where given.
+        noise: what the estimate is told of the wheels.
+        noise_factors: the least and the most that the true noise is of that.
     """
     rng = np.random.default_rng(seed)
-    robot = _robot(radius_sigma)
-    town = _driven(rng, length_m)
-    poses = se2.compose(se2.inverse(town[0]), town)
+    robot = _robot(radius_sigma, "carl" if town is None else f"carl{seed}")
+    driven = _driven(rng, length_m)
+    poses = se2.compose(se2.inverse(driven[0]), driven)
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses), dtype=np.int64)
-    tags_m = se2.apply(se2.inverse(town[0]), _placed_tags(rng))
+    placed = _placed_tags(rng, TAG_SPACING_M) if town is None else town.tags_m
+    tags_m = se2.apply(se2.inverse(driven[0]), placed)
     calibration = _drawn_calibration(rng, robot)
-    odometry_factor, reading_factor = NOISE_FACTORS[0] * (NOISE_FACTORS[1] / NOISE_FACTORS[0]) ** rng.random(2)
+    if town is not None:
+        calibration["tag_scale"] = town.tag_scale
+    odometry_factor, reading_factor = noise_factors[0] * (noise_factors[1] / noise_factors[0]) ** rng.random(2)
     pictures = np.arange(0, len(poses), picture_every)
     picture, tag, value = _readings(rng, poses[pictures], tags_m, robot, calibration, reading_factor)
     seen, tag = np.unique(tag, return_inverse=True)
@@ -89,17 +116,24 @@ def made_long_drive(
     )  # fmt: skip
     track = _wheel_track(stamps_ns, poses, robot, calibration)
     run = made_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
-    (chain,) = chains_of(run, NOISE)
+    (chain,) = chains_of(run, noise)
     return LongDrive(
         _with_noise(rng, chain, odometry_factor),
         poses[np.searchsorted(stamps_ns, chain.stamps_ns)],
         dict(zip(keys, tags_m[seen], strict=True)),
         calibration,
+        driven[0],
     )
 
 
-def _robot(radius_sigma: float | None) -> Robot:
-    robot = made_robot()
+def made_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M) -> Town:
+    """Roads with tags so far apart, and their batch a draw from its prior."""
+    rng = np.random.default_rng(seed)
+    return Town(_placed_tags(rng, spacing_m), made_robot().tags[0].relative_sigma * float(rng.standard_normal()))
+
+
+def _robot(radius_sigma: float | None, robot_id: str) -> Robot:
+    robot = made_robot(robot_id)
     if radius_sigma is None:
         return robot
     wheels_section = robot.wheels.model_copy(
@@ -135,16 +169,16 @@ def _is_crossing(place: IntArray) -> bool:
     return bool(((place >= 0) & (place < N_CROSSINGS)).all())
 
 
-def _placed_tags(rng: np.random.Generator) -> FloatArray:
+def _placed_tags(rng: np.random.Generator, spacing_m: tuple[float, float]) -> FloatArray:
     """(T, 2) beside the roads, now left, now right."""
     tags = []
     for across in range(N_CROSSINGS):
         for along_x in (True, False):
-            along_m = rng.uniform(0.0, TAG_SPACING_M[1])
+            along_m = rng.uniform(0.0, spacing_m[1])
             while along_m < ROAD_M * (N_CROSSINGS - 1):
                 place = np.array([along_m, ROAD_M * across + TAG_OFFSET_M * rng.choice([-1.0, 1.0])])
                 tags.append(place if along_x else place[::-1])
-                along_m += rng.uniform(*TAG_SPACING_M)
+                along_m += rng.uniform(*spacing_m)
     return np.array(tags)
 
 

@@ -213,7 +213,7 @@ def test_the_run_nearest_to_joining_tells_the_reason(tmp_path: Path) -> None:
     ]
     result = map_of(*logs)
     assert len(result.components) == 2
-    assert any("shares only one tag" in warning for warning in result.warnings)
+    assert any("shares only tag 0 with" in warning for warning in result.warnings)
 
 
 def test_a_run_without_tags_is_a_trajectory_of_its_own(tmp_path: Path) -> None:

@@ -1,0 +1,139 @@
+"""What merging found, in words for a person and typed for the result."""
+
+from collections.abc import Sequence
+from math import degrees
+
+from calib.arrays import FloatArray
+from offline.alignment import Alignment
+from offline.local_map import LocalMap
+from offline.merge import Group, Merge, PairAlignment
+from offline.result import AlignmentResult, RivalResult
+from offline.run import TagKey
+
+_MOST_NAMED = 8
+
+
+def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[AlignmentResult, ...]:
+    """Each pair in which any two tags fit together."""
+    return tuple(_result(maps, pair, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
+
+
+def merge_warnings(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
+    """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart."""
+    component = {m: i for i, group in enumerate(merged.groups) for m in group.members}
+    warnings = []
+    for pair in merged.pairs:
+        alignment = pair.alignment
+        if alignment is None:
+            continue
+        if alignment.is_sure:
+            warnings += _elsewhere(maps, pair, alignment)
+        elif component[pair.a] == component[pair.b]:
+            warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
+    warnings += _contradictions(maps, merged)
+    for i, group in enumerate(merged.groups[1:], start=1):
+        warnings.append(f"component {i}: {reason_apart(maps, merged, group)}")
+    return warnings
+
+
+def reason_apart(maps: Sequence[LocalMap], merged: Merge, group: Group) -> str:
+    """Why a component is one of its own, told of the pair that is nearest to joining it, and what would help."""
+    crossing = [pair for pair in merged.pairs if (pair.a in group.members) != (pair.b in group.members)]
+    if crossing:
+        return _why_not_joined(maps, max(crossing, key=_nearness), {maps[m].chain.name for m in group.members})
+    name = maps[group.members[0]].chain.name
+    if not any(maps[m].graph.tags for m in group.members):
+        return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"
+    return f"{name} shares no tag with the others; drive it past two tags that another run saw"
+
+
+def _nearness(pair: PairAlignment) -> tuple[float, int]:
+    evidence_nats = float("-inf") if pair.alignment is None else pair.alignment.evidence_nats
+    return evidence_nats, len(pair.shared)
+
+
+def _why_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
+    """Why a pair is not joined; the first name is one of `told_of`."""
+    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    alignment = pair.alignment
+    if alignment is not None and alignment.rivals:
+        return _ambiguous(a, b, alignment)
+    if told_of is not None and b not in told_of:
+        a, b = b, a
+    if len(pair.shared) == 1:
+        return f"{b} shares only tag {pair.shared[0].tag_id} with {a}; one more shared tag would do"
+    if alignment is not None and alignment.is_sure:
+        return f"the alignment of {b} with {a} contradicts those of other runs"
+    if alignment is not None:
+        return (
+            f"of the {len(pair.shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} lie the same "
+            "way in both maps, which chance may bring about; were tags moved between the runs? One more shared tag "
+            "that stayed would do"
+        )
+    return (
+        f"{b} shares {len(pair.shared)} tags with {a}, but no two of them lie the same way in both maps: "
+        "were tags moved between the runs? Two shared tags that stayed would do"
+    )
+
+
+def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
+    ways = [alignment, *alignment.rivals]
+    first = set(alignment.inliers)
+    told = [f"tags {_names(ways[0].inliers)} put {b}'s start at {_place(ways[0].T_a_b)}"]
+    told += [
+        f"tags {_names(tuple(tag for tag in way.inliers if tag not in first) or way.inliers)} at {_place(way.T_a_b)}"
+        for way in ways[1:3]
+    ]
+    more = f", and there are {len(ways) - 3} more ways" if len(ways) > 3 else ""
+    return (
+        f"how {b} lies in {a} is ambiguous, because {', '.join(told)}{more}: nothing tells which tags stayed and which "
+        "were moved or relabelled; a few more shared tags that stayed would do"
+    )
+
+
+def _elsewhere(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment) -> list[str]:
+    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    return [
+        f"tag {tag.tag_id} lies {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
+        "moved between the runs, or carried about?"
+        for tag, fits, off_m, sigmas in zip(
+            alignment.shared, alignment.inlier, alignment.off_m, alignment.off_sigmas, strict=True
+        )
+        if not fits
+    ]
+
+
+def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
+    warnings = []
+    for each in merged.contradictions:
+        ring = ", ".join(maps[m].chain.name for m in each.ring)
+        gap_m, turn_deg = float((each.gap[:2] ** 2).sum() ** 0.5), abs(degrees(each.gap[2]))
+        a, b = (maps[m].chain.name for m in (each.link.a, each.link.b))
+        warnings.append(
+            f"the alignments of {ring} contradict each other (their ring gapes by {gap_m:.2f} m and {turn_deg:.1f} "
+            f"deg, {each.sigmas:.0f} sigma); that of {a} with {b} was left out"
+        )
+    return warnings
+
+
+def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment) -> AlignmentResult:
+    return AlignmentResult(
+        from_run=maps[pair.a].chain.name,
+        to_run=maps[pair.b].chain.name,
+        T_from_to=alignment.T_a_b,
+        n_shared=len(pair.shared),
+        n_inliers=alignment.n_inliers,
+        inlier_rmse_m=alignment.rmse_m,
+        outliers=tuple((*tag,) for tag in alignment.outliers),
+        is_sure=alignment.is_sure,
+        rivals=tuple(RivalResult(each.T_a_b, tuple((*tag,) for tag in each.inliers)) for each in alignment.rivals),
+    )
+
+
+def _names(tags: Sequence[TagKey]) -> str:
+    named = ", ".join(str(tag.tag_id) for tag in tags[:_MOST_NAMED])
+    return named if len(tags) <= _MOST_NAMED else f"{named} and {len(tags) - _MOST_NAMED} more"
+
+
+def _place(T: FloatArray) -> str:
+    return f"({T[0]:.2f}, {T[1]:.2f}) m turned by {degrees(T[2]):.1f} deg"
