@@ -96,7 +96,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
 def _sorted_readings(readings: ReadingFactors) -> Readings:
     """By rising pose; slots are still missing."""
     order = np.argsort(readings.pose, kind="stable")
-    parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter])[order]
+    parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter, readings.camera_parameters])
     return Readings(
         pose=readings.pose[order],
         tag=readings.tag[order],
@@ -104,8 +104,9 @@ def _sorted_readings(readings: ReadingFactors) -> Readings:
         polar=readings.polar[order],
         whitening=readings.whitening[order],
         mount=readings.mount[order],
-        parameters=parameters,
-        slots=parameters,
+        by_camera=readings.by_camera[order],
+        parameters=parameters[order],
+        slots=parameters[order],
     )
 
 
@@ -123,12 +124,15 @@ def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Re
 
 def _relaxed(readings: Readings) -> Readings:
     """The same as places (x, y), with the covariance that the reading had there."""
-    x, y = readings.value.T
-    range_m, cos, sin = np.maximum(x, 1e-6), np.cos(y), np.sin(y)
+    first, second = readings.value.T
+    range_m, cos, sin = np.maximum(first, 1e-6), np.cos(second), np.sin(second)
+    x_m, y_m = first * cos, first * sin
     by_place = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1) / range_m[:, None]], axis=-2)
+    place_by = np.stack([np.stack([cos, sin], -1), np.stack([-y_m, x_m], -1)], axis=-1)
     polar = readings.polar[:, None]
     return readings._replace(
-        value=np.where(polar, np.column_stack([x * cos, x * sin]), readings.value),
+        value=np.where(polar, np.column_stack([x_m, y_m]), readings.value),
+        by_camera=np.where(polar[..., None], place_by @ readings.by_camera, readings.by_camera),
         polar=np.zeros_like(readings.polar),
         whitening=np.where(polar[..., None], readings.whitening @ by_place, readings.whitening),
     )

@@ -86,7 +86,8 @@ def _chain(name: str, run: Run, track: WheelTrack, noise: NoiseParameters) -> Ch
     stamps_ns = _candidate_stamps(run, track)
     tags_at = _tags_at(run, stamps_ns)
     keyframe_stamps_ns, keyframe_of = _choose_keyframes(track, stamps_ns, tags_at, run.robot.wheels.track_m)
-    readings, warnings = _readings(run, stamps_ns, keyframe_of, noise)
+    twist = track.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
+    readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
     seen, tag = np.unique(readings.tag, return_inverse=True)
     return Chain(
         name=name,
@@ -143,7 +144,7 @@ def _choose_keyframes(
 
 
 def _readings(
-    run: Run, stamps_ns: IntArray, keyframe_of: IntArray, noise: NoiseParameters
+    run: Run, stamps_ns: IntArray, keyframe_of: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Readings, list[str]]:
     """Readings of one stretch with the keyframe of each; what fell between keyframes is passed over."""
     detections, positions = run.detections, run.positions
@@ -153,6 +154,7 @@ def _readings(
         run,
         Detections(detections.stamps_ns[kept], detections.tag[kept], detections.corners_px[kept]),
         keyframe[kept],
+        twist,
         noise,
     )
     keyframe = _keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)

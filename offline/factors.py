@@ -121,7 +121,7 @@ class ReadingFactors:
     """A tag's place seen from a pose, as (range, bearing) or (x, y) about a sensor on the base.
 
     With l the tag in map: l_base = R^T (l - t), l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale); the reading is
-    l_sensor or its polar coordinates.
+    l_sensor or its polar coordinates. What else is wrong with the camera shifts the reading itself, to first order.
 
     Attributes:
         pose: (M,) index of the pose; tag: (M,) of the tag.
@@ -129,6 +129,7 @@ class ReadingFactors:
         whitening: (M, 2, 2).
         mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
         mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
+        by_camera: (M, 2, 3) derivative of the value by three more calibration numbers, camera_parameters: (M, 3).
     """
 
     pose: IntArray
@@ -139,14 +140,16 @@ class ReadingFactors:
     mount: FloatArray
     mount_parameters: IntArray
     scale_parameter: IntArray
+    by_camera: FloatArray
+    camera_parameters: IntArray
 
     def residual(self, state: State) -> FloatArray:
         """(M, 2), whitened, predicted minus read."""
         _, in_sensor, _ = self._places(state)
-        return _times(self.whitening, self._difference(in_sensor))
+        return _times(self.whitening, self._difference(in_sensor, state))
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (M, 2) and blocks for pose, tag, mount and tag scale."""
+        """Residuals (M, 2) and blocks for pose, tag, mount, tag scale and what else is wrong with the camera."""
         in_base, in_sensor, mount = self._places(state)
         theta, yaw = state.poses[self.pose, 2], mount[:, 2]
         scale = 1.0 + state.calibration[self.scale_parameter]
@@ -161,22 +164,22 @@ class ReadingFactors:
         by_mount[..., 2] = _times(outer, _turned_right(in_sensor))
         by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
         return Linearised(
-            _times(self.whitening, self._difference(in_sensor)),
+            _times(self.whitening, self._difference(in_sensor, state)),
             (
                 (columns.poses[self.pose], by_pose),
                 (columns.tags[self.tag], by_base @ _rotation(-theta)),
                 (columns.calibration[self.mount_parameters], by_mount),
                 (columns.calibration[self.scale_parameter][:, None], by_scale),
+                (columns.calibration[self.camera_parameters], -self.whitening @ self.by_camera),
             ),
         )
 
     def places_in_map(self, state: State) -> FloatArray:
         """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""
-        first, second = self.value[:, 0], self.value[:, 1]
+        value = self._corrected(state)
+        first, second = value.T
         in_sensor = np.where(
-            self.polar[:, None],
-            np.stack([first * np.cos(second), first * np.sin(second)], axis=-1),
-            self.value,
+            self.polar[:, None], np.stack([first * np.cos(second), first * np.sin(second)], axis=-1), value
         )
         scale = 1.0 + state.calibration[self.scale_parameter]
         mount = self.mount + state.calibration[self.mount_parameters]
@@ -189,11 +192,17 @@ class ReadingFactors:
         scale = 1.0 + state.calibration[self.scale_parameter]
         return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
 
-    def _difference(self, in_sensor: FloatArray) -> FloatArray:
+    def _corrected(self, state: State) -> FloatArray:
+        """(M, 2) what would have been read with the camera as the calibration has it."""
+        return self.value + _times(self.by_camera, state.calibration[self.camera_parameters])
+
+    def _difference(self, in_sensor: FloatArray, state: State) -> FloatArray:
         x, y = in_sensor[:, 0], in_sensor[:, 1]
-        first = np.where(self.polar, np.hypot(x, y), x) - self.value[:, 0]
-        turned = se2.wrap_angle(np.arctan2(y, x) - self.value[:, 1])
-        return np.stack([first, np.where(self.polar, turned, y - self.value[:, 1])], axis=-1)
+        first, second = self._corrected(state).T
+        turned = se2.wrap_angle(np.arctan2(y, x) - second)
+        return np.stack(
+            [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
+        )
 
     def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
         """(M, 2, 2) derivative of the reading by the place in the sensor; the identity for (x, y)."""

@@ -18,6 +18,7 @@ from offline.factors import (
     State,
     whitening,
 )
+from offline.observations import CAMERA_PARAMETERS
 from offline.odometry import WHEEL_PARAMETERS
 from offline.run import TagKey
 from offline.solver import Problem
@@ -147,7 +148,7 @@ def _reading_factors(
     chains: Sequence[Chain], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
 ) -> ReadingFactors:
     tag_index = {tag: i for i, tag in enumerate(tags)}
-    pose, tag, mount, mount_parameters, scale_parameter = [], [], [], [], []
+    pose, tag, mount, mount_parameters, scale_parameter, camera_parameters = [], [], [], [], [], []
     for chain, start in zip(chains, first_pose, strict=True):
         readings = chain.readings
         own_tags = np.array([tag_index[t] for t in chain.tags], dtype=np.int64)
@@ -156,8 +157,8 @@ def _reading_factors(
         tag.append(own_tags[readings.tag])
         by_camera = readings.in_camera[:, None]
         mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
-        camera_parameters = _indices(parameters, _mount_parameters(chain.run.robot))
-        mount_parameters.append(np.where(by_camera, camera_parameters, 0))
+        mount_parameters.append(np.where(by_camera, _indices(parameters, _mount_parameters(chain.run.robot)), 0))
+        camera_parameters.append(np.where(by_camera, _indices(parameters, _camera_parameters(chain)), 0))
         scale_parameter.append(scales[readings.tag])
     return ReadingFactors(
         pose=np.concatenate(pose),
@@ -168,6 +169,8 @@ def _reading_factors(
         mount=np.concatenate(mount),
         mount_parameters=np.concatenate(mount_parameters),
         scale_parameter=np.concatenate(scale_parameter),
+        by_camera=np.concatenate([chain.readings.by_camera for chain in chains]),
+        camera_parameters=np.concatenate(camera_parameters),
     )
 
 
@@ -175,7 +178,7 @@ def _parameters(chain: Chain) -> list[Parameter]:
     robot = chain.run.robot
     found = _wheel_parameters(robot) + [_scale_parameter(chain, tag) for tag in chain.tags]
     if chain.readings.in_camera.any():
-        found += _mount_parameters(robot)
+        found += _mount_parameters(robot) + _camera_parameters(chain)
     return [p for p in found if p != _NONE]
 
 
@@ -199,6 +202,19 @@ def _mount_parameters(robot: Robot) -> list[Parameter]:
     sigmas = (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma)
     return [
         Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(MOUNT_PARAMETERS, sigmas, strict=True)
+    ]
+
+
+def _camera_parameters(chain: Chain) -> list[Parameter]:
+    """In the order of CAMERA_PARAMETERS; none of them is known to positions that somebody else worked out."""
+    if not chain.readings.by_camera.any():
+        return [_NONE] * len(CAMERA_PARAMETERS)
+    robot = chain.run.robot
+    mount = robot.mount
+    nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
+    sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
+    return [
+        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(CAMERA_PARAMETERS, sigmas, strict=True)
     ]
 
 

@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """`factors.ReadingFactors` by rising pose; parameters (M, 4) are those of the mount and the tag scale."""
+    """`factors.ReadingFactors` by rising pose; parameters (M, 7) are those of mount, tag scale and camera."""
 
     pose: IntArray
     tag: IntArray
@@ -64,6 +64,7 @@ class Readings(NamedTuple):
     polar: BoolArray
     whitening: FloatArray
     mount: FloatArray
+    by_camera: FloatArray
     parameters: IntArray
     slots: IntArray
 

@@ -1,5 +1,7 @@
 """Compiled linearisation of tag readings and calibration priors; see `linearise_kernels`."""
 
+from typing import Final
+
 import numpy as np
 
 from calib.arrays import FloatArray
@@ -7,6 +9,8 @@ from offline.arrowhead_kernels import System
 from offline.jit import borrowed, jitted
 from offline.linearise_kernels import Free, Readings, Values
 from offline.robust import Loss, loss_and_weight
+
+_N_PARAMETERS: Final = 7  # of mount, tag scale and camera
 
 
 @jitted
@@ -17,7 +21,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     whitened derivative of the reading by the tag's place in the sensor.
     """
     readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
-    r, J = np.empty(2), np.empty((2, 9))
+    r, J = np.empty(2), np.empty((2, 5 + _N_PARAMETERS))
     total, g = 0.0, system.gradient
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
@@ -53,17 +57,17 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
         g[first_tag] += c0 * r0 + d0 * r1
         g[first_tag + 1] += c1 * r0 + d1 * r1
         if system.pose_calibration.shape[2]:
-            _add_mount_and_scale(readings, m, w, free, r, J, system)
+            _add_calibration(readings, m, w, free, r, J, system)
     return total
 
 
 @jitted
-def _add_mount_and_scale(
+def _add_calibration(
     readings: Readings, m: int, weight: float, free: Free, r: FloatArray, J: FloatArray, system: System
 ) -> None:
     pose, tag = readings.pose[m], readings.tag[m]
     base = len(system.gradient) - len(system.calibration)
-    for a in range(4):
+    for a in range(_N_PARAMETERS):
         slot, column = readings.slots[m, a], free.calibration[readings.parameters[m, a]]
         if slot < 0:
             continue
@@ -72,7 +76,7 @@ def _add_mount_and_scale(
             system.pose_calibration[pose, i, slot] += J[0, i] * j0 + J[1, i] * j1
         for i in range(2):
             system.tag_calibration[tag, i, column] += J[0, 3 + i] * j0 + J[1, 3 + i] * j1
-        for b in range(4):
+        for b in range(_N_PARAMETERS):
             other = free.calibration[readings.parameters[m, b]]
             if other >= 0:
                 system.calibration[column, other] += j0 * J[0, 5 + b] + j1 * J[1, 5 + b]
@@ -94,12 +98,13 @@ def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J
     c, s = np.cos(yaw), np.sin(yaw)
     x = (c * (base_x - mount_x) + s * (base_y - mount_y)) / scale
     y = (c * (base_y - mount_y) - s * (base_x - mount_x)) / scale
+    first, second = _corrected(readings, m, values)
     W = readings.whitening[m]
     o00, o01, o10, o11 = W[0, 0], W[0, 1], W[1, 0], W[1, 1]
     if readings.polar[m]:
         range_m = np.sqrt(x * x + y * y)
-        d0 = range_m - readings.value[m, 0]
-        d1 = np.arctan2(y, x) - readings.value[m, 1]
+        d0 = range_m - first
+        d1 = np.arctan2(y, x) - second
         d1 -= 2.0 * np.pi * np.rint(d1 / (2.0 * np.pi))
         # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
         range_m = max(range_m, 1e-6)
@@ -108,7 +113,7 @@ def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J
         o00, o01 = W[0, 0] * ux + W[0, 1] * vx, W[0, 0] * uy + W[0, 1] * vy
         o10, o11 = W[1, 0] * ux + W[1, 1] * vx, W[1, 0] * uy + W[1, 1] * vy
     else:
-        d0, d1 = x - readings.value[m, 0], y - readings.value[m, 1]
+        d0, d1 = x - first, y - second
     r[0], r[1] = W[0, 0] * d0 + W[0, 1] * d1, W[1, 0] * d0 + W[1, 1] * d1
     for i in range(2):
         a, b = (o00, o01) if i == 0 else (o10, o11)
@@ -119,6 +124,19 @@ def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J
         J[i, 3], J[i, 4] = bx * cos - by * sin, bx * sin + by * cos
         J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
         J[i, 8] = -(a * x + b * y) / scale
+        for k in range(3):
+            J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
+
+
+@jitted
+def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
+    """What would have been read with the camera as the calibration has it."""
+    first, second = readings.value[m, 0], readings.value[m, 1]
+    for k in range(3):
+        c = values.calibration[readings.parameters[m, 4 + k]]
+        first += readings.by_camera[m, 0, k] * c
+        second += readings.by_camera[m, 1, k] * c
+    return first, second
 
 
 @jitted

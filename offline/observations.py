@@ -15,6 +15,7 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
 from calib.errors import CalibError
 from calib.noise import NoiseParameters
+from calib.robot import Robot
 from offline.covariance_parts import CovarianceParts, concatenated
 from offline.errors import OfflineError
 from offline.run import Detections, Positions, Run
@@ -22,6 +23,10 @@ from offline.tag_pose import TagReadings, general_readings, upright_readings
 
 # What the covariance of an imported position without one is made of.
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
+
+# What a robot's camera adds to its readings besides place and yaw of the mount, to first order: how its corners are
+# read with another roll or pitch, and where its tags were when the stamps are late.
+CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", "time_offset_s")
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -53,6 +58,7 @@ class Readings:
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
         parts: what the covariance is made of.
+        by_camera: (M, 2, 3) derivative of the value by CAMERA_PARAMETERS.
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
     """
@@ -62,6 +68,7 @@ class Readings:
     value: FloatArray
     covariance: FloatArray
     parts: CovarianceParts
+    by_camera: FloatArray
     polar: BoolArray
     in_camera: BoolArray
 
@@ -77,6 +84,7 @@ class Readings:
             self.value[mask],
             self.covariance[mask],
             self.parts.where(mask),
+            self.by_camera[mask],
             self.polar[mask],
             self.in_camera[mask],
         )
@@ -87,7 +95,7 @@ class Readings:
 
 
 def read_detections(
-    run: Run, detections: Detections, keyframe: IntArray, noise: NoiseParameters
+    run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Readings, list[str]]:
     """Turns corners into readings about the camera.
 
@@ -98,6 +106,7 @@ def read_detections(
         run: whose camera and tag sizes apply.
         detections: (M,) of one stretch.
         keyframe: (M,) the keyframe of each.
+        twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
         noise: for the corners' sigma.
 
     Returns:
@@ -133,6 +142,7 @@ def read_detections(
             value=value[good],
             covariance=found.covariance[good],
             parts=_corner_parts(found.where(good), noise.sigma_corner_px),
+            by_camera=_by_camera(run.robot, found.range_bearing[good], found.by_turn[good], twist[keyframe[good]]),
             polar=np.ones(int(good.sum()), dtype=np.bool_),
             in_camera=np.ones(int(good.sum()), dtype=np.bool_),
         ),
@@ -183,8 +193,9 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
     covariance[modelled, 1, 1] = noise.sigma_bearing_rad**2
     good &= _are_covariances(covariance)
     parts = _position_parts(range_m, modelled, covariance)
+    unaffected = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
     readings = Readings(
-        keyframe, positions.tag, value, covariance, parts, positions.polar | unknown, positions.in_camera
+        keyframe, positions.tag, value, covariance, parts, unaffected, positions.polar | unknown, positions.in_camera
     )
     if good.all():
         return readings, []
@@ -210,10 +221,32 @@ def joined(a: Readings, b: Readings) -> Readings:
         np.concatenate([a.value, b.value]),
         np.concatenate([a.covariance, b.covariance]),
         concatenated(a.parts, b.parts),
+        np.concatenate([a.by_camera, b.by_camera]),
         np.concatenate([a.polar, b.polar]),
         np.concatenate([a.in_camera, b.in_camera]),
     )
     return both.where(np.argsort(both.keyframe, kind="stable"))
+
+
+def _by_camera(robot: Robot, range_bearing: FloatArray, by_turn: FloatArray, twist: FloatArray) -> FloatArray:
+    """(M, 2, 3) derivative of readings by CAMERA_PARAMETERS.
+
+    Args:
+        robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
+        range_bearing: (M, 2) about the camera, in axes parallel to base.
+        by_turn: (M, 2, 3) derivative of them by a turn of the camera about these axes.
+        twist: (M, 2) speed and turning rate.
+    """
+    yaw, pitch = robot.mount.yaw_rad, robot.mount.pitch_rad
+    roll_axis = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+    pitch_axis = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    range_m, cos, sin = range_bearing[:, 0], np.cos(range_bearing[:, 1]), np.sin(range_bearing[:, 1])
+    speed, turning = twist.T
+    # How a tag moves as seen from the camera, whose place moves with base: a picture that was taken later shows that.
+    x_rate = -speed + turning * (robot.mount.y_m + range_m * sin)
+    y_rate = -turning * (robot.mount.x_m + range_m * cos)
+    by_time = np.stack([cos * x_rate + sin * y_rate, (cos * y_rate - sin * x_rate) / range_m], axis=-1)
+    return np.stack([by_turn @ roll_axis, by_turn @ pitch_axis, by_time], axis=-1)
 
 
 def _corner_parts(found: TagReadings, sigma_corner_px: float) -> CovarianceParts:
@@ -301,4 +334,5 @@ def _no_readings() -> Readings:
     empty_bool = np.zeros(0, dtype=np.bool_)
     none = np.zeros((0, 2, 2))
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
-    return Readings(empty_int, empty_int, np.zeros((0, 2)), none, parts, empty_bool, empty_bool)
+    by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
+    return Readings(empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool)

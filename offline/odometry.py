@@ -29,6 +29,7 @@ ODOMETRY_NOISE: Final = (
 # Where readings are missing for longer, cumulative counts still give distance and turn, not the path between.
 GAP_NS: Final = 500_000_000
 _GAP_SIGMA_PER_M: Final = 0.1
+_WHILE_NS: Final = 25_000_000
 
 # Below what any encoder resolves; keeps the information of a step that measured no motion finite.
 _SMALLEST_QUANTUM_M: Final = 1e-4
@@ -53,6 +54,15 @@ class WheelTrack:
         """Cumulative (left_m, right_m) at other times: speeds are constant between readings."""
         times, readings = _seconds(stamps_ns, self.stamps_ns[0]), _seconds(self.stamps_ns, self.stamps_ns[0])
         return np.interp(times, readings, self.left_m), np.interp(times, readings, self.right_m)
+
+    def twist_at(self, stamps_ns: IntArray, track_m: float) -> FloatArray:
+        """(K, 2) speed in m/s and turning rate in rad/s about some times, by differences over a short while."""
+        before = np.maximum(stamps_ns - _WHILE_NS, self.stamps_ns[0])
+        after = np.minimum(stamps_ns + _WHILE_NS, self.stamps_ns[-1])
+        left_m, right_m = (b - a for a, b in zip(self.at(before), self.at(after), strict=True))
+        seconds = np.maximum(after - before, 1) * 1e-9
+        speed_m_s, turning_rad_s = 0.5 * (left_m + right_m) / seconds, (right_m - left_m) / (track_m * seconds)
+        return np.stack([speed_m_s, turning_rad_s], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ class TagReadings:
     Attributes:
         range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
         covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part of it that does not come from that.
+        by_turn: (M, 2, 3) derivative of range_bearing, for the corners as they are, by a small turn (rad) of the camera
+            about the axes of base.
         height_m: (M,) of the tag's centre above the camera.
         chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
@@ -52,6 +54,7 @@ class TagReadings:
     range_bearing: FloatArray
     covariance: FloatArray
     rest: FloatArray
+    by_turn: FloatArray
     height_m: FloatArray
     chi2: FloatArray
     valid: BoolArray
@@ -97,11 +100,12 @@ def upright_readings(
             if not len(moving):
                 break
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
-        information = jacobian.swapaxes(-1, -2) @ jacobian / sigma_corner_px**2
-        covariance_full = _solve(information, np.broadcast_to(np.eye(_N_PARAMETERS), information.shape))
-        covariance = covariance_full[:, :3, :3]
+        normal = jacobian.swapaxes(-1, -2) @ jacobian
+        inverse = _solve(normal, np.broadcast_to(np.eye(_N_PARAMETERS), normal.shape))[:, :3]
+        by_turn = -inverse @ jacobian.swapaxes(-1, -2) @ _residual_by_turn(parameters, sides_m, camera, R_base_camera)
+        covariance = inverse[..., :3] * sigma_corner_px**2
         chi2 = (residual**2).sum(-1) / sigma_corner_px**2
-        return _polar(parameters[:, :3], covariance, np.zeros_like(covariance), chi2)
+        return _polar(parameters[:, :3], covariance, np.zeros_like(covariance), by_turn, chi2)
 
 
 def general_readings(
@@ -134,7 +138,8 @@ def general_readings(
         along = (_GENERAL_ALONG * distance_m) ** 2
         sight = direction[:, :, None] * direction[:, None, :]
         rest = along[:, None, None] * sight
-        return _polar(centres, rest + across[:, None, None] * (np.eye(3) - sight), rest, chi2)
+        covariance = rest + across[:, None, None] * (np.eye(3) - sight)
+        return _polar(centres, covariance, rest, -_cross_matrix(centres), chi2)
 
 
 def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray) -> FloatArray:
@@ -175,9 +180,7 @@ def _linearise(
     """Residuals (M, 8), predicted minus seen, in pixels, and their Jacobian (M, 8, 6)."""
     m = len(parameters)
     a, b = _on_face(parameters[:, 5], sides_m)
-    points = np.repeat(parameters[:, None, :3], 4, axis=1)
-    points[..., :2] += a[..., None] * parameters[:, None, 3:5]
-    points[..., 2] += b
+    points = _corner_places(parameters, a, b)
     pixels, d_pixel_d_camera = camera.project_with_jacobian(points @ R_base_camera)
     d_pixel_d_point = d_pixel_d_camera @ R_base_camera.T
     d_point = np.zeros((m, 4, 3, _N_PARAMETERS))
@@ -190,8 +193,36 @@ def _linearise(
     return (pixels - corners_px).reshape(m, 8), (d_pixel_d_point @ d_point).reshape(m, 8, _N_PARAMETERS)
 
 
-def _polar(centre_m: FloatArray, covariance: FloatArray, rest: FloatArray, chi2: FloatArray) -> TagReadings:
-    """Centres (M, 3) in axes parallel to base, about the camera, with their covariances (M, 3, 3), as readings."""
+def _corner_places(parameters: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """(M, 4, 3) in axes parallel to base, about the camera."""
+    points = np.repeat(parameters[:, None, :3], 4, axis=1)
+    points[..., :2] += a[..., None] * parameters[:, None, 3:5]
+    points[..., 2] += b
+    return points
+
+
+def _residual_by_turn(
+    parameters: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
+) -> FloatArray:
+    """(M, 8, 3) derivative of the residuals by a small turn w of the camera: it sees P where it saw P - w x P."""
+    points = _corner_places(parameters, *_on_face(parameters[:, 5], sides_m))
+    _, d_pixel_d_camera = camera.project_with_jacobian(points @ R_base_camera)
+    by_turn: FloatArray = (d_pixel_d_camera @ R_base_camera.T @ _cross_matrix(points)).reshape(len(parameters), 8, 3)
+    return by_turn
+
+
+def _polar(
+    centre_m: FloatArray, covariance: FloatArray, rest: FloatArray, by_turn: FloatArray, chi2: FloatArray
+) -> TagReadings:
+    """Centres (M, 3) in axes parallel to base, about the camera, as readings.
+
+    Args:
+        centre_m: the centres.
+        covariance: (M, 3, 3) theirs.
+        rest: (M, 3, 3) the part of it that does not come from the corners' sigma.
+        by_turn: (M, 3, 3) derivative of the centres by a turn of the camera.
+        chi2: (M,).
+    """
     x, y = centre_m[:, 0], centre_m[:, 1]
     range_m = np.hypot(x, y)
     jacobian = np.zeros((len(x), 2, 3))
@@ -208,7 +239,7 @@ def _polar(centre_m: FloatArray, covariance: FloatArray, rest: FloatArray, chi2:
         & (polar_covariance[:, 1, 1] > 0.0)
         & np.isfinite(chi2)
     )
-    return TagReadings(range_bearing, polar_covariance, polar_rest, centre_m[:, 2], chi2, valid)
+    return TagReadings(range_bearing, polar_covariance, polar_rest, jacobian @ by_turn, centre_m[:, 2], chi2, valid)
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:

@@ -1,5 +1,6 @@
 """Random graphs long enough to be cut into nested pieces, with every kind of factor and all calibration."""
 
+from dataclasses import fields
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,8 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
 from offline.solver import Problem
 
-_ROBOT_SIGMA: Final = (0.004, 0.007, 0.01, 0.01, 0.01, 0.01)  # wheels, then mount
+_ROBOT_SIGMA: Final = (0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)  # wheels, mount, what else of the camera
+_OF_ROBOT: Final = len(_ROBOT_SIGMA)
 _BATCH_SIGMA: Final = (0.005, 0.005)
 N_ROBOTS: Final = 2
 
@@ -47,13 +49,8 @@ def reordered(problem: Problem, rng: np.random.Generator) -> Problem:
     order = rng.permutation(len(problem.readings.pose))
     readings = problem.readings
     mixed = ReadingFactors(
-        *(
-            getattr(readings, name)[order]
-            for name in (
-                "pose", "tag", "value", "polar", "whitening", "mount", "mount_parameters", "scale_parameter",
-            )
-        )
-    )  # fmt: skip
+        *(getattr(readings, name)[order] for name in (field.name for field in fields(ReadingFactors)))
+    )
     return Problem(problem.odometry, mixed, problem.prior, problem.columns, problem.anchor)
 
 
@@ -72,7 +69,7 @@ def _odometry(rng: np.random.Generator, truth: State, first: IntArray, chain_of:
     n = len(first)
     root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
     jacobian = 0.2 * rng.standard_normal((n, 3, 3))
-    parameters = (1 + 6 * (chain_of[first] % N_ROBOTS))[:, None] + np.arange(3)
+    parameters = (1 + _OF_ROBOT * (chain_of[first] % N_ROBOTS))[:, None] + np.arange(3)
     moved = se2.between(truth.poses[first], truth.poses[first + 1])
     error = np.einsum("nij,nj->ni", root, rng.standard_normal((n, 3)))
     by_calibration = np.einsum("nij,nj->ni", jacobian, truth.calibration[parameters])
@@ -87,7 +84,7 @@ def _readings(
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
     mount = np.where(mounted[:, None], [0.2, -0.1, 0.3], 0.0)
-    robot_mount = (4 + 6 * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
+    robot_mount = (4 + _OF_ROBOT * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
     mount_parameters = np.where(mounted[:, None], robot_mount, 0)
     scale_parameter = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
     root = 0.05 * (np.eye(2) + 0.3 * rng.standard_normal((n, 2, 2)))
@@ -97,8 +94,14 @@ def _readings(
     value = np.where(polar[:, None], as_polar, place)
     value += np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
     value[rng.random(n) < 0.05] += 1.0
+    by_camera = 0.5 * mounted[:, None, None] * rng.standard_normal((n, 2, 3))
+    camera_parameters = np.where(mounted[:, None], 3 + robot_mount, 0)
+    value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
     covariance = root @ root.swapaxes(-1, -2)
-    return ReadingFactors(pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter)
+    return ReadingFactors(
+        pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter, by_camera,
+        camera_parameters,
+    )  # fmt: skip
 
 
 def _who_reads_what(

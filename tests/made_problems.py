@@ -9,9 +9,10 @@ from calib.arrays import IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
 from offline.solver import Problem
 
-# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags.
-CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005])
-WHEELS, MOUNT, BATCHES = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8])
+# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, three more of the camera.
+CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, 0.01, 0.01, 0.01])
+WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.array([9, 10, 11])
+N_CALIBRATION = len(CALIBRATION_SIGMA)
 CHAINS = (9, 7)  # poses in each
 N_TAGS = 6
 
@@ -43,7 +44,7 @@ def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
         for _ in range(length - 1):
             first.append(len(poses) - 1)
             poses.append(se2.compose(poses[-1], [rng.uniform(0.2, 0.6), rng.normal(0, 0.02), rng.normal(0, 0.4)]))
-    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else rng.standard_normal(9))
+    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else rng.standard_normal(N_CALIBRATION))
     truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
     problem = Problem(
         odometry=_odometry(truth, np.array(first), noise, rng),
@@ -61,8 +62,8 @@ def made_columns(n_poses: int) -> Columns:
     poses[0] = -1
     n = 3 * n_poses - 3
     tags = n + np.arange(2 * N_TAGS).reshape(N_TAGS, 2)
-    calibration = np.r_[-1, n + 2 * N_TAGS + np.arange(8)]
-    return Columns(poses, tags, calibration, n + 2 * N_TAGS + 8)
+    calibration = np.r_[-1, n + 2 * N_TAGS + np.arange(N_CALIBRATION - 1)]
+    return Columns(poses, tags, calibration, n + 2 * N_TAGS + N_CALIBRATION - 1)
 
 
 def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> State:
@@ -71,11 +72,11 @@ def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> S
     n_poses = sum(CHAINS)
     if near is None:
         poses = np.column_stack([rng.uniform(-5, 5, (n_poses, 2)), rng.uniform(-np.pi, np.pi, n_poses)])
-        return State(poses, rng.uniform(-5, 5, (N_TAGS, 2)), np.r_[0.0, 0.05 * rng.standard_normal(8)])
+        return State(poses, rng.uniform(-5, 5, (N_TAGS, 2)), np.r_[0.0, 0.05 * rng.standard_normal(N_CALIBRATION - 1)])
     poses = se2.compose(near.poses, se2.exp(spread * rng.standard_normal((n_poses, 3))))
     poses[0] = near.poses[0]
     tags = near.tags + spread * rng.standard_normal((N_TAGS, 2))
-    return State(poses, tags, np.r_[0.0, 0.1 * spread * rng.standard_normal(8)])
+    return State(poses, tags, np.r_[0.0, 0.1 * spread * rng.standard_normal(N_CALIBRATION - 1)])
 
 
 def _odometry(truth: State, first: IntArray, noise: float, rng: np.random.Generator) -> OdometryFactors:
@@ -105,5 +106,11 @@ def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Genera
     value = np.where(polar[:, None], as_polar, place)
     value += noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
     value[rng.choice(n, n_outliers, replace=False)] += 3.0
+    by_camera = 0.5 * mounted[:, None, None] * rng.standard_normal((n, 2, 3))
+    camera_parameters = np.where(mounted[:, None], CAMERA, 0)
+    value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
     covariance = root @ root.swapaxes(-1, -2)
-    return ReadingFactors(pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter)
+    return ReadingFactors(
+        pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter, by_camera,
+        camera_parameters,
+    )  # fmt: skip

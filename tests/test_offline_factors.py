@@ -12,7 +12,7 @@ from offline.factors import Linearised, State, whitening
 from offline.robust import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
 from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
 from tests.benchmarks.plain_solver import plain_normal_equations
-from tests.made_problems import CALIBRATION_SIGMA, made_problem, random_state
+from tests.made_problems import CALIBRATION_SIGMA, N_CALIBRATION, made_problem, random_state
 
 KINDS = ("odometry", "readings", "prior")
 SEEDS = range(5)
@@ -118,8 +118,8 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
     readings = replace(problem.readings, mount=at_base, mount_parameters=no_mount, scale_parameter=scaled)
 
     nominal = random_state(1)
-    state = State(nominal.poses, nominal.tags, np.zeros(9))
-    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1])
+    state = State(nominal.poses, nominal.tags, np.zeros(N_CALIBRATION))
+    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0])
     shrunk = State(0.9 ** np.array([1, 1, 0]) * state.poses, 0.9 * state.tags, change)
     np.testing.assert_allclose(odometry.residual(shrunk), odometry.residual(state), atol=1e-8)
     np.testing.assert_allclose(readings.residual(shrunk), readings.residual(state), atol=1e-8)
@@ -128,7 +128,7 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
 def test_the_prior_is_in_sigmas_and_holds_what_has_none() -> None:
     made = made_problem(0)
     state = State(made.truth.poses, made.truth.tags, 2.0 * CALIBRATION_SIGMA)
-    np.testing.assert_allclose(made.problem.prior.residual(state)[:, 0], [0.0, *[2.0] * 8])
+    np.testing.assert_allclose(made.problem.prior.residual(state)[:, 0], [0.0, *[2.0] * (N_CALIBRATION - 1)])
 
 
 def test_whitening_makes_unit_covariances() -> None:

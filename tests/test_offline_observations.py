@@ -6,14 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib import se2
 from calib.arrays import FloatArray
 from calib.errors import GroundsbotError
 from calib.noise import NoiseParameters
+from calib.robot import Robot
 from offline.observations import Readings, check_tag_sizes, read_detections, read_positions
 from offline.run import Detections, Positions, Run, TagKey
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, seen_corners_px
 
 NOISE = NoiseParameters()
+NO_TWIST = np.zeros((1000, 2))  # speed and turning rate at the keyframes
 STILL = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)])
 ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4, "yaw_rad": 0.1, "pitch_rad": 0.05})
 UPRIGHT = [MadeTag(i, (2.0 + 0.7 * i, 0.3 * i - 0.4, 0.4), np.pi + 0.2 * i - 0.3) for i in range(5)]
@@ -38,7 +41,7 @@ def read_many(tags: list[MadeTag], n: int = 40, sigma_px: float = 0.2, seed: int
     noise = sigma_px * np.random.default_rng(seed).standard_normal((len(tags), n, 4, 2))
     corners_px = np.array([corners_of(tag) for tag in tags])[:, None] + noise
     detections = detections_of(corners_px.reshape(-1, 4, 2), np.repeat(np.arange(len(tags)), n).tolist())
-    return read_detections(run_of(tags), detections, np.tile(np.arange(n), len(tags)), NOISE)
+    return read_detections(run_of(tags), detections, np.tile(np.arange(n), len(tags)), NO_TWIST, NOISE)
 
 
 def in_camera(tag: MadeTag) -> FloatArray:
@@ -81,7 +84,7 @@ def test_a_small_tag_is_left_out_rather_than_biased() -> None:
     )
     run = replace(run_of(tiny), robot=robot)
     corners_px = np.array([corners_of(tag) for tag in tiny])
-    readings, warnings = read_detections(run, detections_of(corners_px, list(range(6))), np.arange(6), NOISE)
+    readings, warnings = read_detections(run, detections_of(corners_px, list(range(6))), np.arange(6), NO_TWIST, NOISE)
     assert sorted(readings.tag.tolist()) == [0, 1, 2, 3, 4]
     (warning,) = warnings
     assert "1 of 6 tag readings left out" in warning
@@ -127,7 +130,7 @@ def test_one_spoilt_picture_does_not_make_a_tag_askew() -> None:
     corners_px += 0.2 * rng.standard_normal(corners_px.shape)
     corners_px[7, 2] += [15.0, -9.0]
     detections = detections_of(corners_px, np.repeat(np.arange(5), n).tolist())
-    readings, warnings = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NOISE)
+    readings, warnings = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
     assert not any("upright" in warning for warning in warnings)
     assert len(readings) == 5 * n - 1
     assert 7 not in readings.keyframe[readings.tag == 0].tolist()
@@ -139,7 +142,7 @@ def test_corners_of_no_tag_are_left_out(corners: float) -> None:
     corners_px = np.repeat(np.array([corners_of(tag) for tag in UPRIGHT]), n, axis=0)
     corners_px[3] = corners
     detections = detections_of(corners_px, np.repeat(np.arange(5), n).tolist())
-    readings, _ = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NOISE)
+    readings, _ = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
     assert len(readings) == 5 * n - 1
     assert np.isfinite(readings.value).all()
     assert np.isfinite(readings.covariance).all()
@@ -150,7 +153,7 @@ def test_one_bad_picture_does_not_take_its_standing_pose_along() -> None:
     corners_px = np.repeat(np.array([corners_of(tag) for tag in UPRIGHT]), 6, axis=0)
     corners_px[3, 1, 0] = np.nan
     detections = detections_of(corners_px, np.repeat(np.arange(5), 6).tolist())
-    readings, _ = read_detections(run_of(UPRIGHT), detections, np.zeros(30, dtype=np.int64), NOISE)
+    readings, _ = read_detections(run_of(UPRIGHT), detections, np.zeros(30, dtype=np.int64), NO_TWIST, NOISE)
     assert len(readings) == 5
     np.testing.assert_allclose(readings.value[readings.tag == 0][0], in_camera(UPRIGHT[0]), atol=1e-7)
 
@@ -160,8 +163,8 @@ def test_a_standing_pose_gives_one_reading_with_the_sigma_of_one_picture() -> No
     offset = 0.3 * np.random.default_rng(0).standard_normal((50, 4, 2))
     offset -= offset.mean(axis=0)
     detections = detections_of(corners_of(tag) + offset, [0] * 50)
-    many, _ = read_detections(run_of([tag]), detections, np.full(50, 4), NOISE)
-    one, _ = read_detections(run_of([tag]), detections_of(corners_of(tag)[None], [0]), np.array([4]), NOISE)
+    many, _ = read_detections(run_of([tag]), detections, np.full(50, 4), NO_TWIST, NOISE)
+    one, _ = read_detections(run_of([tag]), detections_of(corners_of(tag)[None], [0]), np.array([4]), NO_TWIST, NOISE)
     assert len(many) == 1
     assert many.keyframe.tolist() == [4]
     np.testing.assert_allclose(many.value, one.value, atol=1e-9)
@@ -172,12 +175,14 @@ def test_a_tag_in_the_lens_is_a_phantom() -> None:
     close = MadeTag(3, (0.2 + 0.08, 0.058, 0.396), np.pi + 0.1, size_m=0.03)
     robot = made_robot(mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.03}])
     run = replace(run_of([close]), robot=robot)
-    readings, _ = read_detections(run, detections_of(corners_of(close)[None], [0]), np.array([0]), NOISE)
+    readings, _ = read_detections(run, detections_of(corners_of(close)[None], [0]), np.array([0]), NO_TWIST, NOISE)
     assert len(readings) == 0
 
 
 def test_nothing_seen_is_no_reading() -> None:
-    readings, warnings = read_detections(run_of([]), detections_of(np.zeros((0, 4, 2)), []), np.zeros(0, int), NOISE)
+    readings, warnings = read_detections(
+        run_of([]), detections_of(np.zeros((0, 4, 2)), []), np.zeros(0, int), NO_TWIST, NOISE
+    )
     assert (len(readings), warnings) == (0, [])
 
 
@@ -254,3 +259,24 @@ def test_logs_that_disagree_about_a_size_are_refused() -> None:
 
 def test_sizes_that_agree_or_are_of_tags_not_seen_are_no_matter() -> None:
     check_tag_sizes([run_with_size(0.15), run_with_size(0.15, "dora"), run_with_size(0.15, "eve", {7: 0.3})])
+
+
+def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
+    """By moving the robot on and by reading with another mount, both by hand."""
+    tag, speed_m_s, turning_rad_s = UPRIGHT[0], 0.4, -0.7
+    run = run_of([tag])
+    twist = np.array([[speed_m_s, turning_rad_s]])
+
+    def read(robot: Robot, T_map_base: FloatArray) -> Readings:
+        corners_px = seen_corners_px(tag, T_map_base, run.robot, CAMERA)
+        assert corners_px is not None
+        one = detections_of(corners_px[None], [0])
+        return read_detections(replace(run, robot=robot), one, np.array([0]), twist, NOISE)[0]
+
+    here = read(run.robot, np.zeros(3))
+    for k, name in enumerate(("roll_rad", "pitch_rad")):
+        mount = run.robot.mount.model_copy(update={name: getattr(run.robot.mount, name) + 1e-5})
+        other = read(run.robot.model_copy(update={"mount": mount}), np.zeros(3))
+        np.testing.assert_allclose(here.by_camera[0, :, k], (other.value - here.value)[0] / 1e-5, rtol=1e-2, atol=1e-3)
+    later = read(run.robot, se2.exp(1e-4 * np.array([speed_m_s, 0.0, turning_rad_s])))
+    np.testing.assert_allclose(here.by_camera[0, :, 2], (later.value - here.value)[0] / 1e-4, rtol=1e-2, atol=1e-3)

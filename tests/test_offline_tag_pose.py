@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.arrays import BoolArray, FloatArray
 from calib.camera_model import CameraModel
@@ -176,3 +177,20 @@ def test_no_readings_are_none() -> None:
     for reader in (upright_readings, general_readings):
         found = reader(np.zeros((0, 4, 2)), np.zeros(0), CAMERA, np.eye(3), SIGMA_PX)
         assert found.range_bearing.shape == (0, 2)
+
+
+@pytest.mark.parametrize("robot", [LEVEL, TIPPED])
+@pytest.mark.parametrize("reader", [upright_readings, general_readings])
+def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Callable[..., TagReadings]) -> None:
+    rotation = robot.mount.T_base_camera.rotation.as_matrix()
+    tags = [placed(3.0, 20.0, 15.0, 5.0), placed(2.0, -30.0, -12.0, 0.0), placed(4.0, 40.0, 3.0, 30.0)]
+    corners_px = np.stack([exact_corners(tag, robot, CAMERA) for tag in tags])
+
+    def turned(w: FloatArray) -> TagReadings:
+        R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
+        return reader(corners_px, np.full(3, SIZE_M), CAMERA, R_base_camera, SIGMA_PX)
+
+    found = turned(np.zeros(3))
+    for axis, turn in enumerate(1e-5 * np.eye(3)):
+        by_turn = (turned(turn).range_bearing - turned(-turn).range_bearing) / 2e-5
+        np.testing.assert_allclose(found.by_turn[..., axis], by_turn, rtol=1e-3, atol=1e-3)

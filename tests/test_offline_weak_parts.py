@@ -140,7 +140,18 @@ def test_a_long_drive_past_one_tag_is_solved_and_says_what_rounding_does() -> No
     by_kind = np.split(columns, [3 * n + 3, 3 * n + 5])
     problem = Problem(
         OdometryFactors(np.arange(n), motion, whitening, jacobian, parameters),
-        ReadingFactors(one, one, reading, one > 0, 20.0 * np.eye(2)[None], np.zeros((1, 3)), no_mount, one),
+        ReadingFactors(
+            one,
+            one,
+            reading,
+            one > 0,
+            20.0 * np.eye(2)[None],
+            np.zeros((1, 3)),
+            no_mount,
+            one,
+            np.zeros((1, 2, 3)),
+            no_mount,
+        ),
         CalibrationPrior(np.array([0.0, 0.005, 0.007, 0.01])),
         Columns(by_kind[0].reshape(-1, 3), by_kind[1].reshape(-1, 2), by_kind[2], 3 * n + 5),
         one,
