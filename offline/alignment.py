@@ -163,7 +163,7 @@ class _Judge:
         by_motion = np.eye(3)
         by_motion[:2, 2] = -quarter_turned(explanation.linear.centre)
         by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
-        covariance: FloatArray = by_motion @ np.linalg.inv(explanation.held.information) @ by_motion.T
+        covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
         return covariance
 
     def _told(self, explanation: Explanation, rivals: tuple[Alignment, ...], *, is_sure: bool) -> Alignment:

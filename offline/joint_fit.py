@@ -207,20 +207,45 @@ class Held:
         spread += lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
         return off.reshape(n, 2), spread
 
-    def misfits(self) -> FloatArray:
-        """(m,) of each tag held, how ill it fits where the others want it; above 1 it does not (see `ill_fitting`).
+    def without_each(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What the others make of each tag held: three tags at least.
 
-        Baarda's test: with P the inverse covariance freed of the motion, (P w)_i' P_ii^-1 (P w)_i is chi-square with 2
-        degrees, and P_ii^-1 the covariance of the difference that the others foretell. Three tags at least.
+        With P the inverse covariance freed of the motion, P_ii^-1 (P w)_i is the difference that the others leave, and
+        P_ii^-1 the covariance that they foretell for it (Baarda's test).
+
+        Returns:
+            (m, 2) differences, (m, 2, 2) their covariances, and (m, 3) by how much the motion changes without each.
         """
         m = len(self.rows) // 2
         inverse_root = linalg.solve_triangular(self.root, np.eye(2 * m), lower=True, check_finite=False)
         lever = (inverse_root.T @ self.whitened).reshape(m, 2, 3)
         each = inverse_root.reshape(2 * m, m, 2)
         P = np.einsum("rma,rmb->mab", each, each)
-        P -= lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
+        by_lever = lever @ np.linalg.inv(self.information)
+        P -= by_lever @ lever.transpose(0, 2, 1)
         covariance = np.linalg.inv(P)
-        return ill_fitting((covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance)
+        off = (covariance @ self.pull.reshape(m, 2, 1))[..., 0]
+        return off, covariance, np.einsum("mij,mi->mj", by_lever, off)
+
+    def misfits(self) -> FloatArray:
+        """(m,) how ill each tag held fits where the others want it, see `ill_fitting`; three tags at least."""
+        off, covariance, _ = self.without_each()
+        return ill_fitting(off, covariance)
+
+    def motion_covariance(self) -> FloatArray:
+        """(3, 3) of the motion, with what is in doubt of each tag: were it wrong, the motion would be another.
+
+        A mixture of the motion with and without each tag, by how much better a wrong tag, anywhere in reach, explains
+        it.
+        """
+        covariance = np.asarray(np.linalg.inv(self.information), dtype=np.float64)
+        if len(self.rows) < 6:
+            return covariance
+        off, spread, change = self.without_each()
+        gain_nats = 0.5 * (_better_than_wrong(spread) - squared_sigmas(off, spread))
+        doubt = 1.0 / (1.0 + np.exp(np.clip(gain_nats, -30.0, 30.0)))
+        mixed: FloatArray = covariance + (doubt[:, None] * change).T @ change
+        return mixed
 
 
 @lru_cache
@@ -234,9 +259,14 @@ def ill_fitting(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
     It fits if chance explains the difference, chi-square with 2 degrees, and explains it better than a wrong tag would
     that lies anywhere in reach. So a tag whose place is foretold to a few metres only proves nothing.
     """
-    better_than_wrong = 2.0 * np.log(REACH_M**2 / (2.0 * pi)) - np.log(_determinants(covariance))
-    ratio: FloatArray = squared_sigmas(off_m, covariance) / np.clip(better_than_wrong, 1e-6, TAG_GATE)
+    ratio: FloatArray = squared_sigmas(off_m, covariance) / np.clip(_better_than_wrong(covariance), 1e-6, TAG_GATE)
     return ratio
+
+
+def _better_than_wrong(covariance: FloatArray) -> FloatArray:
+    """(m,) squared sigmas up to which a tag with covariance (m, 2, 2) rather fits than lies anywhere in reach."""
+    squares: FloatArray = 2.0 * np.log(REACH_M**2 / (2.0 * pi)) - np.log(_determinants(covariance))
+    return squares
 
 
 def squared_sigmas(off_m: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -97,7 +97,9 @@ def _starts() -> StartFactors:
 
 def _distances() -> DistanceFactors:
     ends = np.array([[0, -1, 2, -1], [1, -1, -1, 0], [-1, 1, -1, 0], [-1, 1, 2, -1]]).T
-    return DistanceFactors(ends[0], ends[1], ends[2], ends[3], np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.1, 0.2, 0.3, 0.4]))
+    return DistanceFactors(
+        ends[0], ends[1], ends[2], ends[3], np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.1, 0.2, 0.3, 0.4])
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
