@@ -16,17 +16,19 @@ from offline.variance_components import Components, FittedVariances, Part, fit_v
 # What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals.
 _MAX_KEYFRAMES: Final = 20_000
 _QUANTILE: Final = float(ndtri(0.995))
+# No wheel and no detector is so many times better than the defaults: smaller residuals are made up, or too few.
+_BEST: Final = 20.0
 
 
 @dataclass(frozen=True)
 class FittedSigma:
-    """One noise parameter.
+    """One noise parameter, as the drives have it.
 
     Attributes:
         low, high: where it lies with 99 %.
         redundancy: of how many squared residuals of its own it is the mean.
-        told: False where the drives say next to nothing of it; then it stands where it began, unless they speak
-            against that.
+        told: False where the drives say next to nothing of it; then it stands where it began, or where they are more
+            content with if that is more, unless they speak against that.
     """
 
     name: str
@@ -58,7 +60,12 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
         return NoiseFit(noise, (), converged=True)
     share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
     parts = [_part(each, names, share) for each in maps]
-    fitted = fit_variances(parts, np.array([getattr(noise, name) for name in names]))
+    best = NoiseParameters()
+    fitted = fit_variances(
+        parts,
+        np.array([getattr(noise, name) for name in names]),
+        least=np.array([getattr(best, name) / _BEST for name in names]),
+    )
     values = dict(zip(names, fitted.sigma.tolist(), strict=True))
     return NoiseFit(noise.model_copy(update=values), _sigmas(names, fitted), fitted.converged)
 

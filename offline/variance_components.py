@@ -99,15 +99,20 @@ class FittedVariances:
         return self.sigma / spread, self.sigma * spread
 
 
-def fit_variances(parts: Sequence[Part], sigma: FloatArray) -> FittedVariances:
+def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | None = None) -> FittedVariances:
     """Fits K sigmas to all parts at once, from `sigma` (K,), which is also the middle of the prior.
 
     Sigmas of which the data say next to nothing are put back up to where they began, unless the data speak against it.
 
+    Args:
+        parts: what the residuals are of.
+        sigma: (K,) where to begin.
+        least: (K,) below which no sigma is looked for.
+
     Raises:
         UnderDeterminedError: a part has something that nothing ties down.
     """
-    search = _Search(parts, np.log(sigma))
+    search = _Search(parts, np.log(sigma), np.full(len(sigma), -np.inf) if least is None else np.log(least))
     converged = search.run(np.ones(len(sigma), dtype=np.bool_))
     fitted = search.log_sigma.copy()
     told = search.redundancy() >= _LEAST_REDUNDANCY
@@ -132,10 +137,11 @@ class _Search:
             too small make the information far too small; this does not depend on them.
     """
 
-    def __init__(self, parts: Sequence[Part], log_sigma: FloatArray) -> None:
+    def __init__(self, parts: Sequence[Part], log_sigma: FloatArray, least: FloatArray) -> None:
         self._parts = parts
+        self._least = least
         self.middle = log_sigma
-        self.log_sigma = log_sigma.copy()
+        self.log_sigma = np.maximum(log_sigma, least)
         self.states = [part.start for part in parts]
         self.score = np.zeros(len(log_sigma))
         self.expected = np.zeros(len(log_sigma))
@@ -171,6 +177,7 @@ class _Search:
             pull = self.score - (self.log_sigma - self.middle) / PRIOR_SIGMA**2
             step = np.zeros(len(free))
             step[free] = np.linalg.solve(total[np.ix_(free, free)], pull[free])
+            step = np.maximum(step, self._least - self.log_sigma)
             told = self.expected >= _LEAST_REDUNDANCY
             if (np.abs(step) < _SMALL_STEP * np.sqrt(np.diag(self.covariance())))[free & told].all():
                 return True
