@@ -90,11 +90,17 @@ def merge(
 
 
 def _variance_factor(local_map: LocalMap) -> float:
-    """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that."""
+    """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that.
+
+    Where a map's parts do not join within their noise, something that is in no covariance bends it, and by as much as
+    they do not join its covariance says too little.
+    """
     problem = local_map.graph.problem
     n_priors = int((problem.prior.sigma > 0.0).sum())
     freedom = problem.n_residuals + n_priors - problem.columns.n
-    return max(1.0, 2.0 * local_map.solution.cost / freedom) if freedom > 0 else 1.0
+    factor = max(1.0, 2.0 * local_map.solution.cost / freedom) if freedom > 0 else 1.0
+    goodness = local_map.goodness
+    return factor if goodness.fits else max(factor, goodness.chi_square / max(goodness.expected, 1))
 
 
 def _condensed(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:

@@ -1,6 +1,7 @@
 """Which local maps hang together, and where each one starts."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -184,3 +185,18 @@ def test_reasons_say_what_is_missing() -> None:
     stray = {2: HALL[2] + [9.0, -9.0], 3: HALL[3] + [-7.0, 8.0]}
     by_chance = reason(a, local_map("e", STARTS["b"], [0, 1, 2, 3], places=stray))
     assert "of the 4 tags that e_one shares with a_one only 0, 1 lie the same way" in by_chance
+
+
+def test_a_map_that_does_not_fit_together_is_held_to_less() -> None:
+    """What bends it is in no covariance, so a tag a little off is no sign that this tag was moved."""
+    tags = list(range(8))
+    a = local_map("a", STARTS["a"], tags)
+    b = local_map("b", STARTS["b"], tags, places={5: HALL[5] + np.array([0.5, 0.0])})
+    bent = replace(b, goodness=replace(b.goodness, chi_square=900.0, expected=30, bound=60.0))
+    n_inliers = [
+        pair.alignment.n_inliers
+        for maps in ([a, b], [a, bent])
+        for pair in merge(maps).pairs
+        if pair.alignment is not None
+    ]
+    assert n_inliers == [7, 8]

@@ -32,8 +32,8 @@ def test_the_two_runs_merge_into_one_map_of_all_tags(merged: dict[str, list[dict
     (alignment,) = merged["alignments"]
     assert alignment["n_shared"] == 12
     assert isinstance(alignment["n_inliers"], int)
+    assert alignment["n_inliers"] >= 10
     assert alignment["is_sure"]
-    assert alignment["n_inliers"] > 6  # most of them
 
 
 def test_readme_quotes_the_distance_found(merged: dict[str, list[dict[str, float]]]) -> None:
