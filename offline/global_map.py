@@ -90,11 +90,13 @@ def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
 
 def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
     """From right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
-    turn = np.eye(len(joint))
+    turned = joint.copy()
     for i, theta in enumerate(start_headings_rad):
         cos, sin = np.cos(theta), np.sin(theta)
-        turn[3 * i : 3 * i + 2, 3 * i : 3 * i + 2] = [[cos, -sin], [sin, cos]]
-    return turn @ joint @ turn.T
+        turn, place = np.array([[cos, -sin], [sin, cos]]), slice(3 * i, 3 * i + 2)
+        turned[place] = turn @ turned[place]
+        turned[:, place] = turned[:, place] @ turn.T
+    return turned
 
 
 def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray) -> RunResult:
@@ -139,9 +141,9 @@ def _start_to_start(runs: Sequence[RunResult], joint: FloatArray) -> tuple[Start
     found = []
     for i in range(len(runs)):
         for j in range(i + 1, len(runs)):
-            difference = np.zeros((2, len(joint)))
-            difference[:, 3 * i : 3 * i + 2] = -np.eye(2)
-            difference[:, 3 * j : 3 * j + 2] = np.eye(2)
+            first, second = slice(3 * i, 3 * i + 2), slice(3 * j, 3 * j + 2)
+            between = joint[first, second]
+            covariance = joint[first, first] + joint[second, second] - between - between.T
             vector_m = runs[j].T_map_start[:2] - runs[i].T_map_start[:2]
-            found.append(StartToStart(runs[i].name, runs[j].name, vector_m, difference @ joint @ difference.T))
+            found.append(StartToStart(runs[i].name, runs[j].name, vector_m, covariance))
     return tuple(found)

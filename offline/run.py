@@ -76,6 +76,7 @@ class Run:
         tags: what was seen, sorted.
         camera: None in an imported log.
         warnings: what a person should know.
+        log_bytes: of the log; how much work it is worth.
     """
 
     name: str
@@ -90,12 +91,14 @@ class Run:
     detections: Detections
     positions: Positions
     warnings: tuple[str, ...]
+    log_bytes: int = 0
 
 
 # Readings with corrected bits are the ones that turn out to be phantoms.
 MAX_HAMMING = 0
-# The largest family has 587; a map's joint covariance grows with the square.
-_MOST_TAGS = 1000
+# All that the families we know have together: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
+# kilobytes with a thousand tags took over 400 MiB.
+_MOST_TAGS = 652
 
 
 @dataclass
@@ -207,14 +210,23 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
         detections=detections,
         positions=positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
+        log_bytes=_size_bytes(log),
     )
+
+
+def _size_bytes(log: Path) -> int:
+    files = [log] if log.is_file() else [path for path in log.iterdir() if path.is_file()]
+    return sum(path.stat().st_size for path in files)
 
 
 def _tag_readings(collected: _Collected, log: Path) -> tuple[tuple[TagKey, ...], Detections, Positions]:
     keys = {key for _, key, _ in collected.sightings}
     keys |= {TagKey(o.family, o.tag_id) for message in collected.observations for o in message.observations}
     if len(keys) > _MOST_TAGS:
-        raise OfflineError(f"{log}: {len(keys)} different tags, limit {_MOST_TAGS}; are their numbers right?")
+        raise OfflineError(
+            f"{log}: {len(keys)} different tags, limit {_MOST_TAGS} (as many as all families have); "
+            "are their numbers right?"
+        )
     tags = tuple(sorted(keys))
     index = {key: i for i, key in enumerate(tags)}
     n = len(collected.sightings)
