@@ -116,6 +116,9 @@ class Arrowhead:
             pose_next=np.zeros((tree.n_poses, 3, 3)),
             inner=np.empty(int(tree.rows_start[-1])),
             workspace=np.empty(int(tree.workspace_start[-1])),
+            border=np.empty((2, 3, int(np.diff(tree.front_start)[tree.level == 0].max(initial=0)))),
+            blocks=np.empty((2, 3, 3)),
+            inside=np.empty((int((tree.end - tree.first)[tree.level == 0].max(initial=0)), 3)),
         )
 
     def factorise(self, system: System, damping: float = 0.0, out: Rows | None = None) -> "Factorisation":

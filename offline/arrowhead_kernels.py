@@ -12,7 +12,7 @@ import numpy as np
 from calib.arrays import FloatArray
 from offline.arrowhead_cut import LEVELS
 from offline.arrowhead_tree import Tree
-from offline.jit import borrowed, jitted
+from offline.jit import borrowed, inner, jitted
 
 
 class System(NamedTuple):
@@ -45,12 +45,17 @@ class Rows(NamedTuple):
         pose_next: (P, 3, 3) U by the next pose of the leaf or the separator after it.
         inner: rows (n_eliminated, front) of the nodes between leaves and top.
         workspace: fronts being built up, one a level; the last one is the top's.
+        border, blocks, inside: room for what couples two poses to a leaf's front (2, 3, w), for two blocks (2, 3, 3),
+            and for a vector in a leaf (K, 3).
     """
 
     pose: FloatArray
     pose_next: FloatArray
     inner: FloatArray
     workspace: FloatArray
+    border: FloatArray
+    blocks: FloatArray
+    inside: FloatArray
 
 
 @jitted
@@ -66,25 +71,13 @@ def eliminate(tree: Tree, system: System, damping: float, rows: Rows) -> int:
     Returns:
         -1, or the first column whose pivot is not positive.
     """
-    rows.workspace[:] = 0.0
-    widest = 0
-    for node in range(len(tree.level) - 1):
-        if tree.level[node] == 0:
-            widest = max(widest, tree.front_start[node + 1] - tree.front_start[node])
-    return _eliminate_nodes(tree, system, damping, rows, np.zeros((2, 3, widest)), np.zeros((2, 3, 3)))
-
-
-@jitted
-def _eliminate_nodes(
-    tree: Tree, system: System, damping: float, rows: Rows, border: FloatArray, blocks: FloatArray
-) -> int:
-    """Children first, with room for what couples two poses to a leaf's border, and for two blocks."""
     tree, system, rows = borrowed(tree), borrowed(system), borrowed(rows)
-    border, blocks = borrowed(border), borrowed(blocks)
+    for i in range(len(rows.workspace)):
+        rows.workspace[i] = 0.0
     for node in range(len(tree.level)):
         front = _front_of(tree, node, rows.workspace)
         if tree.level[node] == 0:
-            failed = _eliminate_leaf(tree, system, damping, node, rows, front, border, blocks)
+            failed = _eliminate_leaf(tree, system, damping, node, rows, front)
         else:
             _add_separators(tree, system, damping, node, front)
             _add_tags(tree, system, damping, node, front)
@@ -95,28 +88,21 @@ def _eliminate_nodes(
         if failed >= 0:
             return int(failed)
         _add_to_parent(tree, node, front, rows.workspace)
-        front[:] = 0.0
+        for i in range(len(front)):
+            for j in range(len(front)):
+                front[i, j] = 0.0
     return -1
 
 
-@jitted
+@inner
 def _front_of(tree: Tree, node: int, workspace: FloatArray) -> FloatArray:
     size = tree.front_start[node + 1] - tree.front_start[node]
     start = tree.workspace_start[tree.level[node]]
     return workspace[start : start + size * size].reshape((size, size))
 
 
-@jitted
-def _eliminate_leaf(
-    tree: Tree,
-    system: System,
-    damping: float,
-    leaf: int,
-    rows: Rows,
-    front: FloatArray,
-    border: FloatArray,
-    blocks: FloatArray,
-) -> int:
+@inner
+def _eliminate_leaf(tree: Tree, system: System, damping: float, leaf: int, rows: Rows, front: FloatArray) -> int:
     """Pose by pose; `now` (3, w) couples the pose to the border seen so far.
 
     U^T D U = H, Y = U^-T now, Z = U^-T next.
@@ -124,11 +110,8 @@ def _eliminate_leaf(
     first, end, n_left = tree.first[leaf], tree.end[leaf], tree.calibration_at[leaf]
     n_slots = n_slots_of(tree, leaf)
     width = n_left + n_slots
-    now, following, block, carried = border[0], border[1], blocks[0], blocks[1]
-    carried[:] = 0.0
-    now[:, :width] = 0.0
-    if n_left:
-        now[:, :3] = system.pose_next[first - 1].T
+    now, following, block, carried = rows.border[0], rows.border[1], rows.blocks[0], rows.blocks[1]
+    _begin_leaf(system, first, n_left, width, now, carried)
     for pose in range(first, end):
         for i in range(3):
             for j in range(3):
@@ -148,13 +131,32 @@ def _eliminate_leaf(
         _subtract_square(front, U, now, width)
         now, following = following, now
     if tree.right[leaf] >= 0:
-        at = front.shape[0] - 3
-        front[at:, at:] += carried
-        front[:width, at:] += now[:, :width].T
+        _add_rest(front, carried, now, width)
     return -1
 
 
-@jitted
+@inner
+def _begin_leaf(system: System, first: int, n_left: int, width: int, now: FloatArray, carried: FloatArray) -> None:
+    """Before a leaf's first pose: nothing is carried, and only the separator on the left is coupled."""
+    for i in range(3):
+        for j in range(3):
+            carried[i, j] = 0.0
+        for a in range(width):
+            now[i, a] = system.pose_next[first - 1, a, i] if a < n_left else 0.0
+
+
+@inner
+def _add_rest(front: FloatArray, carried: FloatArray, now: FloatArray, width: int) -> None:
+    """What is left of a leaf's last pose for the separator on the right."""
+    at = front.shape[0] - 3
+    for i in range(3):
+        for j in range(3):
+            front[at + i, at + j] += carried[i, j]
+        for a in range(width):
+            front[a, at + i] += now[i, a]
+
+
+@inner
 def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
     """Z = U^-T N."""
     for j in range(3):
@@ -163,7 +165,7 @@ def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
         Z[0, j], Z[1, j], Z[2, j] = z0, z1, N[2, j] - U[0, 2] * z0 - U[1, 2] * z1
 
 
-@jitted
+@inner
 def _carry_on(
     U: FloatArray, Z: FloatArray, Y: FloatArray, width: int, carried: FloatArray, following: FloatArray
 ) -> None:
@@ -176,20 +178,21 @@ def _carry_on(
             following[i, a] = -(z0 * Y[0, a] + z1 * Y[1, a] + z2 * Y[2, a])
 
 
-@jitted
+@inner
 def n_slots_of(tree: Tree, node: int) -> int:
     """How much calibration the chain of a node is coupled to."""
     chain = tree.chain[node]
     return int(tree.slot_start[chain + 1] - tree.slot_start[chain])
 
 
-@jitted
+@inner
 def _add_readings(tree: Tree, system: System, pose: int, coupled: FloatArray, width: int) -> int:
     """Adds a pose's coupling to tags; tags come in the order of first reading, so a new one is always the next."""
     for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
         at = tree.reading_at[m]
         if at == width:
-            coupled[:, at : at + 2] = 0.0
+            for i in range(3):
+                coupled[i, at], coupled[i, at + 1] = 0.0, 0.0
             width += 2
         for i in range(3):
             coupled[i, at] += system.pose_tag[m, i, 0]
@@ -197,7 +200,7 @@ def _add_readings(tree: Tree, system: System, pose: int, coupled: FloatArray, wi
     return width
 
 
-@jitted
+@inner
 def _square_root(block: FloatArray, U: FloatArray) -> int:
     """U^T D U = block, 1 / D on the diagonal; -1, or the column without a positive pivot. Roots would take longer."""
     if not block[0, 0] > 0.0:
@@ -216,7 +219,7 @@ def _square_root(block: FloatArray, U: FloatArray) -> int:
     return -1
 
 
-@jitted
+@inner
 def _solve_transposed(U: FloatArray, B: FloatArray, width: int) -> None:
     """B <- U^-T B for the first columns of B (3, w)."""
     u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
@@ -226,7 +229,7 @@ def _solve_transposed(U: FloatArray, B: FloatArray, width: int) -> None:
         B[1, a], B[2, a] = y1, B[2, a] - u02 * y0 - u12 * y1
 
 
-@jitted
+@inner
 def _subtract_square(front: FloatArray, U: FloatArray, Y: FloatArray, width: int) -> None:
     """Front -= Y^T D^-1 Y: both triangles, since loops of full length are the faster ones."""
     for a in range(width):
@@ -235,7 +238,7 @@ def _subtract_square(front: FloatArray, U: FloatArray, Y: FloatArray, width: int
             front[a, b] -= y0 * Y[0, b] + y1 * Y[1, b] + y2 * Y[2, b]
 
 
-@jitted
+@inner
 def _add_separators(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
     """The separators' own entries of H."""
     is_top = tree.level[node] == LEVELS - 1
@@ -257,7 +260,7 @@ def _add_separators(tree: Tree, system: System, damping: float, node: int, front
                 front[row + i, at] += system.pose_calibration[pose, i, slot]
 
 
-@jitted
+@inner
 def _add_tags(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
     """The own entries of H of the tags that a node eliminates."""
     is_top = tree.level[node] == LEVELS - 1
@@ -275,7 +278,7 @@ def _add_tags(tree: Tree, system: System, damping: float, node: int, front: Floa
         row += 2
 
 
-@jitted
+@inner
 def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArray) -> None:
     first = tree.calibration_at[-1]
     for a in range(tree.n_calibration):
@@ -284,7 +287,7 @@ def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArr
         front[first + a, first + a] += damping * system.calibration[a, a]
 
 
-@jitted
+@inner
 def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> int:
     """Partial Cholesky: the first columns become rows of R, the rest loses what they explain."""
     n, size = tree.n_eliminated[node], front.shape[0]
@@ -300,11 +303,13 @@ def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> in
                 for r in range(end, size):
                     _subtract_one(front, k, r)
     start = tree.rows_start[node]
-    rows.inner[start : start + n * size] = front[:n].reshape(n * size)
+    for i in range(n):
+        for j in range(size):
+            rows.inner[start + i * size + j] = front[i, j]
     return -1
 
 
-@jitted
+@inner
 def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
     """Rows first to end - 1 of R; -1, or the row without a positive pivot."""
     for k in range(first, end):
@@ -321,7 +326,7 @@ def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
     return -1
 
 
-@jitted
+@inner
 def _subtract_one(front: FloatArray, k: int, r: int) -> None:
     """Row r loses its product with row k of R. Loops over slices need no look at the sign of an index."""
     factor, row, rest = front[k, r], front[k, r:], front[r, r:]
@@ -329,7 +334,7 @@ def _subtract_one(front: FloatArray, k: int, r: int) -> None:
         rest[j] -= factor * row[j]
 
 
-@jitted
+@inner
 def _subtract_four(front: FloatArray, k: int) -> None:
     """The rows below four rows of R, from k on, lose their products."""
     for r in range(k + 4, len(front)):
@@ -341,7 +346,7 @@ def _subtract_four(front: FloatArray, k: int) -> None:
             rest[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
 
 
-@jitted
+@inner
 def _add_to_parent(tree: Tree, node: int, front: FloatArray, workspace: FloatArray) -> None:
     """What is left of a front is added to the parent's."""
     above = _front_of(tree, tree.parent[node], workspace)

@@ -17,7 +17,7 @@ from offline import arrowhead_substitution
 from offline.arrowhead_cut import LEVELS
 from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_tree import Tree
-from offline.jit import jitted
+from offline.jit import inner, jitted
 
 
 def pose_marginals(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: BoolArray) -> FloatArray:
@@ -97,21 +97,26 @@ def _add_leaf(
         if not wanted[first + k]:
             continue
         for i in range(3):
-            inside[:] = 0.0
+            for j in range(n):
+                for axis in range(3):
+                    inside[j, axis] = 0.0
             inside[k, i] = 1.0
             arrowhead_substitution.solve_leaf(tree, rows, leaf, inside)
-            marginals[first + k, i] = inside[k]
-            outside[i] = 0.0
+            for j in range(3):
+                marginals[first + k, i, j] = inside[k, j]
+            for a in range(size):
+                outside[i, a] = 0.0
             arrowhead_substitution.leaf_to_front(tree, system, leaf, inside, outside[i])
         _add_square(outside, front, marginals[first + k])
 
 
-@jitted
+@inner
 def _add_square(outside: FloatArray, front: FloatArray, out: FloatArray) -> None:
     """Adds G C G^T of G (3, w) to out (3, 3), and makes it symmetric."""
     weighted = np.empty(len(front))
     for i in range(3):
-        weighted[:] = 0.0
+        for a in range(len(front)):
+            weighted[a] = 0.0
         for b in range(len(front)):
             if outside[i, b] != 0.0:
                 for a in range(len(front)):

@@ -8,7 +8,7 @@ factors of Lupton and Sukkarieh, "Visual-inertial-aided navigation for high-dyna
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from offline.jit import borrowed, jitted
+from offline.jit import borrowed, inner, jitted
 from offline.linearise_kernels import Odometry, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
 
@@ -24,7 +24,7 @@ def add_moments(odometry: Odometry, whitening: FloatArray) -> None:
         _invert(odometry.information[m], odometry.covariance[m])
 
 
-@jitted
+@inner
 def _invert(A: FloatArray, out: FloatArray) -> None:
     """Out <- A^-1 (3, 3), symmetric."""
     out[0, 0], out[0, 1] = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2], A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
@@ -67,14 +67,14 @@ def compose(odometry: Odometry, index: IntArray, out: Odometry) -> None:
             at += 1
 
 
-@jitted
+@inner
 def _copy(block: FloatArray, out: FloatArray) -> None:
     for i in range(3):
         for j in range(3):
             out[i, j] = block[i, j]
 
 
-@jitted
+@inner
 def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, scratch: FloatArray) -> None:
     """M <- M o M_m, C <- A C A^T + C_m, K <- A K + K_m, with A the adjoint of M_m^-1."""
     x, y, turn, cos, sin = odometry.motion[m]
@@ -98,7 +98,7 @@ def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, 
     motion[3], motion[4] = c * cos - s * sin, s * cos + c * sin
 
 
-@jitted
+@inner
 def _multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     for i in range(3):
         for j in range(3):
@@ -152,7 +152,7 @@ def expand(
             T[2] = wrapped(theta + C[2, 0] * along + C[2, 1] * across + C[2, 2] * here)
 
 
-@jitted
+@inner
 def _pull(composed: Odometry, at: int, kept: FloatArray, calibration: FloatArray) -> tuple[float, float, float]:
     """Force and moment at the end of a composed motion: its information times what it is off by; the force in map."""
     x, y, turn, cos, sin = motion_at(composed, at, wheel_correction(composed, at, calibration))

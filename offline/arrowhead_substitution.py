@@ -5,21 +5,21 @@ import numpy as np
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import Rows, System, n_slots_of
 from offline.arrowhead_tree import Tree
-from offline.jit import borrowed, jitted
+from offline.jit import borrowed, inner, jitted
 
 
 @jitted
 def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
-    inside, outside = _scratch(tree)
+    inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 1):
         start, end = tree.front_start[node], tree.front_start[node + 1]
         if tree.level[node] == 0:
-            first, last = tree.first[node], tree.end[node]
-            inside[: last - first] = vector[3 * first : 3 * last].reshape((last - first, 3))
+            _take_leaf(tree, node, vector, inside)
             solve_leaf(tree, rows, node, inside)
-            outside[: end - start] = 0.0
+            for a in range(end - start):
+                outside[a] = 0.0
             leaf_to_front(tree, system, node, inside, outside)
             for a in range(start, end):
                 vector[tree.front[a]] -= outside[a - start]
@@ -36,18 +36,19 @@ def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
 def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
-    inside, outside = _scratch(tree)
+    inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 2, -1, -1):
         start, end = tree.front_start[node], tree.front_start[node + 1]
         columns = tree.front[start:end]
         if tree.level[node] == 0:
-            first, last = tree.first[node], tree.end[node]
             for a in range(end - start):
                 outside[a] = vector[columns[a]]
-            inside[: last - first] = vector[3 * first : 3 * last].reshape((last - first, 3))
+            _take_leaf(tree, node, vector, inside)
             _front_to_leaf(tree, system, node, outside, inside)
             solve_leaf(tree, rows, node, inside)
-            vector[3 * first : 3 * last] = inside[: last - first].reshape(3 * (last - first))
+            for pose in range(tree.first[node], tree.end[node]):
+                for i in range(3):
+                    vector[3 * pose + i] = inside[pose - tree.first[node], i]
             continue
         R = _rows_of(tree, node, rows)
         for k in range(len(R) - 1, -1, -1):
@@ -57,17 +58,16 @@ def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None
             vector[columns[k]] = rest / R[k, k]
 
 
-@jitted
-def _scratch(tree: Tree) -> tuple[FloatArray, FloatArray]:
-    longest, widest = 0, 0
-    for node in range(len(tree.level) - 1):
-        if tree.level[node] == 0:
-            longest = max(longest, tree.end[node] - tree.first[node])
-            widest = max(widest, tree.front_start[node + 1] - tree.front_start[node])
-    return np.empty((longest, 3)), np.empty(widest)
+@inner
+def _take_leaf(tree: Tree, leaf: int, vector: FloatArray, inside: FloatArray) -> None:
+    """A leaf's part of a vector."""
+    first = tree.first[leaf]
+    for pose in range(first, tree.end[leaf]):
+        for i in range(3):
+            inside[pose - first, i] = vector[3 * pose + i]
 
 
-@jitted
+@inner
 def _rows_of(tree: Tree, node: int, rows: Rows) -> FloatArray:
     n, size = tree.n_eliminated[node], tree.front_start[node + 1] - tree.front_start[node]
     return rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape((n, size))
@@ -127,7 +127,7 @@ def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, out
             outside[at + 1] += L[0, 1] * x0 + L[1, 1] * x1 + L[2, 1] * x2
 
 
-@jitted
+@inner
 def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, inside: FloatArray) -> None:
     """Takes B outside from inside (K, 3)."""
     first, end = tree.first[leaf], tree.end[leaf]
@@ -158,25 +158,33 @@ def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
     first_calibration = first_tag + 2 * tree.n_tags
     for chain in range(len(tree.chain_start) - 1):
         first, end = tree.chain_start[chain], tree.chain_start[chain + 1]
-        slots = first_calibration + tree.slots[tree.slot_start[chain] : tree.slot_start[chain + 1]]
+        slots = tree.slots[tree.slot_start[chain] : tree.slot_start[chain + 1]]
         for pose in range(first, end):
             p = 3 * pose
-            y[p : p + 3] += system.pose[pose] @ x[p : p + 3]
+            _add_one_way(system.pose[pose], p, x, y)
             if pose + 1 < end:
                 _add_both_ways(system.pose_next[pose], p, p + 3, x, y)
             for a in range(len(slots)):
-                _add_both_ways(system.pose_calibration[pose][:, a : a + 1], p, slots[a], x, y)
+                _add_both_ways(system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y)
             for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
                 _add_both_ways(system.pose_tag[m], p, first_tag + 2 * tree.reading_tag[m], x, y)
     for tag in range(tree.n_tags):
         t = first_tag + 2 * tag
-        y[t : t + 2] += system.tag[tag] @ x[t : t + 2]
+        _add_one_way(system.tag[tag], t, x, y)
         _add_both_ways(system.tag_calibration[tag], t, first_calibration, x, y)
-    y[first_calibration:] += system.calibration @ x[first_calibration:]
+    _add_one_way(system.calibration, first_calibration, x, y)
     return y
 
 
-@jitted
+@inner
+def _add_one_way(block: FloatArray, at: int, x: FloatArray, y: FloatArray) -> None:
+    """Adds a block on the diagonal."""
+    for i in range(block.shape[0]):
+        for j in range(block.shape[1]):
+            y[at + i] += block[i, j] * x[at + j]
+
+
+@inner
 def _add_both_ways(block: FloatArray, row: int, column: int, x: FloatArray, y: FloatArray) -> None:
     """Adds an off-diagonal block and its transpose."""
     for i in range(block.shape[0]):

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.arrays import IntArray
 from offline.arrowhead_cut import LEVELS, Pieces, cut, nodes_of_poses
-from offline.jit import jitted
+from offline.jit import inner, jitted
 
 
 class Tree(NamedTuple):
@@ -112,7 +112,7 @@ def build_tree(
     pieces = cut(chain_start)
     n_poses, n_nodes = int(chain_start[-1]), len(pieces.level)
     node_of = nodes_of_poses(pieces.level, pieces.first, pieces.end, pieces.pose_level)
-    home = _homes_of_tags(node_of, reading_pose, reading_tag, n_tags)
+    home = _homes_of_tags(node_of, n_nodes - 1, reading_pose, reading_tag, n_tags)
     inner = np.flatnonzero(pieces.pose_level > 0)
     separators = _grouped(node_of[inner, pieces.pose_level[inner]], inner, n_nodes)
     tags = _grouped(home, np.arange(n_tags), n_nodes)
@@ -121,7 +121,14 @@ def build_tree(
     home_of_reading = node_of[reading_pose, pieces.pose_level[reading_pose]]
     column_of_reading, n_columns = 3 * n_poses + 2 * reading_tag, 3 * n_poses + 2 * n_tags + n_free
     up, reading_at = _places(
-        pieces.parent, fronts.front_start, fronts.front, home_of_reading, column_of_reading, n_columns
+        pieces.parent,
+        np.argsort(pieces.parent[:-1], kind="stable"),
+        fronts.front_start,
+        fronts.front,
+        home_of_reading,
+        np.argsort(home_of_reading, kind="stable"),
+        column_of_reading,
+        n_columns,
     )
     up[_within(fronts.front_start, fronts.n_eliminated)] = -1
     size = np.diff(fronts.front_start)
@@ -196,7 +203,7 @@ def _fronts(
     return _Fronts(n_eliminated, start, front, calibration_at)
 
 
-@jitted
+@inner
 def _add_columns(lists: _Lists, member: int, base: int, width: int, front: IntArray, at: int, is_filling: bool) -> int:
     """The columns of a list's variables, each `width` wide; returns where the next go."""
     for k in range(lists.start[member], lists.start[member + 1]):
@@ -207,7 +214,7 @@ def _add_columns(lists: _Lists, member: int, base: int, width: int, front: IntAr
     return at
 
 
-@jitted
+@inner
 def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
     """The columns of a separator at an end, unless it is a chain's end."""
     if pose < 0:
@@ -226,19 +233,22 @@ def _within(start: IntArray, length: IntArray) -> IntArray:
 @jitted
 def _places(
     parent: IntArray,
+    children: IntArray,
     front_start: IntArray,
     front: IntArray,
     home_of_reading: IntArray,
+    readings: IntArray,
     column_of_reading: IntArray,
     n_columns: int,
 ) -> tuple[IntArray, IntArray]:
-    """Where each front's columns lie in the parent's front, and each reading's tag in the front of its pose's node."""
+    """Where each front's columns lie in the parent's front, and each reading's tag in the front of its pose's node.
+
+    `children` are sorted by their parents, `readings` by their homes: sorting takes a second to compile.
+    """
     n_nodes = len(parent)
     place = np.full(n_columns, -1)
     up = np.full(len(front), -1)
     reading_at = np.empty(len(home_of_reading), dtype=np.int64)
-    children = np.argsort(parent[:-1], kind="mergesort")
-    readings = np.argsort(home_of_reading, kind="mergesort")
     next_child, next_reading = 0, 0
     for node in range(n_nodes):
         for i in range(front_start[node], front_start[node + 1]):
@@ -255,11 +265,9 @@ def _places(
 
 
 @jitted
-def _homes_of_tags(node_of: IntArray, reading_pose: IntArray, reading_tag: IntArray, n_tags: int) -> IntArray:
+def _homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_tag: IntArray, n_tags: int) -> IntArray:
     """(T,) the lowest node above the leaves in which all readings of a tag lie."""
-    top = node_of.max()
     common = np.full((n_tags, LEVELS), -2)
-    common[:, LEVELS - 1] = top
     for m in range(len(reading_pose)):
         for level in range(1, LEVELS - 1):
             node, tag = node_of[reading_pose[m], level], reading_tag[m]
@@ -269,7 +277,7 @@ def _homes_of_tags(node_of: IntArray, reading_pose: IntArray, reading_tag: IntAr
                 common[tag, level] = -1
     home = np.full(n_tags, top)
     for tag in range(n_tags):
-        for level in range(LEVELS - 1, 0, -1):
+        for level in range(LEVELS - 2, 0, -1):
             if common[tag, level] >= 0:
                 home[tag] = common[tag, level]
     return home

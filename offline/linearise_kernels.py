@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_kernels import System
-from offline.jit import jitted
+from offline.jit import inner, jitted
 
 
 class Values(NamedTuple):
@@ -104,14 +104,14 @@ def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: Syst
             system.pose_tag[m, i, 1] *= pose[i] * tag[1]
 
 
-@jitted
+@inner
 def _hold_one(block: FloatArray, i: int) -> None:
     block[i, :] = 0.0
     block[:, i] = 0.0
     block[i, i] = 1.0
 
 
-@jitted
+@inner
 def wrapped(angle: float) -> float:
     """In [-pi, pi]."""
     return float(angle - 2.0 * np.pi * np.rint(angle * (0.5 / np.pi)))
@@ -120,7 +120,7 @@ def wrapped(angle: float) -> float:
 # Series are written with reciprocals: a division takes as long as the whole rest of a term.
 
 
-@jitted
+@inner
 def half_angle_cotangent(omega: float) -> float:
     """(w/2) cot(w/2)."""
     if abs(omega) < 0.2:
@@ -131,7 +131,7 @@ def half_angle_cotangent(omega: float) -> float:
     return float(0.5 * omega * np.cos(0.5 * omega) / np.sin(0.5 * omega))
 
 
-@jitted
+@inner
 def series(omega: float) -> tuple[float, float, float]:
     """sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^2."""
     s = omega * omega

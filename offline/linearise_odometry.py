@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import System
-from offline.jit import borrowed, jitted
+from offline.jit import borrowed, inner, jitted
 from offline.linearise_kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
 from offline.robust import Loss, loss_and_weight
 
@@ -55,7 +55,7 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
     return total
 
 
-@jitted
+@inner
 def wheel_correction(odometry: Odometry, m: int, calibration: FloatArray) -> _Three:
     """T = K c, what calibration c puts at the end of a motion."""
     c0 = calibration[odometry.parameters[m, 0]]
@@ -71,7 +71,7 @@ def wheel_correction(odometry: Odometry, m: int, calibration: FloatArray) -> _Th
     )
 
 
-@jitted
+@inner
 def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, float, float, float]:
     """X, y, heading of motion o exp(t), and the heading's cosine and sine."""
     motion = odometry.motion[m]
@@ -85,7 +85,7 @@ def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, floa
     return x, y, theta, np.cos(theta), np.sin(theta)
 
 
-@jitted
+@inner
 def _error(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
     """log(motion^-1 o moved), and (a, b, p, q) of Jr^-1 with the rows (a, -b, p), (b, a, q), (0, 0, 1)."""
     dx, dy, omega = x - motion[0], y - motion[1], wrapped(turn - motion[2])
@@ -96,7 +96,7 @@ def _error(motion: tuple[float, float, float, float, float], x: float, y: float,
     return e, _right_jacobian_inverse(e, cotangent)
 
 
-@jitted
+@inner
 def _right_jacobian_inverse(e: _Three, cotangent: float) -> _Four:
     half = 0.5 * e[2]
     _, even, odd = series(e[2])
@@ -104,13 +104,13 @@ def _right_jacobian_inverse(e: _Three, cotangent: float) -> _Four:
     return cotangent, half, half * moved_y - cotangent * moved_x, -half * moved_x - cotangent * moved_y
 
 
-@jitted
+@inner
 def _scaled(L: FloatArray, s: float) -> _Upper:
     """S L S: lengths are divided by 1 + wheel_scale."""
     return s * s * L[0, 0], s * s * L[0, 1], s * L[0, 2], s * s * L[1, 1], s * L[1, 2], L[2, 2]
 
 
-@jitted
+@inner
 def _times_vector(L: _Upper, e: _Three) -> _Three:
     return (
         L[0] * e[0] + L[1] * e[1] + L[2] * e[2],
@@ -119,7 +119,7 @@ def _times_vector(L: _Upper, e: _Three) -> _Three:
     )
 
 
-@jitted
+@inner
 def _transposed_times(J: _Four, L: _Upper) -> _Square:
     """J^T L."""
     a, b, p, q = J
@@ -136,7 +136,7 @@ def _transposed_times(J: _Four, L: _Upper) -> _Square:
     )
 
 
-@jitted
+@inner
 def _times_jacobian(M: _Square, J: _Four) -> _Upper:
     """M J, which is symmetric."""
     a, b, p, q = J
@@ -150,7 +150,7 @@ def _times_jacobian(M: _Square, J: _Four) -> _Upper:
     )
 
 
-@jitted
+@inner
 def _add_blocks(system: System, i: int, H: _Upper, A: _Four) -> None:
     """Adds H to pose j = i + 1, sets -A^T H between, and adds A^T H A to pose i.
 
@@ -176,7 +176,7 @@ def _add_blocks(system: System, i: int, H: _Upper, A: _Four) -> None:
     add_symmetric(system.pose[i + 1], H)
 
 
-@jitted
+@inner
 def add_symmetric(block: FloatArray, upper: _Upper) -> None:
     """Block (3, 3) += the matrix with this upper triangle."""
     block[0, 0] += upper[0]
@@ -190,7 +190,7 @@ def add_symmetric(block: FloatArray, upper: _Upper) -> None:
     block[2, 2] += upper[5]
 
 
-@jitted
+@inner
 def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) -> None:
     """Adds J^T f to pose j, and -A^T J^T f to pose i, whose three entries begin at `at`."""
     a, b, p, q = J
@@ -204,7 +204,7 @@ def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) 
     gradient[at + 5] += g2
 
 
-@jitted
+@inner
 def _by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
     """C <- S^-1 d(S e)/dc: log(exp(-(t + dt)) o G) with t = K c, the change enters on the left."""
     along, even, odd = series(t[2])
@@ -223,7 +223,7 @@ def _by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, pro
     C[1, 0] -= e[1] * s
 
 
-@jitted
+@inner
 def _unpacked(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
     """Into arrays: M, L, A and, in the first row of the fourth, f."""
     for k in range(3):
@@ -239,7 +239,7 @@ def _unpacked(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
 
 
-@jitted
+@inner
 def _add_wheels(odometry: Odometry, m: int, free: Free, scratch: FloatArray, system: System) -> None:
     """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for what is free of the wheel parameters."""
     M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]

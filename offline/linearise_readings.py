@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import System
-from offline.jit import borrowed, jitted
+from offline.jit import borrowed, inner, jitted
 from offline.linearise_kernels import Free, Readings, Values
 from offline.robust import Loss, loss_and_weight
 
@@ -61,7 +61,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     return total
 
 
-@jitted
+@inner
 def _add_calibration(
     readings: Readings, m: int, weight: float, free: Free, r: FloatArray, J: FloatArray, system: System
 ) -> None:
@@ -83,7 +83,7 @@ def _add_calibration(
         system.gradient[base + column] += j0 * r[0] + j1 * r[1]
 
 
-@jitted
+@inner
 def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J: FloatArray) -> None:
     """Sets r = W (predicted - read) and its derivatives; see `factors.ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
@@ -128,7 +128,7 @@ def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J
             J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
 
 
-@jitted
+@inner
 def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
     first, second = readings.value[m, 0], readings.value[m, 1]

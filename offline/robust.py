@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.arrays import FloatArray
-from offline.jit import jitted
+from offline.jit import inner, jitted
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
@@ -64,7 +64,7 @@ def forgets(loss: Loss) -> bool:
     return loss.form in (_GEMAN_MCCLURE, _TRUNCATED)
 
 
-@jitted
+@inner
 def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
     """Loss rho and weight rho' of a squared length."""
     c2 = loss.threshold * loss.threshold
@@ -88,5 +88,8 @@ def losses_and_weights(loss: Loss, residual: FloatArray) -> tuple[FloatArray, Fl
     """(M,) losses and (M,) weights of whitened residuals (M, n)."""
     losses, weights = np.empty(len(residual)), np.empty(len(residual))
     for m in range(len(residual)):
-        losses[m], weights[m] = loss_and_weight(loss, np.square(residual[m]).sum())
+        square = 0.0
+        for i in range(residual.shape[1]):
+            square += residual[m, i] * residual[m, i]
+        losses[m], weights[m] = loss_and_weight(loss, square)
     return losses, weights

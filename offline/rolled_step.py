@@ -9,7 +9,7 @@ its start: odometry then follows its linear model all but exactly, and what is l
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from offline.jit import jitted
+from offline.jit import inner, jitted
 from offline.linearise_kernels import Values
 
 
@@ -41,7 +41,7 @@ def rolled(
         out.tags[tag, 1] = after[1] + sin * x + cos * y
 
 
-@jitted
+@inner
 def _roll_on(here: FloatArray, there: FloatArray, step: FloatArray, poses: FloatArray, pose: int) -> None:
     """T_j <- T_i o M o exp(d_j - Ad d_i), Ad that of M^-1, M = T_i^-1 o T_j before the step."""
     cos, sin = np.cos(here[2]), np.sin(here[2])
