@@ -4,21 +4,21 @@ It reads no clock and no device, so that a live recording and a simulated one ru
 calls give the same log to the byte.
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from calib.camera_model import CameraModel
 from calib.robot import Robot
-from onboard.errors import LogError, MessageRefusedError
+from onboard.counted_log import CountedLog
+from onboard.errors import LogError
 from onboard.log_head import CAMERA_FRAME, log_head
-from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
-from onboard.log_writer import LogNote, LogOpener, LogWriter, RunLog
+from onboard.log_segments import SegmentLimits
+from onboard.log_writer import LogOpener, LogWriter, RunLog
 from onboard.measurements import detections_message, wheel_message
 from onboard.messages import (
     ClockAnchor,
@@ -31,6 +31,7 @@ from onboard.messages import (
     timestamp,
 )
 from onboard.picture import encode_jpeg
+from onboard.picture_schedule import PictureSchedule
 from onboard.tag_detector import Detection, TagDetector
 from onboard.watches import ClockWatch, SilenceWatch, Tallies
 from onboard.wheel_intake import StampedReading, WheelIntake
@@ -41,8 +42,6 @@ _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a m
 _WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s
 _CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
 _WAIT_FOR_WHEELS_NS: Final = 500_000_000
-_PICTURE_JITTER: Final = 0.4  # of the period between pictures to keep: how early one may be
-_PICTURE_CATCH_UP_NS: Final = _NS_PER_S  # pictures that were held up so long are made up for
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
 
@@ -104,14 +103,10 @@ class RecorderCore:
             LogError: the log cannot be opened.
         """
         self.folder = folder / run.run_id
-        self.counts: Counter[str] = Counter()
-        self.losses: Counter[str] = Counter()
-        self.newest_ns: dict[str, int] = {}
         self.tags_in_view: tuple[str, ...] = ()
         self._run = run
         self._options = run.robot.recorder
         self._detector = detector
-        self._on_event = on_event
         self._intake = WheelIntake()
         self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
         self._wheels = SilenceWatch(_WHEEL_SILENCE_NS, run.start_ns if expect_wheels else None)
@@ -121,20 +116,21 @@ class RecorderCore:
         self._waiting: deque[_Waiting] = deque()
         self._source: StampSource | int = StampSource.STAMP_SOURCE_UNSPECIFIED
         self._odd_sizes: set[tuple[int, int]] = set()
-        self._next_picture_ns = 0
         self._next_anchor_ns = 0
         self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines told of so far
         head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
         keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
         if open_log is None:
             limits = segment_limits(run.robot)
-            self._writer: RunLog = LogWriter(
+            writer: RunLog = LogWriter(
                 self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable, limits=limits
             )
         else:
-            self._writer = open_log(self.folder, head, run.start_ns, keep_pictures)
+            writer = open_log(self.folder, head, run.start_ns, keep_pictures)
+        self._log = CountedLog(writer, on_event)
+        self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
         self._keep_pictures = keep_pictures
-        self._keep_all = self._options.picture_rate_hz >= run.robot.devices.camera_fps
+        self._schedule = PictureSchedule(self._options.picture_rate_hz, run.robot.devices.camera_fps)
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
 
@@ -158,7 +154,7 @@ class RecorderCore:
     def _write_reading(self, each: StampedReading) -> None:
         reading = each.reading
         self._note_gaps(each)
-        self._write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
+        self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._recent.append((each.stamp_ns, reading.sequence))
         self._wheels.heard(each.host_ns)
 
@@ -249,28 +245,20 @@ class RecorderCore:
         try:
             message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         except ValueError as error:  # protobuf's word for a number that does not fit its field
-            self._refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
+            self._log.refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
             return
         self._waiting.append(_Waiting(message, receive_ns))
         self._write_waiting(receive_ns)
 
     def wants_picture(self, stamp_ns: int) -> bool:
         """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
-        if not self._keep_pictures or self._keep_all:
-            return self._keep_pictures
-        period_ns = round(_NS_PER_S / self._options.picture_rate_hz)
-        late_ns = stamp_ns - self._next_picture_ns
-        if late_ns < -_PICTURE_JITTER * period_ns:
-            return False
-        in_step = late_ns <= max(period_ns, _PICTURE_CATCH_UP_NS)
-        self._next_picture_ns = (self._next_picture_ns if in_step else stamp_ns) + period_ns
-        return True
+        return self._keep_pictures and self._schedule.is_due(stamp_ns)
 
     def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
         """Keeps one picture, encoded as JPEG."""
         if self._keep_pictures:
             message = CompressedImage(timestamp=timestamp(stamp_ns), frame_id=CAMERA_FRAME, data=jpeg, format="jpeg")
-            self._write("/camera/image", message, receive_ns, stamp_ns)
+            self._log.write("/camera/image", message, receive_ns, stamp_ns)
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
         """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
@@ -311,7 +299,7 @@ class RecorderCore:
         if before is not None:
             message.has_wheel_sequence = True
             message.wheel_sequence = before
-        self._write("/tags/detections", message, receive_ns, message.stamp_ns)
+        self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
 
     # --- time
 
@@ -327,7 +315,7 @@ class RecorderCore:
             self._write_reading(each)
         self._write_waiting(now_ns)
         self._watch(now_ns, now_ns if realtime_ns is None else realtime_ns)
-        self._tell_notes(now_ns)
+        self._log.tell_notes(now_ns)
         if now_ns < self._next_anchor_ns:
             return
         self._next_anchor_ns = now_ns - now_ns % _ANCHOR_PERIOD_NS + _ANCHOR_PERIOD_NS
@@ -337,7 +325,7 @@ class RecorderCore:
             realtime_ns=now_ns if realtime_ns is None else realtime_ns,
             synchronised=synchronised,
         )
-        self._write("/clock", anchor, now_ns, now_ns)
+        self._log.write("/clock", anchor, now_ns, now_ns)
         self._tell_tallies(now_ns)
 
     def _watch(self, now_ns: int, realtime_ns: int) -> None:
@@ -367,10 +355,7 @@ class RecorderCore:
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Writes one event."""
-        message = Event(stamp_ns=host_ns, severity=Severity.Name(severity), kind=kind, text=text, count=count)
-        self._write("/events", message, host_ns, host_ns)
-        if self._on_event is not None:
-            self._on_event(message)
+        self._log.event(kind, severity, text, host_ns, count)
 
     def close(self, now_ns: int) -> None:
         """Writes what still waits and finishes the files. A second call does nothing."""
@@ -383,36 +368,10 @@ class RecorderCore:
         self._tell_tallies(now_ns)
         if self._wheels.is_silent and not self.counts["/wheels"]:
             self.losses["recording without a single wheel reading"] += 1
-        self._tell_notes(now_ns)
+        self._log.tell_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
-        self._writer.close()
-        for note in self._writer.take_notes():  # too late for the log
-            self._count(note)
-
-    def _tell_notes(self, now_ns: int) -> None:
-        """Writes what the log's disk has to say."""
-        for note in self._writer.take_notes():
-            self._count(note)
-            self.event(note.kind, note.severity, note.text, now_ns, sum(note.lost.values()))
-
-    def _count(self, note: LogNote) -> None:
-        for topic, count in note.lost.items():
-            self.losses["pictures" if topic == PICTURE_TOPIC else topic] += count
-
-    def _write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
-        log_time_ns = max(receive_ns, self._writer.last_log_time_ns)
-        try:
-            taken = self._writer.write(topic, message, log_time_ns, stamp_ns)
-        except MessageRefusedError as error:
-            self._refuse(str(error))
-            return
-        self.counts[topic] += taken
-        self.newest_ns[topic] = receive_ns
-
-    def _refuse(self, reason: str) -> None:
-        self.losses["messages refused"] += 1
-        self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, reason, self._writer.last_log_time_ns, 1)
+        self._log.close()
 
 
 def segment_limits(robot: Robot) -> SegmentLimits:
