@@ -16,7 +16,8 @@ from onboard.messages import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
-_MOST_RESETS = 1000  # each begins a chain of its own, and between so many nothing is known
+# Each begins a chain of its own that only tags can join; pairs of them grow with the square.
+_MOST_RESETS = 100
 
 
 def stretches_of(
