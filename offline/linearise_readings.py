@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from offline.arrowhead_kernels import System
-from offline.jit import borrowed, inner, jitted
+from offline.jit import borrowed, inlined, inner, jitted
 from offline.linearise_kernels import Free, Readings, Values
 from offline.robust import Loss, loss_and_weight
 
@@ -22,10 +22,10 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     """
     readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
     r, J = np.empty(2), np.empty((2, 5 + _N_PARAMETERS))
-    total, g = 0.0, system.gradient
+    total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
-        _reading_factor(readings, m, values, r, J)
+        _reading_factor(readings, m, values, by_calibration, r, J)
         rho, w = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
         total += rho
         a0, a1, a2, b0, b1, b2 = J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2]
@@ -56,7 +56,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
         first_tag = 3 * len(values.poses) + 2 * tag
         g[first_tag] += c0 * r0 + d0 * r1
         g[first_tag + 1] += c1 * r0 + d1 * r1
-        if system.pose_calibration.shape[2]:
+        if by_calibration:
             _add_calibration(readings, m, w, free, r, J, system)
     return total
 
@@ -83,9 +83,11 @@ def _add_calibration(
         system.gradient[base + column] += j0 * r[0] + j1 * r[1]
 
 
-@inner
-def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J: FloatArray) -> None:
-    """Sets r = W (predicted - read) and its derivatives; see `factors.ReadingFactors`."""
+@inlined
+def _reading_factor(
+    readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
+) -> None:
+    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `factors.ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
     theta = values.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
@@ -122,20 +124,22 @@ def _reading_factor(readings: Readings, m: int, values: Values, r: FloatArray, J
         # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
         J[i, 0], J[i, 1], J[i, 2] = -bx, -by, bx * base_y - by * base_x
         J[i, 3], J[i, 4] = bx * cos - by * sin, bx * sin + by * cos
-        J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
-        J[i, 8] = -(a * x + b * y) / scale
-        for k in range(3):
-            J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
+        if by_calibration:
+            J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
+            J[i, 8] = -(a * x + b * y) / scale
+            for k in range(3):
+                J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
 
 
-@inner
+@inlined
 def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
     first, second = readings.value[m, 0], readings.value[m, 1]
     for k in range(3):
         c = values.calibration[readings.parameters[m, 4 + k]]
-        first += readings.by_camera[m, 0, k] * c
-        second += readings.by_camera[m, 1, k] * c
+        if c != 0.0:
+            first += readings.by_camera[m, 0, k] * c
+            second += readings.by_camera[m, 1, k] * c
     return first, second
 
 

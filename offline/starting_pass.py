@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, FloatArray
 from offline.arrowhead_tree import Tree
-from offline.jit import borrowed, inner, jitted
+from offline.jit import borrowed, inlined, jitted
 from offline.linearise_kernels import Odometry, Readings, Values, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
 
@@ -101,14 +101,14 @@ def _run(
                     _read(readings, m, out.calibration, out.poses[pose], P, turn, out.tags[readings.tag[m]], known)
 
 
-@inner
+@inlined
 def _begin(variance: FloatArray, heading: float, P: FloatArray, turn: FloatArray) -> None:
     turn[0], turn[1] = np.cos(heading), np.sin(heading)
     P[0], P[1], P[2] = turned((variance[0], 0.0, variance[1]), turn[0], turn[1])
     P[3], P[4], P[5] = 0.0, 0.0, variance[2]
 
 
-@inner
+@inlined
 def turned(C: _Covariance, cos: float, sin: float) -> _Covariance:
     """R C R^T with R the turn."""
     cross = 2.0 * cos * sin * C[1]
@@ -119,7 +119,7 @@ def turned(C: _Covariance, cos: float, sin: float) -> _Covariance:
     )
 
 
-@inner
+@inlined
 def _predict(
     odometry: Odometry,
     m: int,
@@ -146,7 +146,7 @@ def _predict(
     P[5] += C[2, 2]
 
 
-@inner
+@inlined
 def _read(
     readings: Readings,
     m: int,
@@ -180,7 +180,7 @@ def _read(
             turn[0], turn[1] = np.cos(pose[2]), np.sin(pose[2])
 
 
-@inner
+@inlined
 def _read_from_pose(
     readings: Readings, m: int, calibration: FloatArray, cos: float, sin: float
 ) -> tuple[float, float, _Covariance]:
@@ -203,7 +203,7 @@ def _read_from_pose(
     return cos * x - sin * y, sin * x + cos * y, turned(noise, cos * c - sin * s, sin * c + cos * s)
 
 
-@inner
+@inlined
 def _of_place(P: FloatArray, x: float, y: float) -> _Covariance:
     """Covariance of what lies at (x, y) from the pose and moves with it."""
     return (
@@ -213,18 +213,18 @@ def _of_place(P: FloatArray, x: float, y: float) -> _Covariance:
     )
 
 
-@inner
+@inlined
 def _sum(A: _Covariance, B: _Covariance) -> _Covariance:
     return A[0] + B[0], A[1] + B[1], A[2] + B[2]
 
 
-@inner
+@inlined
 def _place(tag: FloatArray, V: FloatArray, x: float, y: float, C: _Covariance) -> None:
     tag[0], tag[1] = x, y
     V[0], V[1], V[2] = C
 
 
-@inner
+@inlined
 def _correct(
     pose: FloatArray, P: FloatArray, H: tuple[float, float], S: _Covariance, off_x: float, off_y: float
 ) -> None:
