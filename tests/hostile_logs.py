@@ -177,16 +177,29 @@ def tags_seen(count: int, per_message: int) -> bytes:
     return of_messages(*contents)
 
 
-def observed(count: int) -> bytes:
+def observed(count: int, n_tags: int | None = None, per_message: int = 2) -> bytes:
+    """A straight drive past tags that all seem to lie a metre ahead; after `n_tags` the first ones come again."""
     contents: list[Content] = []
     for index in range(count):
         at_ns = START_NS + index * 100 * MS
         rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
         place = TagObservation.Cartesian(x_m=1.0, y_m=0.1)
-        tags = [TagObservation(family="tag36h11", tag_id=index + k, cartesian=place) for k in (0, 1)]
+        ids = [index * per_message + k if n_tags else index + k for k in range(per_message)]
+        numbers = [each % n_tags if n_tags else each for each in ids]
+        tags = [TagObservation(family="tag36h11", tag_id=number, cartesian=place) for number in numbers]
         contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
         seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
         contents.append(("/tags/observations", seen, at_ns))
+    return of_messages(*contents)
+
+
+def driven(count: int) -> bytes:
+    """Nothing but keyframes."""
+    contents: list[Content] = []
+    for index in range(count):
+        at_ns = START_NS + index * 100 * MS
+        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
+        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
     return of_messages(*contents)
 
 
@@ -231,6 +244,12 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "tags in one picture": lambda: full(lambda n: tags_seen(n, n)),
     "a new tag in each picture": lambda: full(lambda n: tags_seen(n, 1)),
     "tags in a row": lambda: full(observed),
+    "all tags in one picture": lambda: tags_seen(650, 650),
+    "all tags in a row": lambda: observed(650),
+    "all tags again and again": lambda: observed(2000, 650),
+    "few tags all along": lambda: full(lambda n: observed(n, 50)),
+    "a hundred tags a look": lambda: observed(2000, 600, 100),
+    "keyframes": lambda: full(driven),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),
     "PNG of 12000 x 12000": lambda: pictures([png(12000)]),
