@@ -29,7 +29,8 @@ def rolled(
     """
     for chain in range(len(chain_start) - 1):
         first = chain_start[chain]
-        out.poses[first] = moved.poses[first]
+        for i in range(3):
+            out.poses[first, i] = moved.poses[first, i]
         for pose in range(first, chain_start[chain + 1] - 1):
             _roll_on(values.poses[pose], values.poses[pose + 1], step[3 * pose : 3 * pose + 6], out.poses, pose)
     for tag in range(len(moved.tags)):
