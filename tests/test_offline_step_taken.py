@@ -53,7 +53,7 @@ def test_a_step_too_long_is_taken_in_part() -> None:
     arrowhead = problem.arrowhead
     system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
     step = -arrowhead.factorise(system).solve_in_order(system.gradient)
-    for times, share in ((1.0, 1.0), (3.0, 0.5), (6.0, 0.2)):
+    for times, share in ((1.0, 1.0), (2.5, 0.5), (6.0, 0.2)):
         taken = take_step(
             arrowhead,
             PLAIN_SQUARES,
