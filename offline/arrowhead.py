@@ -13,11 +13,12 @@ import numpy as np
 from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_kernels, arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
+from offline import arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
 from offline.arrowhead_covariance import joint_covariance
 from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_marginals import pose_marginals
 from offline.arrowhead_skeleton import expand
+from offline.arrowhead_threads import eliminate_chains
 from offline.arrowhead_tree import Tree
 from offline.factors import State
 from offline.linearise_kernels import Free, Odometry, Readings, Values
@@ -121,20 +122,24 @@ class Arrowhead:
             inside=np.empty((int((tree.end - tree.first)[tree.level == 0].max(initial=0)), 3)),
         )
 
-    def factorise(self, system: System, damping: float = 0.0, out: Rows | None = None) -> "Factorisation":
+    def factorise(
+        self, system: System, damping: float = 0.0, out: Rows | None = None, threads: int = 1
+    ) -> "Factorisation":
         """R with R^T R = H + damping diag(H).
 
         Args:
             system: the blocks; they are used again by the factorisation.
             damping: Levenberg-Marquardt's, as a share of the diagonal.
             out: room to write into; a factorisation that used it before is lost.
+            threads: on how many cores to eliminate chains. What the chains leave for the top is then added up in
+                another order, which changes the result by rounding.
 
         Raises:
             UnderDeterminedError: something is not tied down.
         """
         tree = self.tree
         rows = out if out is not None else self.empty_rows()
-        failed = arrowhead_kernels.eliminate(tree, system, damping, rows)
+        failed = eliminate_chains(tree, system, damping, rows, threads)
         if failed >= 0:
             raise UnderDeterminedError(self._tangent_column(failed))
         columns = tree.front[tree.front_start[-2] :]

@@ -186,6 +186,7 @@ def solve(
     losses: Losses = DEFAULT_LOSSES,
     relative_tolerance: float = _COST_ROUNDING,
     relaxed_steps: int = 0,
+    threads: int = 1,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -207,6 +208,7 @@ def solve(
         relative_tolerance: or by less than this share.
         relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
             that a start lies in.
+        threads: on how many cores chains are eliminated.
     """
     arrowhead = problem.arrowhead
     system, spare, rows = arrowhead.scratch
@@ -222,7 +224,7 @@ def solve(
         return ended("the cost is no number at the start", converged=False)
     for _ in range(_MAX_ITERATIONS):
         try:
-            factorisation, used = _factorised(arrowhead, system, max(damping, floor), rows)
+            factorisation, used = _factorised(arrowhead, system, max(damping, floor), rows, threads)
         except UnderDeterminedError:
             return ended("a variable is in no factor", converged=False)
         if used > max(damping, floor):
@@ -256,7 +258,7 @@ def solve(
 
 
 def _factorised(
-    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None
+    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None, threads: int = 1
 ) -> tuple[Factorisation, float]:
     """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
 
@@ -265,7 +267,7 @@ def _factorised(
     """
     while True:
         try:
-            return arrowhead.factorise(system, damping, out), damping
+            return arrowhead.factorise(system, damping, out, threads), damping
         except UnderDeterminedError:
             if damping > _MOST_FLOOR:
                 raise

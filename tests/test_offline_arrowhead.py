@@ -10,7 +10,7 @@ from offline.arrowhead import Arrowhead, UnderDeterminedError
 from offline.arrowhead_build import build_arrowhead
 from offline.factors import Linearised, State
 from offline.robust import SQUARES, Loss, cauchy, graduated, huber, truncated
-from offline.solver import DEFAULT_LOSSES, Problem
+from offline.solver import DEFAULT_LOSSES, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_graphs import made_graph
 
@@ -187,3 +187,26 @@ def test_condition_is_estimated() -> None:
     system, _ = arrowhead.linearise(truth, reading_loss=huber(3.0))
     true = np.linalg.cond(plain_normal_equations(problem, truth, DEFAULT_LOSSES)[0].toarray())
     assert 0.5 * true < arrowhead.factorise(system).condition() < 1.001 * true
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_several_cores_give_the_same_result(threads: int) -> None:
+    problem, truth = made_graph(5, [40, 65, 3, 120, 9], 9)
+    arrowhead = problem.arrowhead
+    system, _ = arrowhead.linearise(truth)
+    alone = arrowhead.factorise(system).solve_in_order(system.gradient)
+    shared = arrowhead.factorise(system, threads=threads).solve_in_order(system.gradient)
+    np.testing.assert_allclose(shared, alone, rtol=0.0, atol=1e-11 * float(np.abs(alone).max()))
+    start = State(truth.poses, truth.tags + 0.05, truth.calibration)
+    one, several = solve(problem, start), solve(problem, start, threads=threads)
+    np.testing.assert_allclose(several.state.poses, one.state.poses, atol=1e-9)
+    np.testing.assert_allclose(several.state.tags, one.state.tags, atol=1e-9)
+
+
+def test_several_cores_name_what_is_not_tied_down() -> None:
+    problem, truth = made_graph(5, [40, 65], 9)
+    arrowhead = problem.arrowhead
+    system, _ = arrowhead.linearise(truth)
+    system.pose[50] = 0.0
+    with pytest.raises(UnderDeterminedError):
+        arrowhead.factorise(system, threads=2)
