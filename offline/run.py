@@ -1,7 +1,7 @@
 """One run log -> one Run of measurements, or a refusal with reasons."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -197,6 +197,7 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
         pictures = counted(collected.n_other_size, "picture")
         warnings.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
     name = f"{info.robot_id}_{info.run_id}"
+    late_ns = round(robot.time_offset_s * 1e9)  # by which the camera's stamps are ahead of the wheels'
     return Run(
         name=name,
         robot_id=info.robot_id,
@@ -205,9 +206,9 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
         robot=robot,
         camera=camera,
         stretches=tuple(stretches),
-        picture_stamps_ns=np.unique(np.array(collected.pictures, dtype=np.int64)),
+        picture_stamps_ns=np.unique(np.array(collected.pictures, dtype=np.int64)) - late_ns,
         tags=tags,
-        detections=detections,
+        detections=replace(detections, stamps_ns=detections.stamps_ns - late_ns),
         positions=positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=_size_bytes(log),

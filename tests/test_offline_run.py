@@ -130,6 +130,15 @@ def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
     assert (run.picture_stamps_ns - START_NS).tolist() == [10_000_000, 20_000_000, 30_000_000]
 
 
+def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
+    log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
+    write_robot_yaml(made_robot(time_offset_s=0.004), tmp_path / "robot.yaml")
+    write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
+    run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
+    assert (run.picture_stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
+    assert (run.detections.stamps_ns - START_NS).tolist() == [6_000_000]
+
+
 def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:
     seen = picture(0.01, tag(7, hamming=1), tag(8), tag(9, corners=CORNERS[:6]))
     run = load_run(write_log(tmp_path, [*TWO_READINGS, seen]))
