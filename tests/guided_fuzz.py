@@ -3,6 +3,7 @@
 After the idea of AFL (Zalewski, 2013); small, so that it needs nothing that is not here already.
 """
 
+import argparse
 import random
 import sys
 import time
@@ -130,3 +131,14 @@ def _traced(
     finally:
         sys.settrace(before)
     return edges
+
+
+def fuzz_for_minutes(run: Callable[[int, float], Findings], description: str | None) -> int:
+    """A program that fuzzes for as long as its command line says; `run` takes a seed and seconds."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    done = run(arguments.seed, 60.0 * arguments.minutes)
+    sys.stdout.write(f"{done.runs} inputs, {len(done.corpus)} kept, {done.edges} steps reached, nothing found\n")
+    return 0
