@@ -4,7 +4,7 @@ import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -16,7 +16,8 @@ from calib.files import written_whole
 Model = TypeVar("Model", bound=BaseModel)
 
 _LONGEST_VALUE = 60  # characters of a bad value worth repeating
-_LONGEST_TEXT = 1 << 17  # characters: a second's work; logs carry such texts, and anybody may have made a log
+# Characters: a second's work. Logs carry such texts, and anybody may have made a log.
+LONGEST_TEXT: Final = 1 << 17
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 
@@ -64,18 +65,19 @@ def read_text(path: Path) -> str:
         raise CalibError(f"{path}: is not text in UTF-8 (byte {error.start}); is this the right file?") from error
 
 
-def parse_mapping(text: str, source: str) -> dict[str, Any]:
+def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[str, Any]:
     """The one mapping that a YAML text holds.
 
     Args:
         text: YAML.
         source: what to call it in errors, usually the path.
+        longest: how many characters it may have.
 
     Raises:
         CalibError: too long, not YAML, or not a mapping.
     """
-    if len(text) > _LONGEST_TEXT:
-        raise CalibError(f"{source}: has {len(text)} characters, limit {_LONGEST_TEXT}; is this the right file?")
+    if len(text) > longest:
+        raise CalibError(f"{source}: has {len(text)} characters, limit {longest}; is this the right file?")
     try:
         # A loader built on SafeLoader makes plain data only.
         data = yaml.load(text, Loader=_Loader)

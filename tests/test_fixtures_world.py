@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
+from calib.yaml_file import LONGEST_TEXT
 from fixtures.errors import FixturesError
 from fixtures.world import World, load_world, parse_world, world_names
 
@@ -52,6 +53,17 @@ def test_every_field_is_documented() -> None:
         return found
 
     assert [name for name in sorted(names(World)) if not re.search(rf"\b{name}\b", text)] == []
+
+
+def test_a_world_may_be_longer_than_what_a_log_carries(tmp_path: Path) -> None:
+    long = TINY + "# x\n" * (LONGEST_TEXT // 4)
+    (tmp_path / "long.yaml").write_text(long, encoding="utf-8")
+    assert parse_world(long, "long.yaml") == load_world(str(tmp_path / "long.yaml")) == parse_world(TINY, "tiny.yaml")
+
+
+def test_a_file_that_can_be_no_world_is_refused_at_once() -> None:
+    with pytest.raises(FixturesError, match=r"huge\.yaml: has \d+ characters, limit 4194304; is this the right file"):
+        parse_world(TINY + "# x\n" * (1 << 20), "huge.yaml")
 
 
 def test_packaged_worlds_load() -> None:
