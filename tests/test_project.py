@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf")
+HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf", "reportlab")
 COMMANDS = [
+    ("calib.cli",),
+    ("calib.cli", "board"),
     ("onboard.cli",),
     ("onboard.cli", "record"),
     ("onboard.cli", "check"),
@@ -46,7 +48,7 @@ except SystemExit as end:
     assert "Usage:" in found.stdout
 
 
-@pytest.mark.parametrize("module", ["onboard.cli", "offline.cli", "fixtures.__main__"])
+@pytest.mark.parametrize("module", ["calib.cli", "onboard.cli", "offline.cli", "fixtures.__main__"])
 def test_version_is_that_of_the_distribution(
     module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -58,6 +60,7 @@ def test_version_is_that_of_the_distribution(
 
 
 def test_every_command_is_among_those_whose_help_is_tested() -> None:
+    from calib.cli import app as calib_app
     from fixtures.__main__ import app as fixtures_app
     from offline.cli import app as offline_app
     from onboard.cli import app as onboard_app
@@ -65,6 +68,7 @@ def test_every_command_is_among_those_whose_help_is_tested() -> None:
     registered = {
         (module, command.name or (command.callback.__name__ if command.callback else ""))
         for module, app in (
+            ("calib.cli", calib_app),
             ("onboard.cli", onboard_app),
             ("offline.cli", offline_app),
             ("fixtures.__main__", fixtures_app),

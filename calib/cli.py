@@ -1,0 +1,47 @@
+"""groundsbot-calib: what is printed, and the camera's calibration. Heavy imports wait until a command runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.command_line import new_app, run
+
+app = new_app("Prints calibration boards and tags, calibrates a camera, and tells whether a calibration still fits.")
+
+PdfOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The PDF to write.")]
+PaperOption = Annotated[str, typer.Option(help="a4, letter or a3.")]
+OverwriteFlag = Annotated[bool, typer.Option("--overwrite", help="Replace FILE if it exists.")]
+
+
+@app.command()
+def board(
+    output: PdfOption,
+    paper: PaperOption = "a4",
+    columns: Annotated[int, typer.Option(help="Squares across.")] = 7,
+    rows: Annotated[int, typer.Option(help="Squares down.")] = 9,
+    square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker. [default: 0.72 of the square]")] = None,
+    dictionary: Annotated[str, typer.Option(help="Of the markers: cells across and how many, as 5x5_100.")] = "5x5_100",
+    overwrite: OverwriteFlag = False,
+) -> None:
+    """Writes a calibration board (ChArUco) as a PDF true to scale, with rulers to check the print with.
+
+    The default fits on A4 and on Letter, and `groundsbot-calib camera` expects it; it must be told of any other one
+    by the word that is printed on it.
+    """
+    from calib.board import MARKER_SHARE, Board
+    from calib.board_sheet import print_board
+
+    made = Board(columns, rows, square_mm, MARKER_SHARE * square_mm if marker_mm is None else marker_mm, dictionary)
+    print_board(made, paper, output, overwrite)
+    typer.echo(f"{output}: board {made.specification}; print it at 100 % and check its rulers")
+
+
+def main() -> None:
+    """Runs the program."""
+    run(app)
+
+
+if __name__ == "__main__":
+    main()
