@@ -14,9 +14,10 @@ from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
+from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_covariance import joint_covariance
-from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_marginals import pose_marginals
+from offline.arrowhead_measured import MeasuredBlocks
 from offline.arrowhead_skeleton import expand
 from offline.arrowhead_threads import eliminate_chains
 from offline.arrowhead_tree import Tree
@@ -51,6 +52,7 @@ class Arrowhead:
     prior_sigma: FloatArray
     free: Free
     tangent: IntArray
+    measured: MeasuredBlocks | None = None
 
     def linearise(
         self, state: State, odometry_loss: Loss = SQUARES, reading_loss: Loss = SQUARES, out: System | None = None
@@ -69,6 +71,8 @@ class Arrowhead:
         total = linearise_odometry.add_odometry(self.odometry, odometry_loss, values, self.free, system)
         total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
         total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
+        if self.measured is not None:
+            total += self.measured.add(state, system)
         linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
         return system, 0.5 * total
 
@@ -107,6 +111,7 @@ class Arrowhead:
             tag_calibration=np.empty((tree.n_tags, 2, tree.n_calibration)),
             calibration=np.empty((tree.n_calibration, tree.n_calibration)),
             gradient=np.empty(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration),
+            distance=np.empty((0 if self.measured is None else len(self.measured.ends), 2, 5)),
         )
 
     def empty_rows(self) -> Rows:
@@ -146,6 +151,8 @@ class Arrowhead:
         front = rows.workspace[int(tree.workspace_start[-2]) :].reshape(len(columns), len(columns))
         if not len(columns):
             return Factorisation(self, system, rows, front)
+        if self.measured is not None:
+            self.measured.add_to_top(system, front)
         top, info = linalg.lapack.dpotrf(front.T, lower=1, clean=0, overwrite_a=1)
         if info:
             raise UnderDeterminedError(self._tangent_column(int(columns[info - 1])))
@@ -156,6 +163,13 @@ class Arrowhead:
         out = np.zeros((3 * self.tree.n_poses + 2 * self.tree.n_tags + self.tree.n_calibration, *tangent.shape[1:]))
         out[self.tangent] = tangent
         return out
+
+    def product(self, system: System, x: FloatArray) -> FloatArray:
+        """H x, in the arrowhead's order."""
+        y = arrowhead_substitution.product(self.tree, system, x)
+        if self.measured is not None:
+            self.measured.add_product(system, x, y)
+        return y
 
     def _tangent_column(self, column: int) -> int:
         return int(np.flatnonzero(self.tangent == column)[0])
@@ -213,7 +227,7 @@ class Factorisation:
         largest = smallest = rng.standard_normal(len(held)) * (1.0 - held)
         up = down = 1.0
         for _ in range(_CONDITION_STEPS):
-            largest = arrowhead_substitution.product(self.arrowhead.tree, self.system, largest)
+            largest = self.arrowhead.product(self.system, largest)
             smallest = self.solve_in_order(smallest)
             up, down = float(np.linalg.norm(largest)), float(np.linalg.norm(smallest))
             largest, smallest = largest / up, smallest / down
@@ -227,7 +241,7 @@ class Factorisation:
         """
         vector = self.arrowhead.in_order(np.random.default_rng(0).standard_normal(len(self.arrowhead.tangent)))
         solution = self.solve_in_order(vector)
-        rest = vector - arrowhead_substitution.product(self.arrowhead.tree, self.system, solution)
+        rest = vector - self.arrowhead.product(self.system, solution)
         length = float(np.linalg.norm(solution))
         return float(np.linalg.norm(self.solve_in_order(rest))) / length if length else 0.0
 

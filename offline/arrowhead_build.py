@@ -4,14 +4,20 @@ import numpy as np
 
 from calib.arrays import BoolArray, IntArray
 from offline.arrowhead import Arrowhead, Skeleton
+from offline.arrowhead_measured import measured_blocks, top_chains
 from offline.arrowhead_skeleton import add_moments, compose
-from offline.arrowhead_tree import build_tree
+from offline.arrowhead_tree import Couplings, build_tree
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
 from offline.linearise_kernels import Free, Odometry, Readings
+from offline.measured_factors import NOTHING_MEASURED, Measured
 
 
 def build_arrowhead(
-    odometry: OdometryFactors, readings: ReadingFactors, prior: CalibrationPrior, columns: Columns
+    odometry: OdometryFactors,
+    readings: ReadingFactors,
+    prior: CalibrationPrior,
+    columns: Columns,
+    measured: Measured = NOTHING_MEASURED,
 ) -> Arrowhead:
     """Sorts factors by pose and settles the order of elimination.
 
@@ -34,8 +40,19 @@ def build_arrowhead(
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     tree = build_tree(
-        chain_start, by_pose.pose, by_pose.tag, n_tags, slot_start, np.nonzero(uses)[1], int(is_free.sum())
+        Couplings(
+            chain_start=chain_start,
+            reading_pose=by_pose.pose,
+            reading_tag=by_pose.tag,
+            slot_start=slot_start,
+            slots=np.nonzero(uses)[1],
+            n_tags=n_tags,
+            n_free=int(is_free.sum()),
+            top_chains=top_chains(measured, chain_start),
+            top_tags=measured.tags,
+        )
     )
+    free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
     motion = odometry.motion[in_order]
     own = Odometry(
         first=first,
@@ -52,8 +69,9 @@ def build_arrowhead(
         odometry=own,
         readings=by_pose._replace(slots=slot[chain_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
         prior_sigma=prior.sigma,
-        free=_free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose),
+        free=free,
         tangent=_tangent_order(columns),
+        measured=measured_blocks(measured, tree, free),
     )
 
 
@@ -63,6 +81,8 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     is_kept = np.diff(tree.reading_start) > 0
     is_kept[whole.free.held_poses] = True
     is_kept[tree.chain_start[:-1]] = True
+    if whole.measured is not None:
+        is_kept[whole.measured.factors.starts.pose] = True
     index = np.where(is_kept, np.cumsum(is_kept) - 1, -1)
     chain_start = np.concatenate([index[tree.chain_start[:-1]], [int(is_kept.sum())]])
     n = int(is_kept.sum())
@@ -80,15 +100,29 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     )
     compose(odometry, index, composed)
     places = _relaxed(readings)._replace(pose=index[readings.pose])
+    measured = NOTHING_MEASURED if whole.measured is None else whole.measured.factors.among(index)
+    own_tree = build_tree(
+        Couplings(
+            chain_start=chain_start,
+            reading_pose=places.pose,
+            reading_tag=places.tag,
+            slot_start=tree.slot_start,
+            slots=tree.slots,
+            n_tags=tree.n_tags,
+            n_free=tree.n_calibration,
+            top_chains=top_chains(measured, chain_start),
+            top_tags=measured.tags,
+        )
+    )
+    free = _free(whole.free.poses[is_kept] > 0.0, whole.free.tags > 0.0, whole.free.calibration, places)
     own = Arrowhead(
-        tree=build_tree(
-            chain_start, places.pose, places.tag, tree.n_tags, tree.slot_start, tree.slots, tree.n_calibration
-        ),
+        tree=own_tree,
         odometry=composed,
         readings=places,
         prior_sigma=whole.prior_sigma,
-        free=_free(whole.free.poses[is_kept] > 0.0, whole.free.tags > 0.0, whole.free.calibration, places),
+        free=free,
         tangent=np.arange(3 * n + 2 * tree.n_tags + tree.n_calibration),
+        measured=measured_blocks(measured, own_tree, free),
     )
     return Skeleton(own, whole, index)
 

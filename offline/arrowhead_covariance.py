@@ -11,7 +11,7 @@ from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_substitution
-from offline.arrowhead_kernels import Rows, System
+from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_tree import Tree
 
 

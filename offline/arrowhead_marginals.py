@@ -14,8 +14,8 @@ from scipy import linalg
 
 from calib.arrays import BoolArray, FloatArray
 from offline import arrowhead_substitution
+from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_cut import LEVELS
-from offline.arrowhead_kernels import Rows, System
 from offline.arrowhead_tree import Tree
 from offline.jit import inner, jitted
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from calib.arrays import FloatArray
-from offline.arrowhead_kernels import Rows, System, n_slots_of
-from offline.arrowhead_tree import Tree
+from offline.arrowhead_blocks import Rows, System
+from offline.arrowhead_tree import Tree, n_slots_of
 from offline.jit import borrowed, inner, jitted
 
 
@@ -110,6 +110,8 @@ def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, out
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
     size = tree.front_start[leaf + 1] - tree.front_start[leaf]
+    if first == end:
+        return  # a chain of one pose, which the top eliminates
     for i in range(3):
         for j in range(3):
             if n_left:
@@ -133,6 +135,8 @@ def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, i
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
     size = tree.front_start[leaf + 1] - tree.front_start[leaf]
+    if first == end:
+        return
     for i in range(3):
         for j in range(3):
             if n_left:

@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from calib.arrays import IntArray
-from offline.arrowhead_kernels import Rows, System, eliminate
+from offline.arrowhead_blocks import Rows, System
+from offline.arrowhead_kernels import eliminate
 from offline.arrowhead_tree import Tree
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.arrowhead_kernels import System
+from offline.arrowhead_blocks import System
 from offline.jit import inner, jitted
 
 

@@ -8,7 +8,7 @@ Small matrices travel as tuples, row by row; of symmetric ones the upper triangl
 import numpy as np
 
 from calib.arrays import FloatArray
-from offline.arrowhead_kernels import System
+from offline.arrowhead_blocks import System
 from offline.jit import borrowed, inner, jitted
 from offline.linearise_kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
 from offline.robust import Loss, loss_and_weight

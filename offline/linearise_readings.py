@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from calib.arrays import FloatArray
-from offline.arrowhead_kernels import System
+from offline.arrowhead_blocks import System
 from offline.jit import borrowed, inlined, inner, jitted
 from offline.linearise_kernels import Free, Readings, Values
 from offline.robust import Loss, loss_and_weight

@@ -1,6 +1,7 @@
 """What a person measured, as factors: residuals and Jacobians in the form of `factors`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -56,19 +57,74 @@ class DistanceFactors:
 
     def residual(self, state: State) -> FloatArray:
         """(M, 1), whitened."""
-        apart = _places(state, self.pose_b, self.tag_b) - _places(state, self.pose_a, self.tag_a)
+        place_a, place_b = ends_of(self, state)
+        apart = place_b - place_a
         off_m: FloatArray = np.linalg.norm(apart, axis=1) - self.distance_m
         return (off_m / self.sigma_m)[:, None]
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
         """Residuals (M, 1) and a block for each end's pose and each end's tag, held where it is the other kind."""
-        apart = _places(state, self.pose_b, self.tag_b) - _places(state, self.pose_a, self.tag_a)
+        place_a, place_b = ends_of(self, state)
+        apart = place_b - place_a
         # Two ends on one spot have no direction between them; the floor keeps the step finite.
         length = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         by_b = (apart / (length * self.sigma_m)[:, None])[:, None, :]
         ends = ((self.pose_a, self.tag_a, -by_b), (self.pose_b, self.tag_b, by_b))
         blocks = [block for pose, tag, by_place in ends for block in _blocks(state, columns, pose, tag, by_place)]
         return Linearised(self.residual(state), tuple(blocks))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All that somebody measured."""
+
+    starts: StartFactors
+    distances: DistanceFactors
+
+    def __len__(self) -> int:
+        """How many measurements there are."""
+        return len(self.starts.pose) + len(self.distances.distance_m)
+
+    @property
+    def n_residuals(self) -> int:
+        """How many measured numbers there are."""
+        return 3 * len(self.starts.pose) + len(self.distances.distance_m)
+
+    def sum_of_squares(self, state: State) -> float:
+        """Of all residuals."""
+        return float((self.starts.residual(state) ** 2).sum() + (self.distances.residual(state) ** 2).sum())
+
+    def linearise(self, state: State, columns: Columns) -> tuple[Linearised, Linearised]:
+        """Of starts and of distances."""
+        return self.starts.linearise(state, columns), self.distances.linearise(state, columns)
+
+    @property
+    def tags(self) -> IntArray:
+        """Tags at which a distance ends."""
+        ends = np.concatenate([self.distances.tag_a, self.distances.tag_b])
+        return np.unique(ends[ends >= 0])
+
+    def among(self, index: IntArray) -> "Measured":
+        """The same of a part of the poses, which all ends are among: (P,) the index of each there."""
+        ends = {
+            name: np.where(pose >= 0, index[pose], -1)
+            for name, pose in (("pose_a", self.distances.pose_a), ("pose_b", self.distances.pose_b))
+        }
+        return Measured(replace(self.starts, pose=index[self.starts.pose]), replace(self.distances, **ends))
+
+
+_NONE: Final = np.zeros(0, dtype=np.int64)
+NOTHING_MEASURED: Final = Measured(
+    StartFactors(_NONE, np.zeros((0, 3)), np.zeros((0, 3, 3))),
+    DistanceFactors(_NONE, _NONE, _NONE, _NONE, np.zeros(0), np.zeros(0)),
+)
+
+
+def ends_of(distances: DistanceFactors, state: State) -> tuple[FloatArray, FloatArray]:
+    """Places (M, 2) of both ends."""
+    ends = (distances.pose_a, distances.tag_a), (distances.pose_b, distances.tag_b)
+    place_a, place_b = (_places(state, pose, tag) for pose, tag in ends)
+    return place_a, place_b
 
 
 def _places(state: State, pose: IntArray, tag: IntArray) -> FloatArray:

@@ -14,10 +14,11 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_build import build_arrowhead, build_skeleton
-from offline.arrowhead_kernels import Rows, System
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
+from offline.measured_factors import NOTHING_MEASURED, Measured
 from offline.robust import SQUARES, Loss, huber, losses_and_weights
 from offline.step_taken import Before, take_step
 from offline.tied_down import Untied, untied_parts
@@ -59,6 +60,7 @@ class Problem:
 
     Attributes:
         anchor: (T,) a pose from which each tag was read.
+        measured: what somebody measured with a tape, if anything.
     """
 
     odometry: OdometryFactors
@@ -66,17 +68,19 @@ class Problem:
     prior: CalibrationPrior
     columns: Columns
     anchor: IntArray
+    measured: Measured = NOTHING_MEASURED
 
     def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
-        """Half the sum of all losses: F(x) = 1/2 (sum rho(|r|^2) over odometry and readings + sum c^2 / sigma^2)."""
+        """Half the sum of all losses: rho(|r|^2) of odometry and readings, |r|^2 of priors and what was measured."""
         odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
         readings, _ = losses_and_weights(losses.readings, self.readings.residual(state))
-        return 0.5 * float(odometry.sum() + readings.sum() + (self.prior.residual(state) ** 2).sum())
+        prior = (self.prior.residual(state) ** 2).sum()
+        return 0.5 * float(odometry.sum() + readings.sum() + prior + self.measured.sum_of_squares(state))
 
     @cached_property
     def arrowhead(self) -> Arrowhead:
         """The order of elimination, settled once."""
-        return build_arrowhead(self.odometry, self.readings, self.prior, self.columns)
+        return build_arrowhead(self.odometry, self.readings, self.prior, self.columns, self.measured)
 
     @cached_property
     def skeleton(self) -> Skeleton:
@@ -86,7 +90,7 @@ class Problem:
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
-        return self.odometry.motion.size + self.readings.value.size
+        return self.odometry.motion.size + self.readings.value.size + self.measured.n_residuals
 
     def moved(self, state: State, step: FloatArray) -> State:
         """The state after a step (n,) in the tangent space.
@@ -155,7 +159,7 @@ class Solution:
     def untied(self) -> Untied:
         """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
         problem = self.problem
-        return untied_parts(problem.odometry, problem.readings, problem.columns, self.state)
+        return untied_parts(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
 
     @property
     def rank(self) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead
-from offline.arrowhead_kernels import System
+from offline.arrowhead_blocks import System
 from offline.factors import State
 from offline.robust import Loss
 

@@ -1,6 +1,6 @@
 """Random graphs long enough to be cut into nested pieces, with every kind of factor and all calibration."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Final
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
+from offline.measured_factors import DistanceFactors, Measured, StartFactors
 from offline.solver import Problem
 
 _ROBOT_SIGMA: Final = (0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)  # wheels, mount, what else of the camera
@@ -52,6 +53,24 @@ def reordered(problem: Problem, rng: np.random.Generator) -> Problem:
         *(getattr(readings, name)[order] for name in (field.name for field in fields(ReadingFactors)))
     )
     return Problem(problem.odometry, mixed, problem.prior, problem.columns, problem.anchor)
+
+
+def with_measured(problem: Problem, truth: State, seed: int, n: int) -> Problem:
+    """The same with up to n measured starts and n distances, of any two ends: first poses of chains, or tags."""
+    rng = np.random.default_rng(seed)
+    n_poses, n_tags = len(truth.poses), len(truth.tags)
+    firsts = np.setdiff1d(np.arange(n_poses), problem.odometry.first + 1)
+    at = rng.integers(0, n_poses, n)
+    root = 0.1 * (np.eye(3) + 0.3 * rng.standard_normal((n, 3, 3)))
+    starts = StartFactors(
+        at, se2.compose(truth.poses[at], 0.1 * rng.standard_normal((n, 3))), whitening(root @ root.swapaxes(1, 2))
+    )
+    ends = np.array([rng.permutation(len(firsts) + n_tags)[:2] for _ in range(n)], dtype=np.int64).reshape(-1, 2).T
+    pose = np.where(ends < len(firsts), firsts[np.minimum(ends, len(firsts) - 1)], -1)
+    tag = np.where(ends < len(firsts), -1, ends - len(firsts))
+    distance_m = rng.uniform(1.0, 5.0, n)
+    distances = DistanceFactors(pose[0], tag[0], pose[1], tag[1], distance_m, np.full(n, 0.02))
+    return replace(problem, measured=Measured(starts, distances))
 
 
 def _driven(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, IntArray, IntArray]:

@@ -1,5 +1,7 @@
 """Elimination in nested pieces: steps, covariances and costs are those of plain dense algebra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,15 +12,15 @@ from offline.arrowhead import Arrowhead, UnderDeterminedError
 from offline.arrowhead_build import build_arrowhead
 from offline.factors import Linearised, State
 from offline.robust import SQUARES, Loss, cauchy, graduated, huber, truncated
-from offline.solver import DEFAULT_LOSSES, Problem, solve
+from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
-from tests.made_graphs import made_graph
+from tests.made_graphs import made_graph, with_measured
 
 LOSSES = (SQUARES, huber(1.5), cauchy(1.5), graduated(2.0, 4.0), truncated(2.5))
 
 
 def arrowhead_of(problem: Problem) -> Arrowhead:
-    return build_arrowhead(problem.odometry, problem.readings, problem.prior, problem.columns)
+    return build_arrowhead(problem.odometry, problem.readings, problem.prior, problem.columns, problem.measured)
 
 
 def weights(loss: Loss, residual: FloatArray) -> FloatArray:
@@ -53,7 +55,8 @@ def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Los
     prior = problem.prior.linearise(state, columns)
     add(odometry, weights(odometry_loss, odometry.residual))
     add(readings, weights(reading_loss, readings.residual))
-    add(prior, np.ones(len(prior.residual)))
+    for kind in (prior, *problem.measured.linearise(state, columns)):
+        add(kind, np.ones(len(kind.residual)))
     return hessian, gradient
 
 
@@ -71,6 +74,7 @@ def allowed(condition: float) -> float:
     reach=st.sampled_from([0.05, 0.3, 1.0]),
     odometry_loss=st.sampled_from(LOSSES),
     damping=st.sampled_from([0.0, 1e-3]),
+    n_measured=st.integers(0, 4),
 )
 @settings(max_examples=6, deadline=None)
 def test_steps_and_covariances_equal_dense_algebra(
@@ -83,8 +87,10 @@ def test_steps_and_covariances_equal_dense_algebra(
     odometry_loss: Loss,
     reading_loss: Loss,
     damping: float,
+    n_measured: int,
 ) -> None:
     problem, truth = made_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held)
+    problem = with_measured(problem, truth, seed, n_measured)
     H, g = dense(problem, truth, odometry_loss, reading_loss)
     H += damping * np.diag(H.diagonal())
     if not len(g):
@@ -179,6 +185,29 @@ def test_what_nothing_ties_down_is_named() -> None:
     with pytest.raises(UnderDeterminedError) as raised:
         arrowhead.factorise(system)
     assert raised.value.column == loose
+
+
+@given(seed=st.integers(0, 10**6), lengths=st.lists(st.integers(1, 40), min_size=1, max_size=4))
+@settings(max_examples=10, deadline=None)
+def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
+    problem, truth = made_graph(seed, lengths, 4)
+    problem = with_measured(problem, truth, seed, 3)
+    H, g = dense(problem, truth, SQUARES, SQUARES)
+    arrowhead = arrowhead_of(problem)
+    system, cost = arrowhead.linearise(truth)
+    assert cost == pytest.approx(problem.cost(truth, PLAIN_SQUARES), rel=1e-12)
+    assert np.linalg.norm(system.gradient[arrowhead.tangent] - g) <= 1e-12 * np.linalg.norm(g)
+    x = np.random.default_rng(seed).standard_normal(len(g))
+    product = arrowhead.product(system, arrowhead.in_order(x))[arrowhead.tangent]
+    assert np.linalg.norm(product - H @ x) <= 1e-12 * np.linalg.norm(H @ x)
+
+
+def test_a_distance_from_the_middle_of_a_chain_is_refused() -> None:
+    problem, truth = made_graph(3, [20], 3)
+    problem = with_measured(problem, truth, 3, 1)
+    distances = replace(problem.measured.distances, pose_a=np.array([5]), tag_a=np.array([-1]))
+    with pytest.raises(ValueError, match="first pose of a chain"):
+        arrowhead_of(replace(problem, measured=replace(problem.measured, distances=distances)))
 
 
 def test_condition_is_estimated() -> None:

@@ -27,7 +27,7 @@ from offline.solver import PLAIN_SQUARES, Problem, Solution, solve
 from offline.weak_parts import weak_parts
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, MadeDrive, made_drive, made_positions, made_robot, made_run
-from tests.made_graphs import made_graph
+from tests.made_graphs import made_graph, with_measured
 
 LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
 
@@ -108,14 +108,17 @@ def test_chains_and_shared_tags_are_bars_and_joints(
     lengths=st.lists(st.integers(1, 8), min_size=1, max_size=4),
     n_kept=st.integers(0, 12),
     held=st.sampled_from([0.0, 0.1]),
+    n_measured=st.integers(0, 3),
 )
-@settings(max_examples=40, deadline=None)
-def test_rank_is_that_of_the_dense_jacobian(seed: int, lengths: list[int], n_kept: int, held: float) -> None:
+@settings(max_examples=60, deadline=None)
+def test_rank_is_that_of_the_dense_jacobian(
+    seed: int, lengths: list[int], n_kept: int, held: float, n_measured: int
+) -> None:
     problem, truth = made_graph(seed, lengths, 5, held=held)
     keep = np.random.default_rng(seed).permutation(len(problem.readings.pose))[:n_kept]
     names = problem.readings.__dataclass_fields__
     few = ReadingFactors(**{name: getattr(problem.readings, name)[keep] for name in names})
-    sparse_problem = replace(problem, readings=few)
+    sparse_problem = with_measured(replace(problem, readings=few), truth, seed, n_measured)
     hessian = plain_normal_equations(sparse_problem, truth)[0].toarray()
     # Compared in sigmas' own units, dependencies stand far from rounding.
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))

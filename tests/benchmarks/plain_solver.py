@@ -51,6 +51,7 @@ def plain_normal_equations(
         _reweighted(problem.odometry.linearise(state, problem.columns), losses.odometry),
         _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),
         problem.prior.linearise(state, problem.columns),
+        *problem.measured.linearise(state, problem.columns),
     )
     jacobian, residual = stacked(kinds, problem.columns.n)
     return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
