@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
 
 import cv2
 import numpy as np
@@ -10,13 +9,7 @@ import numpy as np
 from calib.arrays import BoolArray
 from calib.board import DEFAULT_BOARD, Board
 from calib.errors import CalibError
-from calib.sheet import EDGE_MM, RULER_MM, Rectangle, Sheets, paper_size_mm, sheets_written
-
-_HEAD_MM: Final = 17.0  # three lines of text
-_APART_MM: Final = 3.0  # the board from rulers and text
-_TITLE_PT: Final = 11.0
-_TEXT_PT: Final = 8.0
-_HOW_TO_PRINT: Final = 'Print at 100 % (not "fit to page"). Hold a ruler against both rulers: 100 mm must be 100 mm.'
+from calib.sheet import HOW_TO_PRINT, Rectangle, Sheets, black_cells, paper_size_mm, room_on, sheets_written
 
 
 def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -> None:
@@ -28,7 +21,7 @@ def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -
     with sheets_written(path, _turned(board, paper), f"groundsbot board {board.specification}", overwrite) as sheets:
         sheets.rulers()
         _write_head(sheets, board)
-        left_mm, top_mm, width_mm, height_mm = _room(sheets.width_mm, sheets.height_mm)
+        left_mm, top_mm, width_mm, height_mm = room_on((sheets.width_mm, sheets.height_mm))
         board_mm = board.size_mm
         x_mm, y_mm = left_mm + (width_mm - board_mm[0]) / 2, top_mm + (height_mm - board_mm[1]) / 2
         sheets.blacken(_black(board, x_mm, y_mm))
@@ -41,7 +34,7 @@ def _turned(board: Board, paper: str) -> tuple[float, float]:
     wanted_mm = board.size_mm
     best = 0.0
     for size_mm in (upright_mm, upright_mm[::-1]):
-        _, _, *room_mm = _room(*size_mm)
+        _, _, *room_mm = room_on(size_mm)
         share = min(room_mm[0] / wanted_mm[0], room_mm[1] / wanted_mm[1])
         if share >= 1.0:
             return size_mm
@@ -53,22 +46,14 @@ def _turned(board: Board, paper: str) -> tuple[float, float]:
     )
 
 
-def _room(width_mm: float, height_mm: float) -> Rectangle:
-    """Where the board may be on a paper."""
-    left_mm, top_mm = EDGE_MM + RULER_MM + _APART_MM, EDGE_MM + _HEAD_MM
-    return Rectangle(left_mm, top_mm, width_mm - left_mm - EDGE_MM, height_mm - top_mm - EDGE_MM - RULER_MM - _APART_MM)
-
-
 def _write_head(sheets: Sheets, board: Board) -> None:
-    x_mm, y_mm = EDGE_MM + RULER_MM + _APART_MM, EDGE_MM + 4.0
-    sheets.text(x_mm, y_mm, f"Calibration board {board.specification}", _TITLE_PT)
-    lines = [
+    told = "" if board == DEFAULT_BOARD else f"; --board {board.specification}"
+    sheets.head(
+        f"Calibration board {board.specification}",
         f"{board.columns} x {board.rows} squares of {board.square_mm:g} mm, markers of {board.marker_mm:g} mm, "
-        f"dictionary {board.dictionary}" + ("" if board == DEFAULT_BOARD else f": --board {board.specification}"),
-        f"{_HOW_TO_PRINT} Glue it onto something flat and stiff.",
-    ]
-    for index, line in enumerate(lines, start=1):
-        sheets.text(x_mm, y_mm + 4.2 * index, line, _TEXT_PT)
+        f"dictionary {board.dictionary}{told}",
+        f"{HOW_TO_PRINT} Glue it onto something flat and stiff.",
+    )
 
 
 def _black(board: Board, x_mm: float, y_mm: float) -> Iterator[Rectangle]:
@@ -91,11 +76,3 @@ def _marker_bits(charuco: "cv2.aruco.CharucoBoard", marker_id: int) -> BoolArray
     """Cells of a marker, True where white, as OpenCV draws it."""
     dictionary = charuco.getDictionary()
     return np.asarray(dictionary.generateImageMarker(marker_id, dictionary.markerSize + 2) > 127)
-
-
-def black_cells(bits: BoolArray, x_mm: float, y_mm: float, cell_mm: float) -> Iterator[Rectangle]:
-    """The black cells of a pattern, neighbours in a row as one; its upper left corner at x and y."""
-    for row, cells in enumerate(bits):
-        edges = np.flatnonzero(np.diff(~cells, prepend=False, append=False))
-        for first, end in edges.reshape(-1, 2):
-            yield Rectangle(x_mm + first * cell_mm, y_mm + row * cell_mm, (end - first) * cell_mm, cell_mm)

@@ -38,6 +38,31 @@ def board(
     typer.echo(f"{output}: board {made.specification}; print it at 100 % and check its rulers")
 
 
+@app.command()
+def tags(
+    output: PdfOption,
+    ids: Annotated[str, typer.Option(help="Which: ids and ranges, as 0-23,40.")],
+    size_mm: Annotated[float, typer.Option(help="Side of the black border's outer edge.")],
+    family: Annotated[str, typer.Option(help="tag36h11, tag25h9 or tag16h5.")] = "tag36h11",
+    paper: PaperOption = "a4",
+    packed: Annotated[bool, typer.Option("--packed", help="As many on a sheet as fit, instead of one.")] = False,
+    overwrite: OverwriteFlag = False,
+) -> None:
+    """Writes tags as a PDF true to scale: with id, size and which way is up, marks to cut along, rulers to check with.
+
+    A tag's size is the outer edge of its black border. The white margin belongs to the tag: cut outside of it.
+    """
+    from calib.tag_ids import parse_tag_ids
+    from calib.tag_sheet import print_tags
+    from calib.words import counted
+
+    wanted = parse_tag_ids(ids, family)
+    n_sheets = print_tags(family, wanted, size_mm, paper, output, packed, overwrite)
+    typer.echo(f"{output}: {counted(len(wanted), 'tag')} {family} of {size_mm:g} mm on {counted(n_sheets, 'sheet')}")
+    typer.echo("print at 100 %, check the rulers; in robot.yaml:")
+    typer.echo(f"tags: [{{family: {family}, default_size_m: {size_mm / 1e3:g}}}]")
+
+
 def main() -> None:
     """Runs the program."""
     run(app)

@@ -10,7 +10,7 @@ from calib.arrays import FloatArray
 from calib.board import DEFAULT_BOARD, Board, parse_board
 from calib.board_sheet import print_board
 from calib.errors import CalibError
-from tests.printed import MM_PER_INCH, n_pages, scanned, words
+from tests.printed import n_pages, scanned, words
 
 DPI = 300.0
 
@@ -32,11 +32,11 @@ def test_the_printed_board_is_found_at_its_true_size(tmp_path: Path, board: Boar
     assert board.specification in said
     assert ("--board" in said) == (board != DEFAULT_BOARD)
 
-    picture = scanned(pdf, DPI)
-    corners, ids, _, marker_ids = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(picture)
+    scan = scanned(pdf, DPI)
+    corners, ids, _, marker_ids = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(scan.picture)
     assert len(marker_ids) == board.n_markers
     assert len(ids) == (board.columns - 1) * (board.rows - 1)
-    found_mm = np.asarray(corners, np.float64).reshape(-1, 2) * MM_PER_INCH / DPI
+    found_mm = scan.place_mm(np.asarray(corners, np.float64).reshape(-1, 2))
     expected_mm = 1000.0 * np.asarray(board.charuco().getChessboardCorners(), np.float64)[ids.ravel(), :2]
     # The same but for a shift: not turned, not mirrored, not scaled.
     off_mm = found_mm - found_mm.mean(axis=0) - (expected_mm - expected_mm.mean(axis=0))

@@ -14,6 +14,7 @@ HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf", "rep
 COMMANDS = [
     ("calib.cli",),
     ("calib.cli", "board"),
+    ("calib.cli", "tags"),
     ("onboard.cli",),
     ("onboard.cli", "record"),
     ("onboard.cli", "check"),
