@@ -4,7 +4,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, IntArray
 from offline.arrowhead import Arrowhead, Skeleton
-from offline.arrowhead_measured import measured_blocks, top_chains
+from offline.arrowhead_measured import ends_in_top, measured_blocks
 from offline.arrowhead_skeleton import add_moments, compose
 from offline.arrowhead_tree import Couplings, build_tree
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
@@ -39,6 +39,7 @@ def build_arrowhead(
     uses[:, -1] = False  # where held
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
+    chains_in_top, tags_in_top = ends_in_top(measured, chain_start)
     tree = build_tree(
         Couplings(
             chain_start=chain_start,
@@ -48,8 +49,8 @@ def build_arrowhead(
             slots=np.nonzero(uses)[1],
             n_tags=n_tags,
             n_free=int(is_free.sum()),
-            top_chains=top_chains(measured, chain_start),
-            top_tags=measured.tags,
+            top_chains=chains_in_top,
+            top_tags=tags_in_top,
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
@@ -101,6 +102,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     compose(odometry, index, composed)
     places = _relaxed(readings)._replace(pose=index[readings.pose])
     measured = NOTHING_MEASURED if whole.measured is None else whole.measured.factors.among(index)
+    chains_in_top, tags_in_top = ends_in_top(measured, chain_start)
     own_tree = build_tree(
         Couplings(
             chain_start=chain_start,
@@ -110,8 +112,8 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
             slots=tree.slots,
             n_tags=tree.n_tags,
             n_free=tree.n_calibration,
-            top_chains=top_chains(measured, chain_start),
-            top_tags=measured.tags,
+            top_chains=chains_in_top,
+            top_tags=tags_in_top,
         )
     )
     free = _free(whole.free.poses[is_kept] > 0.0, whole.free.tags > 0.0, whole.free.calibration, places)

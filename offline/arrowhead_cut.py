@@ -35,10 +35,11 @@ def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
     """Cuts each chain evenly into leaves, and joins these; the first poses of some chains become separators too."""
     n_poses = int(chain_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
+    in_top = set(top_chains.tolist())
     rows = []  # level, chain, cut on the left, cut on the right
     for chain, (first, end) in enumerate(zip(chain_start[:-1].tolist(), chain_start[1:].tolist(), strict=True)):
         # A cut is a pose, a separator; those at the chain's ends lie outside of it, or the first one is the top's.
-        is_top = chain in top_chains
+        is_top = chain in in_top
         pose_level[first : first + is_top] = LEVELS - 1
         cuts = _thinned(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
         for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):

@@ -5,6 +5,7 @@ there its products fill what elimination has left anyway. These are few, so all 
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from offline.arrowhead_tree import Tree
 from offline.factors import Columns, State
 from offline.linearise_kernels import Free
 from offline.measured_factors import DistanceFactors, Measured
+
+_NONE: Final = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -81,17 +84,19 @@ def measured_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks
     return MeasuredBlocks(factors, columns, ends, place[ends])
 
 
-def top_chains(factors: Measured, chain_start: IntArray) -> IntArray:
-    """Chains at whose first pose a distance ends.
+def ends_in_top(factors: Measured, chain_start: IntArray) -> tuple[IntArray, IntArray]:
+    """Chains at whose first pose a distance ends, and tags at which one does.
 
     Raises:
         ValueError: one ends at another pose.
     """
+    if not len(factors.distances.distance_m):
+        return _NONE, _NONE
     ends = np.concatenate([factors.distances.pose_a, factors.distances.pose_b])
     poses = np.unique(ends[ends >= 0])
     if not np.isin(poses, chain_start[:-1]).all():
         raise ValueError("a distance can be measured from the first pose of a chain, and from no other")
-    return np.searchsorted(chain_start, poses)
+    return np.searchsorted(chain_start, poses), factors.tags
 
 
 def _ends(distances: DistanceFactors, columns: Columns) -> IntArray:

@@ -196,10 +196,10 @@ def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
     arrowhead = arrowhead_of(problem)
     system, cost = arrowhead.linearise(truth)
     assert cost == pytest.approx(problem.cost(truth, PLAIN_SQUARES), rel=1e-12)
-    assert np.linalg.norm(system.gradient[arrowhead.tangent] - g) <= 1e-12 * np.linalg.norm(g)
+    assert np.linalg.norm(system.gradient[arrowhead.tangent] - g) <= 1e-9 * np.linalg.norm(g)
     x = np.random.default_rng(seed).standard_normal(len(g))
     product = arrowhead.product(system, arrowhead.in_order(x))[arrowhead.tangent]
-    assert np.linalg.norm(product - H @ x) <= 1e-12 * np.linalg.norm(H @ x)
+    assert np.linalg.norm(product - H @ x) <= 1e-9 * np.linalg.norm(H @ x)
 
 
 def test_a_distance_from_the_middle_of_a_chain_is_refused() -> None:
