@@ -158,7 +158,7 @@ def read_camera_yaml(path: Path) -> CameraModel:
             f"{path}: camera_matrix.data is {info.camera_matrix.data} but must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]; "
             "calibrate without skew"
         )
-    coefficients = _fitted(info.distortion_coefficients.data, COEFFICIENTS.get(info.distortion_model))
+    coefficients = fitted_coefficients(info.distortion_coefficients.data, COEFFICIENTS.get(info.distortion_model))
     try:
         return CameraModel(
             info.camera_name,
@@ -175,7 +175,7 @@ def read_camera_yaml(path: Path) -> CameraModel:
         raise CalibError(f"{path}: {error}") from error
 
 
-def _fitted(coefficients: list[float], expected: int | None) -> list[float]:
+def fitted_coefficients(coefficients: list[float], expected: int | None) -> list[float]:
     """The coefficients without surplus zeros, and with plumb_bob's k3 where it was left out."""
     if expected == COEFFICIENTS["plumb_bob"] and len(coefficients) == expected - 1:
         return [*coefficients, 0.0]

@@ -17,7 +17,7 @@ from calib.robot import parse_robot_yaml
 from offline.errors import OfflineError
 from offline.new_log import new_log
 from offline.stages import Progress
-from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
+from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings, Picture
 from onboard.log_losses import LogLosses
 from onboard.log_reader import read_head, read_log
 from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
@@ -160,8 +160,8 @@ def _detect_all(
     """New messages, as bytes, by the stamp of their picture."""
     found: dict[int, bytes] = {}
     n_processes = options.n_processes or os.cpu_count() or 1
-    with _detectors(settings, n_processes) as (detect, library, described):
-        for stamp_ns, result in _in_parallel(_pictures(log), detect, n_processes):
+    with detectors(settings, n_processes) as (detect, library, described):
+        for stamp_ns, result in in_parallel(_pictures(log), detect, n_processes):
             report.n_pictures += 1
             progress("looking for tags", report.n_pictures, old.n_pictures)
             if result.error is not None:
@@ -175,11 +175,11 @@ def _detect_all(
     return found
 
 
-Detect = Callable[[bytes], DetectionResult]
+Detect = Callable[[Picture], DetectionResult]
 
 
 @contextmanager
-def _detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[Detect, str, str]]:
+def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[Detect, str, str]]:
     """A function for several threads, each call of which has a process to itself; and what it detects with."""
     with ExitStack() as stack:
         idle: queue.SimpleQueue[ChildDetector] = queue.SimpleQueue()
@@ -189,10 +189,11 @@ def _detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[D
             stack.callback(children[-1].close)
             idle.put(children[-1])
 
-        def detect(picture: bytes) -> DetectionResult:
-            width_px, height_px = claimed_size(picture)
-            if width_px * height_px > _PIXELS_PER_BYTE * len(picture):
-                return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
+        def detect(picture: Picture) -> DetectionResult:
+            if isinstance(picture, bytes):
+                width_px, height_px = claimed_size(picture)
+                if width_px * height_px > _PIXELS_PER_BYTE * len(picture):
+                    return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
             detector = idle.get()
             try:
                 return detector.detect(picture)
@@ -202,14 +203,14 @@ def _detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[D
         yield detect, children[0].library, children[0].settings
 
 
-def _pictures(log: Path) -> Iterator[tuple[int, bytes]]:
+def _pictures(log: Path) -> Iterator[tuple[int, Picture]]:
     for each in read_log(log, (PICTURE_TOPIC,), LogLosses()):
         if isinstance(each.message, CompressedImage):
             yield each.publish_time_ns, each.message.data
 
 
-def _in_parallel(
-    pictures: Iterator[tuple[int, bytes]], detect: Detect, n_threads: int
+def in_parallel(
+    pictures: Iterator[tuple[int, Picture]], detect: Detect, n_threads: int
 ) -> Iterator[tuple[int, DetectionResult]]:
     """Results as they come, with few pictures in memory."""
     with ThreadPoolExecutor(n_threads) as pool:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import yaml
 
-from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from calib.robot import Mount, Robot, parse_robot_yaml, read_robot_yaml
 from offline.errors import OfflineError
 from offline.import_forms import WheelScale
 
@@ -19,6 +19,7 @@ UNKNOWN_MOUNT_SIGMA_YAW_DEG: Final = 2.0
 # The log holds metres, so radius and ticks are not used; robot.yaml must name some.
 _NOMINAL_RADIUS_M: Final = 0.1
 _NOMINAL_TICKS_PER_TURN: Final = 1000
+_NOMINAL_TRACK_M: Final = 0.5  # where odometry holds poses, nothing but the look of robot.yaml depends on it
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -69,11 +70,29 @@ class ImportOptions:
         return tuple(_flag(o) for o in ("wheel_radius_m", "ticks_per_turn") if getattr(self, o) is not None)
 
 
-def safe_name(folder: Path) -> str:
-    """A folder's name with everything but letters, digits, dot, dash and underscore turned to dashes."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).lstrip("._-")
+@dataclass(frozen=True)
+class KnownRobot:
+    """What the recording itself tells of its robot.
+
+    Attributes:
+        mount: where its camera sits.
+        family: of its tags.
+        tag_size_m: of them.
+        needs_track: whether the distance between the wheels matters.
+    """
+
+    mount: Mount | None = None
+    family: str = "tag36h11"
+    tag_size_m: float | None = None
+    needs_track: bool = True
+
+
+def safe_name(recording: Path) -> str:
+    """A folder's name, or a file's without its ending; all but letters, digits, dot, dash, underscore become dashes."""
+    path = recording.resolve()
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem if path.is_file() else path.name).lstrip("._-")[:64]
     if not name:
-        raise OfflineError(f"{folder}: a run cannot be named after this folder; give --run-id and --robot-id")
+        raise OfflineError(f"{recording}: a run cannot be named after this; give --run-id and --robot-id")
     return name
 
 
@@ -89,24 +108,31 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
     return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags)
 
 
-def describe_robot(folder: Path, options: ImportOptions, in_camera: bool) -> tuple[Robot, str, list[str]]:
+def describe_robot(
+    recording: Path, options: ImportOptions, in_camera: bool, known: KnownRobot | None = None
+) -> tuple[Robot, str, list[str]]:
     """The run's robot, its robot.yaml as text for the log, and what a person should know of it.
 
     Args:
-        folder: the CSV folder, after which the robot is named unless it has a name.
+        recording: after which the robot is named unless it has a name.
         options: of the command line.
         in_camera: whether observations are in the camera's frame, so that its mount matters.
+        known: from the recording; robot.yaml and options win over it.
 
     Raises:
         OfflineError: the track width is given nowhere.
         CalibError: robot.yaml cannot be used.
     """
+    known = known or KnownRobot()
     if options.robot is not None:
         data = read_robot_yaml(options.robot).model_dump()
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
     else:
-        unknown = "tag size unknown" if options.wheel_radius_m is not None else "tag size and wheel radii unknown"
-        data, said = _bare_robot(folder, options), f"robot.yaml made from the options; {unknown}"
+        data = _bare_robot(recording, options, known)
+        unknown = [] if known.tag_size_m is not None else ["tag size"]
+        unknown += [] if options.wheel_radius_m is not None else ["wheel radii"]
+        told = f"; {' and '.join(unknown)} unknown" if unknown else ""
+        said = f"robot.yaml made from the options{told}"
     if options.robot_id is not None:
         data["robot_id"] = options.robot_id
     _apply_wheels(data["wheels"], options)
@@ -114,22 +140,28 @@ def describe_robot(folder: Path, options: ImportOptions, in_camera: bool) -> tup
     if in_camera:
         remarks.append(_apply_mount(data["mount"], options))
     text = yaml.safe_dump(data, sort_keys=False)
-    return parse_robot_yaml(text, f"{folder}: robot.yaml for the log"), text, remarks
+    return parse_robot_yaml(text, f"{recording}: robot.yaml for the log"), text, remarks
 
 
-def _bare_robot(folder: Path, options: ImportOptions) -> dict[str, Any]:
-    if options.track_width_m is None:
-        raise OfflineError(f"{folder}: the distance between the wheels is not known; give --track-width-m or --robot")
-    return {
-        "robot_id": options.robot_id or safe_name(folder),
+def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> dict[str, Any]:
+    if options.track_width_m is None and known.needs_track:
+        raise OfflineError(
+            f"{recording}: the distance between the wheels is not known; give --track-width-m or --robot"
+        )
+    bare: dict[str, Any] = {
+        "robot_id": options.robot_id or safe_name(recording),
         "wheels": {
             "radius_left_m": _NOMINAL_RADIUS_M,
             "radius_right_m": _NOMINAL_RADIUS_M,
-            "track_m": options.track_width_m,
+            "track_m": options.track_width_m or _NOMINAL_TRACK_M,
             "ticks_per_turn": _NOMINAL_TICKS_PER_TURN,
         },
-        "mount": {},
+        "mount": known.mount.model_dump() if known.mount is not None else {},
     }
+    if known.tag_size_m is not None:
+        bare["tags"] = [{"family": known.family, "default_size_m": known.tag_size_m}]
+        bare["recorder"] = {"families": [known.family]}
+    return bare
 
 
 def _apply_wheels(wheels: dict[str, Any], options: ImportOptions) -> None:
@@ -149,7 +181,7 @@ def _given_wheels(options: ImportOptions) -> dict[str, float]:
 
 
 def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
-    """Puts the camera where the options say. What neither they nor robot.yaml tell is 0 with a wide sigma."""
+    """Puts the camera where the options say. What neither they nor anything else tells is 0 with a wide sigma."""
     yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
     assumed = []
     for field, given, sigma, said in (
@@ -160,7 +192,7 @@ def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
         if given is not None:
             mount[field] = given
             mount.pop(f"{field}_sigma", None)  # that of another value
-        elif options.robot is None:
+        elif field not in mount:
             mount[field], mount[f"{field}_sigma"] = 0.0, sigma
             assumed.append(said)
     place = f"camera at x {mount['x_m']:g} m, y {mount['y_m']:g} m, yaw {degrees(mount['yaw_rad']):g} deg of the base"

@@ -8,7 +8,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from calib.files import folder_written_whole
 from calib.tag_family import families, family_size
 from calib.words import counted
 from offline.errors import OfflineError
@@ -22,38 +21,11 @@ from offline.import_forms import (
     refuse_tick_options,
 )
 from offline.import_robot import ImportOptions, describe_robot, safe_name, wheel_scale
-from onboard.log_writer import LogWriter
+from offline.imported_run import Entry, ImportReport, check_output, write_run
 from onboard.messages import PlanarOdometry, RunInfo, TagObservation, TagObservations
 
 _HEADER_PAIR: Final = ("odometry.csv", "observations.csv")
 _PAPER_PAIR: Final = ("odom.csv", "landmarks.csv")
-
-
-@dataclass(frozen=True)
-class ImportReport:
-    """What was imported, and what a person should know of it."""
-
-    run_folder: Path
-    run_id: str
-    robot_id: str
-    n_odometry: int  # readings in the file
-    duration_s: float
-    distance_m: float
-    n_observations: int
-    n_tags: int
-    remarks: tuple[str, ...]
-
-    def lines(self) -> list[str]:
-        """For a person."""
-        drive = (
-            f"{counted(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
-        )
-        seen = f"{counted(self.n_observations, 'observation')} of {counted(self.n_tags, 'tag')}"
-        return [
-            f"robot {self.robot_id}, run {self.run_id}: {drive}; {seen}",
-            *(f"  {remark}" for remark in self.remarks),
-            f"wrote {self.run_folder}",
-        ]
 
 
 @dataclass(frozen=True)
@@ -79,7 +51,7 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
         raise OfflineError(f"{folder}: is no folder; give one with {_pairs()}")
     run_id = options.run_id or safe_name(folder)
     run_folder = output / run_id
-    _check_output(output, run_folder)
+    check_output(output, run_folder)
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
     drive = _read_drive(folder, options)
@@ -90,7 +62,7 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
         software_version=metadata.version("groundsbot"),
         robot_yaml=robot_yaml,
     )
-    _write_run(run_folder, info, drive, options.tag_family)
+    write_run(run_folder, {"/run": info}, _messages(drive, options.tag_family))
     return ImportReport(
         run_folder=run_folder,
         run_id=run_id,
@@ -156,45 +128,19 @@ def _n_outside(drive: _Drive) -> int:
     return sum(not first <= observation.stamp_ns <= last for observation in drive.observations)
 
 
-def _check_output(output: Path, run_folder: Path) -> None:
-    """`output` may hold other runs, nothing else."""
-    if output.exists() and not output.is_dir():
-        raise OfflineError(f"{output}: is no folder; give a new or empty one")
-    if run_folder.exists():
-        raise OfflineError(f"{run_folder}: exists already; give another output, another --run-id, or remove it")
-    if not output.exists():
-        return
-    for entry in sorted(output.iterdir()):
-        if not (entry.is_dir() and any(entry.rglob("*.mcap"))):
-            raise OfflineError(f"{output}: is not empty: {entry.name} is no run's log; give a new or empty folder")
-
-
-def _write_run(run_folder: Path, info: RunInfo, drive: _Drive, family: str) -> None:
-    start_ns = min(stamp for stamp, _, _ in _messages(drive, family))
-    with folder_written_whole(run_folder) as partial:
-        try:
-            with LogWriter(partial, {"/run": info}, start_ns) as writer:
-                for stamp_ns, topic, message in _messages(drive, family):
-                    writer.write(topic, message, stamp_ns, stamp_ns)
-        except OSError as error:
-            raise OfflineError(f"{run_folder}: cannot be written: {error.strerror}; choose another output") from error
-
-
-def _messages(drive: _Drive, family: str) -> Iterator[tuple[int, str, PlanarOdometry | TagObservations]]:
+def _messages(drive: _Drive, family: str) -> Iterator[Entry]:
     """(stamp, topic, message) in order of time; at one time the odometry first."""
     frame = "camera_planar" if drive.in_camera else "base"
     return merge(_odometry(drive.wheels), _observations(drive.observations, frame, family), key=lambda each: each[0])
 
 
-def _odometry(wheels: WheelPath) -> Iterator[tuple[int, str, PlanarOdometry]]:
+def _odometry(wheels: WheelPath) -> Iterator[Entry]:
     for stamp_ns, left_m, right_m in zip(wheels.stamps_ns, wheels.left_m, wheels.right_m, strict=True):
         distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=right_m)
         yield stamp_ns, "/odometry", PlanarOdometry(stamp_ns=stamp_ns, wheels=distances)
 
 
-def _observations(
-    observations: list[Observation], frame: str, family: str
-) -> Iterator[tuple[int, str, TagObservations]]:
+def _observations(observations: list[Observation], frame: str, family: str) -> Iterator[Entry]:
     for stamp_ns, group in groupby(observations, key=lambda observation: observation.stamp_ns):
         tags = [_tag_observation(observation, family) for observation in group]
         yield stamp_ns, "/tags/observations", TagObservations(stamp_ns=stamp_ns, frame=frame, observations=tags)

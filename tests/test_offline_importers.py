@@ -16,7 +16,8 @@ from calib.errors import GroundsbotError
 from calib.robot import parse_robot_yaml
 from offline.import_forms import WheelScale, read_odometry
 from offline.import_robot import ImportOptions
-from offline.importers import ImportReport, import_folder
+from offline.imported_run import ImportReport
+from offline.importers import import_folder
 from onboard.log_reader import LogMessage, read_log
 from onboard.log_writer import LogWriter
 from onboard.messages import PlanarOdometry, RunInfo, TagObservations

@@ -1,0 +1,113 @@
+"""Where a camera sits on its robot, by the fixed transforms in a bag."""
+
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calib.robot import R_LEVEL_OPTICAL, Mount
+from offline.errors import OfflineError
+
+_Values = tuple[float, float, float, float, float, float, float]  # x, y, z, then quaternion x, y, z, w
+# What rounding does to a transform that is sent again and again; a joint that moves does more.
+_SAME: Final = 1e-6
+_UNIT_LENGTH: Final = 1e-3  # how far a quaternion's length may be from 1: far beyond rounding, even to floats
+_DEEPEST: Final = 100  # links from a frame to its root; more of them go in circles
+FARTHEST_MOUNT_M: Final = 10.0  # robot.yaml's limit too
+
+
+class FixedFrames:
+    """The transforms between frames that do not move against each other."""
+
+    def __init__(self, where: str) -> None:
+        """Knows no frame yet; `where` names the bag in errors."""
+        self._where = where
+        self._links: dict[str, tuple[str, _Values]] = {}  # child -> parent and T_parent_child
+        self._moving: set[str] = set()  # children whose place on the parent changes
+
+    def add(self, message: Any) -> None:  # noqa: ANN401 - made by rosbags from the bag's definition
+        """Takes a message of `/tf` or `/tf_static`."""
+        for each in message.transforms:
+            parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+            t, q = each.transform.translation, each.transform.rotation
+            values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
+            old_parent, old = self._links.setdefault(child, (parent, values))
+            if old_parent != parent or not np.allclose(values, old, rtol=0.0, atol=_SAME):
+                self._moving.add(child)
+
+    def knows(self, frame: str) -> bool:
+        """Whether a transform names it."""
+        return frame in self._links or any(parent == frame for parent, _ in self._links.values())
+
+    def joins(self, a: str, b: str) -> bool:
+        """Whether fixed transforms lead from one frame to the other."""
+        return self._path(a)[-1][0] == self._path(b)[-1][0]
+
+    def moving_near(self, frame: str) -> str | None:
+        """The frame that moves on its parent, at which the fixed way up from a frame ends; None if none does."""
+        root = self._path(frame)[-1][0]
+        return root if root in self._moving else None
+
+    def transform(self, to: str, frame: str) -> RigidTransform:
+        """Points in `frame` to points in `to`, which must be joined.
+
+        Raises:
+            OfflineError: a transform on the way is none.
+        """
+        return self._to_root(to).inv() * self._to_root(frame)
+
+    def _path(self, frame: str) -> list[tuple[str, _Values | None]]:
+        """The frames from one up to where the fixed transforms end, each with its place on the next."""
+        path: list[tuple[str, _Values | None]] = []
+        while frame in self._links and frame not in self._moving and len(path) < _DEEPEST:
+            parent, values = self._links[frame]
+            path.append((frame, values))
+            frame = parent
+        return [*path, (frame, None)]
+
+    def _to_root(self, frame: str) -> RigidTransform:
+        found = RigidTransform.identity()
+        for child, values in self._path(frame):
+            if values is not None:
+                found = rigid_transform(values, f"{self._where}: tf to {child}") * found
+        return found
+
+
+def rigid_transform(values: _Values, where: str) -> RigidTransform:
+    """A transform of ROS.
+
+    Args:
+        values: translation x, y, z, then quaternion x, y, z, w.
+        where: names it in errors.
+
+    Raises:
+        OfflineError: a number is none, or the quaternion is of another length than 1.
+    """
+    length = float(np.linalg.norm(values[3:]))
+    if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_LENGTH:
+        raise OfflineError(
+            f"{where}: {values} is no transform: its quaternion has length {length:.4g}, must be 1; correct its sender"
+        )
+    return RigidTransform.from_components(np.array(values[:3]), Rotation.from_quat(np.array(values[3:])))
+
+
+def frame_name(name: str) -> str:
+    """A frame as tf2 knows it: ROS 1's first tf wrote a slash before it."""
+    return name.lstrip("/")
+
+
+def mount_of(T_base_camera: RigidTransform) -> Mount:
+    """The mount of robot.yaml that puts a camera's optical frame there.
+
+    Raises:
+        OfflineError: no camera sits so far off.
+    """
+    place, rotation = T_base_camera.as_components()
+    if float(np.abs(place).max()) > FARTHEST_MOUNT_M:
+        raise OfflineError(
+            f"tf: the camera is {np.linalg.norm(place):.4g} m from its base, limit {FARTHEST_MOUNT_M:g} m; "
+            "check the base frame, or name it with --base-frame"
+        )
+    yaw, pitch, roll = (rotation * R_LEVEL_OPTICAL.inv()).as_euler("ZYX").tolist()
+    x, y, z = place.tolist()
+    return Mount(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)

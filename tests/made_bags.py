@@ -1,0 +1,336 @@
+"""ROS bags made from our own logs, message by message, by rosbags' writers."""
+
+import sqlite3
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+from scipy.spatial.transform import Rotation
+
+from calib import wheels
+from calib.camera_model import CameraModel
+from calib.robot import Mount
+from offline.bag_definitions import DEFINITIONS
+from offline.odometry import WheelTrack, chained
+from offline.run import Run, load_run
+from onboard.log_reader import read_log
+from onboard.messages import TagDetections, TagObservations
+
+S = 1_000_000_000
+BASE, CAMERA, ODOM = "base_link", "camera_optical", "odom"
+# The interface of apriltag_ros for ROS 1, whose bags always carry it.
+_ROS1_TYPES = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "apriltag_ros/msg/AprilTagDetection": (
+        "int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose\n"
+    ),
+    "apriltag_ros/msg/AprilTagDetectionArray": "std_msgs/Header header\napriltag_ros/AprilTagDetection[] detections\n",
+}
+_EMPTY: dict[str, Any] = {"float": 0.0, "string": "", "bool": False}
+
+
+def made_stores() -> tuple[Typestore, Typestore]:
+    """Of ROS 1 and ROS 2, with the types of AprilTag detectors."""
+    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _ROS1_TYPES.items():
+        ros1.register(get_types_from_msg(text, name))
+    for package in DEFINITIONS.values():
+        for name, text in package.items():
+            ros2.register(get_types_from_msg(text, name))
+    return ros1, ros2
+
+
+STORE1, STORE2 = made_stores()
+
+
+class Sent(NamedTuple):
+    """One message: fields that are not named are zero or empty."""
+
+    topic: str
+    msgtype: str
+    received_ns: int
+    fields: dict[str, Any]
+
+
+def made_message(store: Typestore, msgtype: str, fields: dict[str, Any]) -> Any:
+    """A message of a store's class; fields by name, messages within as such mappings."""
+    unknown = set(fields) - {name for name, _ in store.fielddefs[msgtype][1]}
+    assert not unknown, f"{msgtype} has no {unknown}"
+    values = {name: _made(store, kind, fields.get(name)) for name, kind in store.fielddefs[msgtype][1]}
+    return store.types[msgtype](**values)
+
+
+def _made(store: Typestore, kind: Any, value: Any) -> Any:
+    if kind[0] == Nodetype.NAME:
+        return made_message(store, kind[1], value or {})
+    if kind[0] == Nodetype.BASE:
+        name = kind[1][0]
+        return value if value is not None else _EMPTY.get(name.rstrip("0123456789"), 0)
+    inner, length = kind[1]
+    if inner[0] == Nodetype.BASE and inner[1][0] != "string":
+        dtype = np.dtype(inner[1][0].replace("bool", "bool_"))
+        return np.zeros(length, dtype) if value is None else np.asarray(value, dtype)
+    given = list(value) if value is not None else [None] * length
+    return [_made(store, inner, each) for each in given]
+
+
+def write_bag(path: Path, messages: Iterable[Sent]) -> Path:
+    """A bag of ROS 1 if the name ends in .bag; else of ROS 2: a folder, of MCAP unless `db3` is in its name."""
+    ordered = sorted(messages, key=lambda each: each.received_ns)
+    is_ros1 = path.suffix == ".bag"
+    store = STORE1 if is_ros1 else STORE2
+    plugin = StoragePlugin.SQLITE3 if "db3" in path.name else StoragePlugin.MCAP
+    connections: dict[tuple[str, str], Any] = {}
+    writer: Any = Writer1(path) if is_ros1 else Writer2(path, version=9, storage_plugin=plugin)
+    with writer:
+        for each in ordered:
+            key = (each.topic, each.msgtype)
+            if key not in connections:
+                connections[key] = writer.add_connection(*key, typestore=store)
+            message = made_message(store, each.msgtype, _of_ros1(each.fields) if is_ros1 else each.fields)
+            data = store.serialize_ros1(message, key[1]) if is_ros1 else store.serialize_cdr(message, key[1])
+            writer.write(connections[key], each.received_ns, data)
+    return path
+
+
+def _of_ros1(fields: dict[str, Any]) -> dict[str, Any]:
+    """ROS 1 wrote the matrices of CameraInfo large."""
+    return {name.upper() if name in ("k", "d", "p") else name: value for name, value in fields.items()}
+
+
+def without_definitions(bag: Path) -> Path:
+    """The bag as older ROS 2 wrote it: without the messages' definitions."""
+    (database,) = bag.glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute("DROP TABLE message_definitions")
+        connection.execute("UPDATE schema SET schema_version = 3")
+    connection.close()
+    return bag
+
+
+def header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    return {"stamp": {"sec": stamp_ns // S, "nanosec": stamp_ns % S}, "frame_id": frame}
+
+
+def xyz(values: Sequence[float]) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def xyzw(rotation: Rotation) -> dict[str, float]:
+    return dict(zip("xyzw", rotation.as_quat().tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class BagOfLog:
+    """The messages that ROS's nodes would have sent on the drive that a log holds, received later than measured."""
+
+    run: Run
+    looks: list[TagDetections]
+    observations: list[TagObservations]
+    sent: list[Sent] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, log: Path) -> "BagOfLog":
+        messages = [each.message for each in read_log(log)]
+        return cls(
+            load_run(log),
+            [each for each in messages if isinstance(each, TagDetections)],
+            [each for each in messages if isinstance(each, TagObservations)],
+        )
+
+    @property
+    def track(self) -> WheelTrack:
+        (track,) = self.run.stretches
+        return track
+
+    def add(self, topic: str, msgtype: str, stamp_ns: int, fields: dict[str, Any]) -> None:
+        late_ns = 5_000_000 if msgtype in ("nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState") else 90_000_000
+        self.sent.append(Sent(topic, msgtype, stamp_ns + late_ns, fields))
+
+    def odometry(self, topic: str = "/odom", **also: Any) -> "BagOfLog":
+        """nav_msgs/Odometry from the wheels, starting somewhere in odom."""
+        track, track_m = self.track, self.run.robot.wheels.track_m
+        left, right = np.diff(track.left_m), np.diff(track.right_m)
+        poses = chained(wheels.advance(left, right, track_m), np.array([3.0, -2.0, 2.5]))
+        for stamp, (x, y, theta) in zip(track.stamps_ns.tolist(), poses.tolist(), strict=True):
+            pose = {"position": xyz([x, y, 0.0]), "orientation": xyzw(Rotation.from_euler("z", theta))}
+            fields = {"header": header(stamp, ODOM), "child_frame_id": BASE, "pose": {"pose": pose, **also}}
+            self.add(topic, "nav_msgs/msg/Odometry", stamp, fields)
+        return self
+
+    def joints(
+        self, topic: str = "/joint_states", names: Sequence[str] = ("wheel_left", "arm", "wheel_right")
+    ) -> "BagOfLog":
+        """sensor_msgs/JointState: the first name is the left wheel, the last the right one."""
+        radii = self.run.robot.wheels
+        track = self.track
+        for stamp, left_m, right_m in zip(track.stamps_ns.tolist(), track.left_m, track.right_m, strict=True):
+            angles = {names[0]: 5.0 + left_m / radii.radius_left_m, names[-1]: right_m / radii.radius_right_m - 3.0}
+            position = [angles.get(name, 0.7) for name in names]
+            fields = {"header": header(stamp, ""), "name": list(names), "position": position}
+            self.add(topic, "sensor_msgs/msg/JointState", stamp, fields)
+        return self
+
+    def mount(self, mount: Mount | None = None) -> "BagOfLog":
+        """/tf_static in two links and one that leads elsewhere."""
+        T_base_camera = (mount or self.run.robot.mount).T_base_camera
+        place, rotation = T_base_camera.as_components()
+        half = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
+        links = [
+            (BASE, "camera_link", place, half),
+            ("camera_link", CAMERA, np.zeros(3), half.inv() * rotation),
+            (BASE, "laser", np.ones(3), half),
+        ]
+        transforms = [
+            {"header": header(0, parent), "child_frame_id": child, "transform": _transform(t, r)}
+            for parent, child, t, r in links
+        ]
+        self.add("/tf_static", "tf2_msgs/msg/TFMessage", int(self.track.stamps_ns[0]), {"transforms": transforms})
+        return self
+
+    def camera_info(self, topic: str = "/camera/camera_info", camera: CameraModel | None = None) -> "BagOfLog":
+        camera = camera or self.run.camera
+        assert camera is not None
+        k = camera.matrix
+        fields = {
+            "header": header(int(self.track.stamps_ns[0]), CAMERA),
+            "width": camera.width_px,
+            "height": camera.height_px,
+            "distortion_model": camera.distortion_model,
+            "k": k.ravel(),
+            "d": camera.distortion,
+            "p": np.hstack([k, np.zeros((3, 1))]).ravel(),
+        }
+        self.add(topic, "sensor_msgs/msg/CameraInfo", int(self.track.stamps_ns[0]), fields)
+        return self
+
+    def apriltag_msgs(self, topic: str = "/detections", frame: str = CAMERA) -> "BagOfLog":
+        """As the ROS 2 node: bottom left first, against the clock, the first pixel's corner at (0, 0)."""
+        for look in self.looks:
+            detections = [
+                {
+                    "family": each.family,
+                    "id": each.tag_id,
+                    "decision_margin": 50.0,
+                    "corners": [
+                        {"x": x + 0.5, "y": y + 0.5}
+                        for x, y in np.reshape(list(each.corners_px), (4, 2))[::-1].tolist()
+                    ],
+                }
+                for each in look.detections
+            ]
+            fields = {"header": header(look.stamp_ns, frame), "detections": detections}
+            self.add(topic, "apriltag_msgs/msg/AprilTagDetectionArray", look.stamp_ns, fields)
+        return self
+
+    def isaac(self, topic: str = "/tag_detections") -> "BagOfLog":
+        """As NVIDIA's node: top left first, with the clock; of a log with positions, zeros for corners."""
+        for look in self.looks:
+            detections = [
+                {
+                    "family": each.family,
+                    "id": each.tag_id,
+                    "corners": [
+                        {"x": x + 0.5, "y": y + 0.5} for x, y in np.reshape(list(each.corners_px), (4, 2)).tolist()
+                    ],
+                    "pose": {"pose": {"pose": {"position": xyz([0.0, 0.0, 9.0])}}},
+                }
+                for each in look.detections
+            ]
+            fields = {"header": header(look.stamp_ns, CAMERA), "detections": detections}
+            self.add(topic, "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", look.stamp_ns, fields)
+        return self
+
+    def isaac_poses(self, topic: str = "/tag_detections") -> "BagOfLog":
+        for observed in self.observations:
+            detections = [
+                {"family": each.family, "id": each.tag_id, "pose": self._pose(observed.stamp_ns, each)}
+                for each in observed.observations
+            ]
+            fields = {"header": header(observed.stamp_ns, CAMERA), "detections": detections}
+            self.add(topic, "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", observed.stamp_ns, fields)
+        return self
+
+    def apriltag_ros(self, topic: str = "/tag_detections") -> "BagOfLog":
+        """As the ROS 1 node: poses, families not named."""
+        for observed in self.observations:
+            detections = [
+                {"id": [each.tag_id], "size": [0.15], "pose": self._pose(observed.stamp_ns, each)}
+                for each in observed.observations
+            ]
+            fields = {"header": header(observed.stamp_ns, CAMERA), "detections": detections}
+            self.add(topic, "apriltag_ros/msg/AprilTagDetectionArray", observed.stamp_ns, fields)
+        return self
+
+    def tag_transforms(self) -> "BagOfLog":
+        """/tf of the tags as the ROS 2 node sends it, and bare detections with them."""
+        for observed in self.observations:
+            transforms, detections = [], []
+            for each in observed.observations:
+                place = self._optical(each)
+                head = header(observed.stamp_ns, CAMERA)
+                transform = _transform(place, Rotation.identity())
+                transforms.append(
+                    {"header": head, "child_frame_id": f"{each.family}:{each.tag_id}", "transform": transform}
+                )
+                detections.append({"family": each.family, "id": each.tag_id})
+            self.add("/tf", "tf2_msgs/msg/TFMessage", observed.stamp_ns, {"transforms": transforms})
+            fields = {"header": header(observed.stamp_ns, CAMERA), "detections": detections}
+            self.add("/detections", "apriltag_msgs/msg/AprilTagDetectionArray", observed.stamp_ns, fields)
+        return self
+
+    def picture(
+        self, form: str, grey: NDArray[np.uint8], stamp_ns: int, topic: str = "/camera/image_raw"
+    ) -> "BagOfLog":
+        """sensor_msgs/Image with padded rows, or a CompressedImage."""
+        head = header(stamp_ns, CAMERA)
+        if form == "png":
+            data = np.frombuffer(cv2.imencode(".png", grey)[1].tobytes(), np.uint8)
+            self.add(
+                topic, "sensor_msgs/msg/CompressedImage", stamp_ns, {"header": head, "format": "png", "data": data}
+            )
+            return self
+        rows = grey if form == "mono8" else np.repeat(grey, 3, axis=1)
+        height, width = grey.shape
+        rows = np.pad(rows, ((0, 0), (0, 5)))
+        fields = {"height": height, "width": width, "encoding": form, "step": rows.shape[1], "data": rows.ravel()}
+        self.add(topic, "sensor_msgs/msg/Image", stamp_ns, {"header": head, **fields})
+        return self
+
+    def without(self, topic: str) -> "BagOfLog":
+        return replace(self, sent=[each for each in self.sent if each.topic != topic])
+
+    def write(self, path: Path) -> Path:
+        return write_bag(path, self.sent)
+
+    def _planar_to_optical(self) -> Rotation:
+        mount = self.run.robot.mount
+        return mount.T_base_camera.rotation.inv() * Rotation.from_euler("z", mount.yaw_rad)
+
+    def _optical(self, each: Any) -> Any:
+        place = each.cartesian
+        return self._planar_to_optical().apply([place.x_m, place.y_m, place.z_m])
+
+    def _pose(self, stamp_ns: int, each: Any) -> dict[str, Any]:
+        turned = self._planar_to_optical().as_matrix()
+        covariance = np.zeros((6, 6))
+        if len(each.covariance):
+            planar = np.diag([0.0, 0.0, 0.01])
+            planar[:2, :2] = np.reshape(list(each.covariance), (2, 2))
+            covariance[:3, :3] = turned @ planar @ turned.T
+        pose = {"position": xyz(self._optical(each)), "orientation": {"w": 1.0}}
+        return {"header": header(stamp_ns, CAMERA), "pose": {"pose": pose, "covariance": covariance.ravel()}}
+
+
+def _transform(place: Any, rotation: Rotation) -> dict[str, Any]:
+    return {"translation": xyz(place), "rotation": xyzw(rotation)}
