@@ -101,6 +101,63 @@ def check(
 
 
 @app.command()
+def capture(
+    robot: RobotOption,
+    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures; may hold earlier ones.")],
+    board: Annotated[str, typer.Option(help="The word that is printed on the board.")] = "7x9-25mm-18mm-5x5_100",
+    views: Annotated[int, typer.Option(help="How many pictures.")] = 30,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Of the pictures, in px.  [default: the calibration's, else 1280x720]"),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Where to save what the camera sees.  [default: capture.jpg beside robot.yaml]"
+        ),
+    ] = None,
+) -> None:
+    """Take pictures of the calibration board for `groundsbot-calib camera`, telling how to hold it.
+
+    A picture is taken when the board is still and the view a new one. Ends when there are enough and they miss nothing,
+    or with Ctrl-C, and keeps what there is. robot.yaml needs no calibration for this.
+
+    Exit code 3: it was ended before there were enough.
+    """
+    import signal
+    import threading
+
+    from rich.console import Console
+
+    from calib.board import parse_board
+    from onboard.camera import camera_for
+    from onboard.capture import Capture, summary
+    from onboard.capture_guide import CaptureGuide
+    from onboard.capture_view import CaptureView
+    from onboard.clock import RunClock
+    from onboard.robot_files import capture_settings
+
+    guide = CaptureGuide(parse_board(board), views)
+    clock = RunClock()
+    camera = camera_for(capture_settings(robot, size), clock, since_ns=clock.now_ns())
+    view = CaptureView(Console())
+    looked_at = picture or robot.with_name("capture.jpg")
+    taking = Capture(camera, clock, guide, output, looked_at, view.show, view.say)
+    stop = threading.Event()
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(each) is not signal.SIG_IGN:
+            signal.signal(each, lambda *_: stop.set())
+    try:
+        with view.shown():
+            taking.run(stop)
+    finally:
+        for line in summary(guide, output):
+            view.say(line)
+    if not guide.enough:
+        raise typer.Exit(EXIT_WITH_LOSSES if guide.kept else EXIT_REFUSED)
+
+
+@app.command()
 def status(
     place: Annotated[
         Path, typer.Argument(metavar="[DIR]", help="Where `record` writes: its DIR, or its status file.")

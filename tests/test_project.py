@@ -18,6 +18,7 @@ COMMANDS = [
     ("onboard.cli",),
     ("onboard.cli", "record"),
     ("onboard.cli", "check"),
+    ("onboard.cli", "capture"),
     ("onboard.cli", "status"),
     ("offline.cli",),
     ("offline.cli", "map"),
