@@ -5,7 +5,8 @@ valley the whole ended, a window is solved right, and what it leaves over shows 
 readings is. The whole is the same problem under conditions: windows join, and a tag has one place. What the conditions
 cost, in squared sigmas of the noise so fitted, is chi-square with as many degrees of freedom as there are conditions
 (the test of nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise
-is fitted. A reading that is simply wrong costs the same on either side.
+is fitted. A reading that is simply wrong costs the same on either side. Errors that neighbouring readings of a tag
+share are invisible one by one, but not where a tag is met again; `shared_errors` fits how large they are.
 """
 
 from dataclasses import dataclass, replace
@@ -18,10 +19,13 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import Columns, State, stacked
 from offline.odometry import chained
 from offline.robust import losses_and_weights
+from offline.shared_errors import fit_shared_errors
 from offline.solver import DEFAULT_LOSSES, Losses, Problem, Solution, solve
 
 # Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
+# Over which readings of a tag share an error; a window has several to compare.
+_CELL_M: Final = WINDOW_M / 4.0
 # Once in a thousand good maps.
 FALSE_ALARM: Final = 1e-3
 # The sigmas that the estimate was told count like this many measurements of each kind.
@@ -78,7 +82,8 @@ class Windows:
         problem: the whole, by the sigmas that the estimate was told.
         losses: of wheels and readings.
         factors: (2,) the noise of wheels and of readings as a multiple of those sigmas.
-        redundancy: (2,) how many measurements each of the two rests on.
+        sharing: (M, 2) what else multiplies each reading's sigmas, for errors that it shares with its neighbours.
+        freedom: what chi-square's degrees of freedom the noise is known like.
         cost: of all windows apart, under that noise.
         n_conditions: how many numbers more the windows have to fit with than the whole.
     """
@@ -86,15 +91,17 @@ class Windows:
     problem: Problem
     losses: Losses
     factors: FloatArray
-    redundancy: FloatArray
+    sharing: FloatArray
+    freedom: float
     cost: float
     n_conditions: int
 
     def judge(self, state: State) -> Goodness:
         """What it costs to join them in the valley of a state."""
-        together = solve(_scaled(self.problem, self.factors), state, losses=self.losses)
+        problem = _scaled(self.problem, self.factors[0], self.factors[1] * self.sharing)
+        together = solve(problem, state, losses=self.losses)
         n = self.n_conditions
-        quantile = stats.f.isf(FALSE_ALARM, n, self.redundancy.min() + _TOLD) if n else 1.0
+        quantile = stats.f.isf(FALSE_ALARM, n, self.freedom) if n else 1.0
         return Goodness(
             chi_square=max(0.0, 2.0 * (together.cost - self.cost)),
             expected=n,
@@ -110,14 +117,21 @@ def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows
     state = _dead_reckoned(problem, apart)
     factors, redundancy = np.ones(2), np.zeros(2)
     for _ in range(_MAX_FITS):
-        solution = solve(_scaled(apart, factors), state, losses=losses)
+        solution = solve(_scaled(apart, *factors), state, losses=losses)
         squares, redundancy = _left_over(solution)
         before, factors = factors, np.sqrt((squares * factors**2 + _TOLD) / (redundancy + _TOLD))
         state = solution.state
         if np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
             break
-    cost = solve(_scaled(apart, factors), state, losses=losses).cost
-    return Windows(problem, losses, factors, redundancy, cost, _freedom(problem) - _freedom(apart))
+    n_conditions = _freedom(problem) - _freedom(apart)
+    sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
+    solution = solve(_scaled(apart, *factors), state, losses=losses)
+    if n_conditions:
+        cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
+        errors = fit_shared_errors(solution, cell)
+        sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
+        solution = solve(_scaled(apart, factors[0], factors[1] * sharing), solution.state, losses=losses)
+    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions)
 
 
 def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
@@ -125,10 +139,8 @@ def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
     window = _window_of_pose(problem, window_m)
     odometry, readings = problem.odometry, problem.readings
     inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
-    n_tags = len(problem.columns.tags)
-    seen, first_reading, tag = np.unique(
-        window[readings.pose] * n_tags + readings.tag, return_index=True, return_inverse=True
-    )
+    tag = _numbered(window[readings.pose], readings.tag)
+    _, first_reading = np.unique(tag, return_index=True)
     return Problem(
         odometry=replace(
             odometry,
@@ -140,7 +152,7 @@ def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
         ),
         readings=replace(readings, tag=tag),
         prior=problem.prior,
-        columns=_columns(window, len(seen), problem.columns.calibration >= 0),
+        columns=_columns(window, len(first_reading), problem.columns.calibration >= 0),
         anchor=readings.pose[first_reading],
     )
 
@@ -159,6 +171,12 @@ def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
     begins = ~follows
     begins[1:] |= number[1:] != number[:-1]
     return np.cumsum(begins) - 1
+
+
+def _numbered(part: IntArray, tag: IntArray) -> IntArray:
+    """(M,) a number of its own for each tag in each part of the way, from 0 without gaps."""
+    _, number = np.unique(part * (int(tag.max(initial=0)) + 1) + tag, return_inverse=True)
+    return np.asarray(number, dtype=np.int64)
 
 
 def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
@@ -186,13 +204,14 @@ def _dead_reckoned(problem: Problem, windows: Problem) -> State:
     return State(poses, np.stack(mean, axis=-1), state.calibration)
 
 
-def _scaled(problem: Problem, factors: FloatArray) -> Problem:
-    """With the noise of wheels and readings (2,) times as large."""
+def _scaled(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
+    """With the noise of wheels and readings so many times as large; (M, 2) where readings differ in that."""
+    by_row = np.broadcast_to(reading_factor, problem.readings.value.shape)[..., None]
     odometry, readings = problem.odometry, problem.readings
     return replace(
         problem,
-        odometry=replace(odometry, whitening=odometry.whitening / factors[0]),
-        readings=replace(readings, whitening=readings.whitening / factors[1]),
+        odometry=replace(odometry, whitening=odometry.whitening / odometry_factor),
+        readings=replace(readings, whitening=readings.whitening / by_row),
     )
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se2
 from offline import pipeline
 from offline.chain import Chain
 from offline.goodness import Goodness, fitted_windows, in_windows
@@ -14,7 +13,7 @@ from offline.graph import build_graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.solver import solve
 from tests.made_drives import MadeTag, made_drive, write_drive
-from tests.made_long_drives import made_long_drive
+from tests.made_long_drives import made_long_drive, with_a_moved_tag
 
 LENGTH_M = 500.0
 
@@ -67,17 +66,8 @@ def test_single_wrong_readings_do_not_count_against_a_map() -> None:
 
 
 def test_a_tag_that_moved_in_between_is_noticed() -> None:
-    """The tag read most hangs 2.8 m farther on when it is seen again."""
     drive = made_long_drive(5, LENGTH_M)
-    chain, readings = drive.chain, drive.chain.readings
-    tag = int(np.argmax(np.bincount(readings.tag)))
-    sightings = readings.keyframe[readings.tag == tag]
-    later = (readings.tag == tag) & (readings.keyframe > sightings[np.argmax(np.diff(sightings))])
-    camera = se2.compose(drive.T_start_base[readings.keyframe[later]], chain.T_base_camera)
-    place = se2.apply(se2.inverse(camera), drive.tags_m[chain.tags[tag]] + 2.0)
-    value = readings.value.copy()
-    value[later] = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
-    graph = build_graph([replace(chain, readings=replace(readings, value=value))])
+    graph = build_graph([with_a_moved_tag(drive)])
     best = solve(graph.problem, drive.true_state(graph))
     assert not fitted_windows(graph.problem).judge(best.state).fits
 

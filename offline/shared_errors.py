@@ -1,0 +1,143 @@
+"""How much of their errors do neighbouring readings of a tag share?
+
+A detector's bias depends on how a tag looks, and so repeats from picture to picture: the mean of m readings is then
+less certain than one reading over sqrt(m). Readings of one tag within a cell, a metre or two of the way, are taken to
+err by a part of each one's own and by a part that the cell shares. The variances of the parts follow from two squares
+of what a solve leaves over: reading by reading, and summed over cells. Each square's expectation is linear in the
+variances, with traces as coefficients, and what the estimate takes is in the traces (the minimum norm quadratic
+unbiased estimator: Rao, "Estimation of variance and covariance components", 1971). So errors that are independent give
+a shared part of zero in the mean.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from offline.factors import stacked
+from offline.robust import losses_and_weights
+from offline.solver import Solution
+
+# What was assumed before, that readings share nothing, counts like this many cells.
+_TOLD: Final = 4.0
+_TINY: Final = 1e-9
+_N_SIGNS: Final = 8
+_SEED: Final = 7
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """Variances of whitened readings, by component.
+
+    Attributes:
+        own: (2,) of each reading's own part, and own_redundancy: (2,) how many measurements it rests on.
+        shared: (2,) of the part that a cell shares, and shared_redundancy: (2,) how many cells it rests on.
+    """
+
+    own: FloatArray
+    own_redundancy: FloatArray
+    shared: FloatArray
+    shared_redundancy: FloatArray
+
+    def factors(self, cell: IntArray) -> FloatArray:
+        """(M, 2) factors on the sigmas of readings in cells (M,), with which they tell as much as independent ones."""
+        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * self.shared)
+
+    def freedom(self, cell: IntArray) -> float:
+        """What chi-square's degrees of freedom the variance of readings so weighed is known like.
+
+        Welch and Satterthwaite's sum: Satterthwaite, "An approximate distribution of estimates of variance components"
+        (1946).
+        """
+        parts = np.concatenate([len(cell) * self.own, _n_in_cell(cell).sum() * self.shared])
+        redundancy = np.concatenate([self.own_redundancy, self.shared_redundancy])
+        return float(parts.sum() ** 2 / (parts**2 / redundancy).sum())
+
+
+def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
+    """Fits both parts to what a solve left over of its readings, the noise of all else being as the solve was told.
+
+    Args:
+        solution: its readings weighed as independent.
+        cell: (M,) of each reading; numbers from 0 without gaps.
+    """
+    left_over = _LeftOver(solution)
+    rng = np.random.default_rng(_SEED)
+    n_rows = len(left_over.residual)
+    traces, rest, length = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
+    for _ in range(_N_SIGNS):
+        for part in range(4):
+            component, by_cell = part % 2, part >= 2
+            signs = (
+                rng.choice([-1.0, 1.0], int(cell.max()) + 1)[cell] if by_cell else rng.choice([-1.0, 1.0], len(cell))
+            )
+            drawn = np.zeros(n_rows)
+            left_over.of_readings(drawn)[:, component] = signs
+            kept = left_over.of(drawn)
+            found = _squares(left_over.of_readings(kept), cell)
+            whole = float(kept @ kept)
+            traces[part] += found / _N_SIGNS
+            rest[part] += (whole - found[:2].sum()) / _N_SIGNS
+            length[part] += whole / _N_SIGNS
+    squares = _squares(left_over.of_readings(left_over.residual), cell) - rest
+    n_in_cell = np.bincount(cell)
+    return _solved(0.5 * (traces + traces.T), squares, length, float((n_in_cell**2).sum() / n_in_cell.sum()))
+
+
+class _LeftOver:
+    """What remains of measured numbers and priors once the estimate has taken its share: v - J H^-1 J^T v."""
+
+    def __init__(self, solution: Solution) -> None:
+        problem, state = solution.problem, solution.state
+        kinds = tuple(
+            kind.linearise(state, problem.columns) for kind in (problem.odometry, problem.readings, problem.prior)
+        )
+        jacobian, residual = stacked(kinds, problem.columns.n)
+        weights = [
+            np.repeat(losses_and_weights(loss, kind.residual)[1], kind.residual.shape[1])
+            for loss, kind in zip(solution.losses, kinds, strict=False)
+        ]
+        root = np.sqrt(np.concatenate([*weights, np.ones(len(kinds[2].residual))]))
+        self._jacobian = jacobian * root[:, None]
+        self._factorisation = solution.factorisation
+        self._readings = slice(kinds[0].residual.size, kinds[0].residual.size + kinds[1].residual.size)
+        self.residual = residual * root
+
+    def of(self, rows: FloatArray) -> FloatArray:
+        taken: FloatArray = self._jacobian @ self._factorisation.solve(self._jacobian.T @ rows)
+        return rows - taken
+
+    def of_readings(self, rows: FloatArray) -> FloatArray:
+        """(M, 2), a view."""
+        return rows[self._readings].reshape(-1, 2)
+
+
+def _squares(readings: FloatArray, cell: IntArray) -> FloatArray:
+    """(4,) sums of squares: of both components reading by reading, then of their sums over cells."""
+    sums = [np.bincount(cell, readings[:, component]) for component in (0, 1)]
+    return np.array([*(readings**2).sum(axis=0), *(float(each @ each) for each in sums)])
+
+
+def _solved(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:
+    """Variances (own twice, shared twice), none below zero, of traces @ variances = squares.
+
+    Args:
+        traces: (4, 4)
+        squares: (4,)
+        length: (4,) what each of the squares would be by own parts of variance 1.
+        size: of a cell, as the mean reading has it: the trace of a cell of which the estimate takes nothing. Where it
+            takes much, sums over cells say little, and what was assumed stands.
+    """
+    told = _TOLD * np.array([1.0, 1.0, size, size]) ** 2
+    weighed = traces + np.diag(told)
+    aimed = squares + told * np.array([1.0, 1.0, 0.0, 0.0])
+    shared = np.maximum(np.linalg.solve(weighed, aimed)[2:], 0.0)
+    own = np.linalg.solve(weighed[:2, :2], aimed[:2] - weighed[:2, 2:] @ shared)
+    redundancy = length**2 / np.maximum(traces.diagonal(), _TINY) + _TOLD
+    return SharedErrors(np.maximum(own, _TINY), redundancy[:2], shared, redundancy[2:])
+
+
+def _n_in_cell(cell: IntArray) -> FloatArray:
+    """(M,) how many readings share the cell of each."""
+    return np.asarray(np.bincount(cell)[cell], dtype=np.float64)
