@@ -2,15 +2,21 @@
 
 import hashlib
 import os
+import re
+import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
 from numba import extending
 from numba.core import event, types
+
+_CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
+_KEPT_UNUSED_S: Final = 30 * 86_400.0
 
 COMPILING: Final = "compiling the solver, this once; some twenty seconds"
 
@@ -130,10 +136,24 @@ def _keep_cache_apart() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
+            os.utime(folder)  # when it was last used: what lies in it is only read
         except OSError:
             continue
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined] # numba fills its config at run time
+        _remove_unused(root)
         return
+
+
+def _remove_unused(root: Path) -> None:
+    """Folders that updates left behind. Another version may be in use beside this one, but then not for so long unused.
+
+    Should it be after all, it compiles once more: numba takes files that are gone for files that never were.
+    """
+    oldest_s = time.time() - _KEPT_UNUSED_S
+    for folder in root.glob("solver-*"):
+        with suppress(OSError):
+            if _CACHE_NAME.fullmatch(folder.name) and not folder.is_symlink() and folder.stat().st_mtime < oldest_s:
+                shutil.rmtree(folder)
 
 
 _keep_cache_apart()

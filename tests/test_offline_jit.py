@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,26 @@ def test_compiling_is_told_of_once() -> None:
     assert told == [COMPILING]
 
 
-def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> None:
-    """A caller in one file must not be loaded with what a callee in another used to be."""
-    package = tmp_path / "offline"
+def made_package(folder: Path) -> Path:
+    """A package `offline` with nothing but this module."""
+    package = folder / "offline"
     package.mkdir()
     (package / "__init__.py").touch()
-    (package / "jit.py").write_text(Path(jit.__file__).read_text())
+    (package / "jit.py").write_text(Path(jit.__file__).read_text(encoding="utf-8"), encoding="utf-8")
+    return package
+
+
+def printed_by(program: str, folder: Path, **more: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", **more}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout
+
+
+def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> None:
+    """A caller in one file must not be loaded with what a callee in another used to be."""
+    package = made_package(tmp_path)
     callee, caller = package / "callee.py", package / "caller.py"
     caller.write_text(
         "from offline.callee import f\nfrom offline.jit import jitted\n@jitted\ndef g(x):\n    return f(x)\n"
@@ -57,8 +72,26 @@ def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> Non
     found = []
     for plus in ("1.0", "2.0"):
         callee.write_text(f"from offline.jit import jitted\n@jitted\ndef f(x):\n    return x + {plus}\n")
-        command = [sys.executable, "-c", "from offline.caller import g; print(g(1.0))"]
-        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-        found.append(float(done.stdout))
+        found.append(float(printed_by("from offline.caller import g; print(g(1.0))", tmp_path)))
     assert found == [2.0, 3.0]
+
+
+def test_caches_that_nobody_used_for_long_are_removed(tmp_path: Path) -> None:
+    """Only what is a cache by its name, and only after thirty days; using one counts, though it is but read."""
+    made_package(tmp_path)
+    caches = tmp_path / "caches"
+    folders = {name: caches / name for name in ("solver-" + "0" * 16, "solver-" + "1" * 16, "solver-mine", "other")}
+    for folder in folders.values():
+        (folder / "inside").mkdir(parents=True)
+        (folder / "inside" / "f.nbi").write_bytes(b"compiled")
+    program = "import numba, offline.jit; print(numba.config.CACHE_DIR)"
+    used = Path(printed_by(program, tmp_path, NUMBA_CACHE_DIR=str(caches)).strip())
+    day_s, now_s = 86_400.0, time.time()
+    for folder, age in zip((*folders.values(), used), (31.0, 29.0, 31.0, 31.0, 31.0), strict=True):
+        os.utime(folder, (now_s - age * day_s, now_s - age * day_s))
+    (caches / ("solver-" + "2" * 16)).symlink_to(folders["other"])
+    printed_by(program, tmp_path, NUMBA_CACHE_DIR=str(caches))
+    kept = sorted(path.name for path in caches.iterdir())
+    assert kept == sorted(["solver-" + "1" * 16, "solver-" + "2" * 16, "solver-mine", "other", used.name])
+    assert (folders["other"] / "inside" / "f.nbi").exists()
+    assert used.stat().st_mtime > now_s - day_s
