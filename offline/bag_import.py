@@ -84,7 +84,9 @@ def _odometry(
     stamps_ns = np.array([stamp for stamp, _ in content.odometry], dtype=np.int64)
     messages = [message for _, message in content.odometry]
     if chosen.odometry.msgtype != JOINTS:
-        return odometry_readings(where, stamps_ns, messages, track_m)
+        readings, distance_m, said = odometry_readings(where, stamps_ns, messages, track_m)
+        content.remarks.append(said)
+        return readings, distance_m
     joints = wheel_joints(path, chosen.odometry.name, messages, bag_options)
     content.remarks.append(f"wheels: joints {joints[0]} and {joints[1]}")
     has_both = np.array([set(joints) <= set(message.name) for message in messages])

@@ -12,17 +12,19 @@ from calib.arrays import FloatArray, IntArray
 from offline.bag_topics import BagOptions
 from offline.errors import OfflineError
 from offline.import_forms import MAX_WHEEL_SPEED_M_S, WheelScale
+from offline.step_covariance import growth
 from offline.stretches import wheel_distances
 from onboard.messages import PlanarOdometry
 
 # A jump of the path is told from a fast drive by more than one reading's worth of crowded stamps.
 _BURST_M: Final = 0.5
+_PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and the turn about z of ROS's six
 
 
 def odometry_readings(
     where: str, stamps_ns: IntArray, messages: Sequence[Any], track_m: float
-) -> tuple[list[PlanarOdometry], float]:
-    """Readings from nav_msgs/Odometry, and the metres driven.
+) -> tuple[list[PlanarOdometry], float, str]:
+    """Readings from nav_msgs/Odometry, the metres driven, and what a person should know.
 
     Args:
         where: names bag and topic in errors.
@@ -46,13 +48,19 @@ def odometry_readings(
         PlanarOdometry(stamp_ns=stamp_ns, pose=PlanarOdometry.PoseInOdom(x_m=x, y_m=y, theta_rad=theta))
         for stamp_ns, (x, y, theta) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
     ]
-    return readings, _driven_m(left_m, right_m)
+    covariances = np.array([np.reshape(message.pose.covariance, (6, 6))[_PLANAR] for message in messages])
+    steps, told = growth(poses, covariances)
+    if steps is not None:
+        for reading, step in zip(readings, steps, strict=True):
+            reading.covariance.extend(step.ravel().tolist())
+    said = f"covariances of the odometry {told}{'' if steps is not None else '; ignored, the noise model tells'}"
+    return readings, _driven_m(left_m, right_m), said
 
 
 def joint_readings(
     where: str, stamps_ns: IntArray, messages: Sequence[Any], joints: tuple[str, str], scale: WheelScale
 ) -> tuple[list[PlanarOdometry], float]:
-    """Readings from the positions of two joints, as `odometry_readings`.
+    """Readings from the positions of two joints, and the metres driven.
 
     Args:
         where: names bag and topic in errors.

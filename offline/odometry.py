@@ -43,12 +43,15 @@ class WheelTrack:
         stamps_ns: (N,) strictly increasing.
         left_m, right_m: (N,) cumulative, by the nominal radii.
         quantum_m: distance of one encoder tick; 0 where unknown.
+        covariance: (N, 3, 3) of the right tangent of the step that ends at each reading; NaN where the noise model
+            tells, None where it tells for all.
     """
 
     stamps_ns: IntArray
     left_m: FloatArray
     right_m: FloatArray
     quantum_m: float = 0.0
+    covariance: FloatArray | None = None
 
     def at(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Cumulative (left_m, right_m) at other times: speeds are constant between readings."""
@@ -140,10 +143,15 @@ def compose_odometry(
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
     net_turn_rad = _net_turn(right_m - left_m, duration_s, step_of_piece) / track_m
     unit, in_gap = _piece_covariances(0.5 * (left_m + right_m), net_turn_rad, duration_s)
+    known = _given(track, grid_ns)
+    is_given = np.isfinite(known).all((-1, -2))
+    unit[:, is_given] = 0.0
+    known[~is_given] = 0.0
     parts = CovarianceParts(
         ODOMETRY_NOISE,
         np.stack([_summed(_carried(to_step_end, each), ends) for each in unit]),
-        _summed(_carried(to_step_end, in_gap), ends) + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+        _summed(_carried(to_step_end, in_gap + known), ends)
+        + np.diag(_quantisation_variance(track.quantum_m, track_m)),
     )
     tangent = se2.right_tangent_from_coordinates(pieces)
     jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
@@ -168,6 +176,15 @@ def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
 def _carried(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
     carried: FloatArray = to_step_end @ covariance @ to_step_end.swapaxes(-1, -2)
     return carried
+
+
+def _given(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
+    """(N, 3, 3) covariances of pieces as the readings have them, shared out by duration; NaN where they have none."""
+    if track.covariance is None:
+        return np.full((len(grid_ns) - 1, 3, 3), np.nan)
+    reading = np.searchsorted(track.stamps_ns, grid_ns[1:])
+    share = np.diff(grid_ns) / (track.stamps_ns[reading] - track.stamps_ns[reading - 1])
+    return np.asarray(share[:, None, None] * track.covariance[reading])
 
 
 def _net_turn(difference_m: FloatArray, duration_s: FloatArray, step_of_piece: IntArray) -> FloatArray:

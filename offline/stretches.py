@@ -12,6 +12,7 @@ from calib.words import counted
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
 from offline.plausible import check_numbers, check_speed
+from offline.step_covariance import given_covariances
 from onboard.messages import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
@@ -96,7 +97,11 @@ def _imported_stretch(
         warnings.append(f"{counted(dropped, 'odometry reading')} not later than the one before; left out")
     keep = table[:, 1]
     check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
-    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep])], warnings
+    covariance, n_bad = given_covariances(readings)
+    if n_bad:
+        warnings.append(f"{counted(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
+    given = covariance[keep] if covariance is not None else None
+    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
 
 
 def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:

@@ -18,6 +18,7 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from calib import wheels
+from calib.arrays import FloatArray
 from calib.camera_model import CameraModel
 from calib.robot import Mount
 from offline.bag_definitions import DEFINITIONS
@@ -157,14 +158,21 @@ class BagOfLog:
         late_ns = 5_000_000 if msgtype in ("nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState") else 90_000_000
         self.sent.append(Sent(topic, msgtype, stamp_ns + late_ns, fields))
 
-    def odometry(self, topic: str = "/odom", **also: Any) -> "BagOfLog":
-        """nav_msgs/Odometry from the wheels, starting somewhere in odom."""
-        track, track_m = self.track, self.run.robot.wheels.track_m
-        left, right = np.diff(track.left_m), np.diff(track.right_m)
-        poses = chained(wheels.advance(left, right, track_m), np.array([3.0, -2.0, 2.5]))
-        for stamp, (x, y, theta) in zip(track.stamps_ns.tolist(), poses.tolist(), strict=True):
+    @property
+    def poses(self) -> FloatArray:
+        """(N, 3) by the wheels, starting somewhere in odom."""
+        left, right = np.diff(self.track.left_m), np.diff(self.track.right_m)
+        return chained(wheels.advance(left, right, self.run.robot.wheels.track_m), np.array([3.0, -2.0, 2.5]))
+
+    def odometry(self, topic: str = "/odom", covariances: FloatArray | None = None) -> "BagOfLog":
+        """nav_msgs/Odometry from the wheels; covariances (N, 3, 3) of (x, y, yaw)."""
+        for number, (stamp, (x, y, theta)) in enumerate(zip(self.track.stamps_ns.tolist(), self.poses, strict=True)):
             pose = {"position": xyz([x, y, 0.0]), "orientation": xyzw(Rotation.from_euler("z", theta))}
-            fields = {"header": header(stamp, ODOM), "child_frame_id": BASE, "pose": {"pose": pose, **also}}
+            covariance = np.diag([0.0, 0.0, 1e6, 1e6, 1e6, 0.0]) if covariances is not None else np.zeros((6, 6))
+            if covariances is not None:
+                covariance[np.ix_([0, 1, 5], [0, 1, 5])] = covariances[number]
+            with_covariance = {"pose": pose, "covariance": covariance.ravel()}
+            fields = {"header": header(stamp, ODOM), "child_frame_id": BASE, "pose": with_covariance}
             self.add(topic, "nav_msgs/msg/Odometry", stamp, fields)
         return self
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.arrays import FloatArray
 from calib.camera_model import CameraModel
 from offline.bag_import import import_bag
 from offline.bag_topics import BagOptions
@@ -17,10 +18,11 @@ from offline.result import MapResult
 from offline.run import load_run
 from onboard.log_reader import read_log
 from onboard.log_writer import LogWriter
-from onboard.messages import RunInfo, TagDetections, TagObservation, TagObservations
+from onboard.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
 from onboard.tag_detector import TagDetector
 from tests.made_bags import BagOfLog, without_definitions
 from tests.made_drives import CAMERA, START_NS, MadeTag, S, made_drive, made_robot, picture_stamps, write_drive
+from tests.made_steps import accumulated, covariances_of_steps
 from tests.tag_pictures import draw_tag
 
 HALL = [
@@ -157,6 +159,38 @@ def test_a_bag_with_tags_in_tf_gives_the_map_of_its_log(tmp_path: Path, bare_pos
     bag = BagOfLog.of(bare_position_log).mount().odometry().tag_transforms().write(tmp_path / "drive")
     report = imported(bag, tmp_path, bag_options=BagOptions())
     assert_same_map(map_logs([bare_position_log]), map_logs([report.run_folder]))
+
+
+def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: Path, corner_map: MapResult) -> None:
+    """They grow by a known covariance with each step, and the map is that of a log which holds these."""
+    made = BagOfLog.of(corner_log)
+    steps = covariances_of_steps(made.poses)
+    bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulated(made.poses, steps))
+    report = imported(bag.write(tmp_path / "drive"), tmp_path)
+    assert "covariances of the odometry are used: by how much each step adds to those of the pose" in report.remarks
+    expected = map_logs([_with_covariances(corner_log, made.poses, steps, tmp_path / "expected")])
+    found = map_logs([report.run_folder])
+    assert_same_map(expected, found)
+    (plain,), (given,) = corner_map.components, found.components
+    assert not np.allclose(plain.tags[0].covariance, given.tags[0].covariance, rtol=0.05)
+
+
+def _with_covariances(log: Path, poses: FloatArray, steps: FloatArray, folder: Path) -> Path:
+    """The log with `/odometry` for its `/wheels`."""
+    entries = list(read_log(log))
+    head = {each.topic: each.message for each in entries if each.topic in ("/run", "/camera/calibration", "/tf")}
+    readings = iter(zip(poses.tolist(), steps, strict=True))
+    with LogWriter(folder, head, START_NS, durable=False) as writer:
+        for each in entries:
+            stamp_ns = each.publish_time_ns
+            if each.topic == "/wheels":
+                (x, y, theta), step = next(readings)
+                pose = PlanarOdometry.PoseInOdom(x_m=x, y_m=y, theta_rad=theta)
+                message = PlanarOdometry(stamp_ns=stamp_ns, pose=pose, covariance=step.ravel().tolist())
+                writer.write("/odometry", message, stamp_ns, stamp_ns)
+            elif each.topic == "/tags/detections":
+                writer.write(each.topic, each.message, stamp_ns, stamp_ns)
+    return folder
 
 
 @pytest.mark.parametrize("form", ["mono8", "bgr8", "png"])
