@@ -99,9 +99,12 @@ class _Judge:
         self.frames = a.frame_covariance, b.frame_covariance
 
     def verdict(self) -> Alignment | None:
-        found = sorted(((self.evidence(each), each) for each in explanations(self.fit)), key=lambda f: -f[0])
-        if not found:
+        explained = explanations(self.fit)
+        if not explained:
             return None
+        if not any(self._agrees(each) for each in explained):
+            self.placement = None  # a slip of the tape or of the pen: it tells none of them from the others
+        found = sorted(((self.evidence(each), each) for each in explained), key=lambda f: -f[0])
         evidence, best = self._united(found)
         rivals = [each for its, each in found if self._is_rival(its, each, evidence, best)]
         told = tuple(self._told(rival, (), is_sure=False) for rival in rivals)
@@ -136,13 +139,24 @@ class _Judge:
         """Log likelihood of the measured placement over that of it being anywhere."""
         if self.placement is None:
             return 0.0
-        back = se2.adjoint(se2.inverse(self.placement.T_a_b))
-        covariance = self.placement.covariance + self._covariance(explanation)
-        covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
-        off = se2.log(se2.between(self.placement.T_a_b, explanation.T_a_b))
+        off, covariance = self._from_placement(self.placement, explanation)
         square = float(off @ np.linalg.solve(covariance, off))
         log_determinant = float(np.linalg.slogdet(2.0 * pi * covariance)[1])
         return -0.5 * (square + log_determinant) + log(2.0 * pi * _AREA_M2)
+
+    def _agrees(self, explanation: Explanation) -> bool:
+        """Whether chance explains how far from the measured placement it puts map b."""
+        if self.placement is None:
+            return True
+        off, covariance = self._from_placement(self.placement, explanation)
+        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
+
+    def _from_placement(self, placement: Placement, explanation: Explanation) -> tuple[FloatArray, FloatArray]:
+        """How far off an explanation is (3,), and the covariance of that."""
+        back = se2.adjoint(se2.inverse(placement.T_a_b))
+        covariance = placement.covariance + self._covariance(explanation)
+        covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
+        return se2.log(se2.between(placement.T_a_b, explanation.T_a_b)), covariance
 
     def _is_rival(self, evidence: float, other: Explanation, best_evidence: float, best: Explanation) -> bool:
         if evidence > best_evidence - MARGIN_NATS and not self._is_same_place(other, best):

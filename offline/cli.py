@@ -108,6 +108,18 @@ def map_command(
         typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
     ] = None,
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters; the others keep defaults.")] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A run's start, as measured in the map: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad; "
+            "repeatable.",
+            metavar="START",
+        ),
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(help="Between two runs' starts or tags, as measured: A,B=metres,sigma_m; repeatable."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
@@ -120,7 +132,8 @@ def map_command(
     """
     from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
-    result, costs = make_map(MapOptions(logs, output, robot or (), noise, overwrite))
+    options = MapOptions(logs, output, robot or (), noise, overwrite, start or (), distance or ())
+    result, costs = make_map(options)
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))
     else:

@@ -9,6 +9,8 @@ from calib.arrays import FloatArray
 from offline.factors import State
 from offline.graph import Graph, Parameter, build_graph
 from offline.local_map import LocalMap
+from offline.measured import Measurements
+from offline.measured_map import with_measurements
 from offline.merge import Group
 from offline.result import CalibrationResult, Component, RunResult, StartToStart, TagResult
 from offline.run import TagKey
@@ -16,12 +18,15 @@ from offline.solver import Solution, solve
 from offline.stages import Stages
 
 
-def solve_global_map(maps: Sequence[LocalMap], group: Group, stages: Stages) -> tuple[Graph, Solution]:
+def solve_global_map(
+    maps: Sequence[LocalMap], group: Group, stages: Stages, measurements: Measurements | None = None
+) -> tuple[Graph, Solution]:
     """Solves the members of a group together, from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
     with stages.stage("building the graph"):
         graph = build_graph([member.chain for member in members])
-        if len(members) == 1:
+        graph = with_measurements(graph, measurements) if measurements else graph
+        if len(members) == 1 and not len(graph.problem.measured):
             return graph, members[0].solution
         poses = np.concatenate(
             [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]

@@ -17,6 +17,7 @@ from scipy import stats
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import Columns, State, stacked
+from offline.measured_factors import NOTHING_MEASURED
 from offline.odometry import chained
 from offline.robust import losses_and_weights
 from offline.shared_errors import fit_shared_errors
@@ -112,7 +113,11 @@ class Windows:
 
 
 def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows:
-    """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over."""
+    """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
+
+    What somebody measured is left out on both sides: it is held against the map on its own.
+    """
+    problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = in_windows(problem)
     state = _dead_reckoned(problem, apart)
     factors, redundancy = np.ones(2), np.zeros(2)

@@ -63,7 +63,17 @@ class Graph:
 
     def wheel_calibration(self, state: State, chain: int) -> FloatArray:
         """(3,) wheel parameters of one chain's robot."""
-        return state.calibration[_indices(self.parameters, _wheel_parameters(self.chains[chain].run.robot))]
+        return state.calibration[self.wheel_parameters(chain)]
+
+    def wheel_parameters(self, chain: int) -> IntArray:
+        """(3,) indices of one chain's WHEEL_PARAMETERS."""
+        return _indices(self.parameters, _wheel_parameters(self.chains[chain].run.robot))
+
+    def tag_scales(self, chain: int) -> IntArray:
+        """Indices of the scales of all batches of tags that one chain read."""
+        owner = self.chains[chain]
+        scales = sorted({_scale_parameter(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
+        return _indices(self.parameters, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
         """Starting values from poses (P, 3) and what is known; other tags start where their readings put them."""

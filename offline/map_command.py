@@ -14,10 +14,11 @@ from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
+from offline.measured import TapeOptions
 from offline.picture import write_picture
 from offline.pipeline import map_logs
 from offline.progress import progress_bar
-from offline.result import AlignmentResult, Component, MapResult
+from offline.result import AlignmentResult, Component, MapResult, MeasurementResult, MetreResult
 from offline.run import RobotFile, read_robot_file
 from offline.stages import StageCost, Stages
 from onboard.log_reader import find_logs
@@ -32,6 +33,8 @@ class MapOptions:
     robots: Sequence[Path] = ()
     noise: Path | None = None
     overwrite: bool = False
+    starts: Sequence[str] = ()
+    distances: Sequence[str] = ()
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -49,7 +52,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     noise = read_noise_yaml(options.noise) if options.noise else None
     with compilation_announced(_say), progress_bar() as show:
         stages = Stages(show)
-        result = map_logs(logs, robot_files, noise, stages)
+        result = map_logs(logs, robot_files, noise, stages, TapeOptions(options.starts, options.distances))
         with folder_written_whole(options.output) as folder:
             _write_files(result, folder, options.output, stages)
     return result, stages.costs
@@ -96,6 +99,8 @@ def summary(result: MapResult, output: Path) -> list[str]:
         for component in result.components
         for pair in component.start_to_start
     ]
+    lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
+    lines += [_metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     lines += [f"warning: {warning}" for warning in result.warnings]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
 
@@ -139,6 +144,24 @@ def _alignment_line(alignment: AlignmentResult) -> str:
         f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
         + ("" if alignment.is_sure else "; not sure, so not used")
     )
+
+
+def _measurement_line(measurement: MeasurementResult) -> str:
+    """What the map makes of it."""
+    what = f"{measurement.a} to {measurement.b}" if measurement.kind == "distance" else f"start of {measurement.b}"
+    values = [] if measurement.in_map is None else measurement.in_map.tolist()
+    figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
+    off = "nothing else says" if measurement.off_sigmas is None else f"all else is off by {measurement.off_sigmas:.1f}"
+    unit = "" if measurement.off_sigmas is None else " sigma"
+    return f"measured {what}: {figures} in the map ({off}{unit})"
+
+
+def _metre_line(metre: MetreResult, *, several: bool) -> str:
+    """What the length of a metre rests on."""
+    of = f" of component {metre.component}" if several else ""
+    shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)
+    held = ", ".join(f"{kind} {100.0 * share:.0f} %" for share, kind in shares)
+    return f"scale{of}: known to {100.0 * metre.sigma:.2f} %, held by {held}"
 
 
 def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> None:

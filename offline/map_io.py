@@ -21,8 +21,11 @@ from offline.errors import OfflineError
 from offline.result import (
     AlignmentResult,
     CalibrationResult,
+    CheckResult,
     Component,
     MapResult,
+    MeasurementResult,
+    MetreResult,
     RivalResult,
     RunResult,
     StartToStart,
@@ -88,6 +91,9 @@ def read_map(folder: Path) -> MapResult:
             alignments=tuple(_alignment(entry) for entry in data["alignments"]),
             noise=NoiseParameters.model_validate(data["noise"]),
             calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
+            measurements=tuple(_measurement(entry) for entry in data["measurements"]),
+            checks=tuple(_check(entry) for entry in data["checks"]),
+            metres=tuple(MetreResult(**entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
         )
     except OSError as error:
@@ -121,6 +127,9 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         ],
         "noise": result.noise.model_dump(),
         "calibration": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.calibration],
+        "measurements": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.measurements],
+        "checks": [{"sigmas": _plain(entry.sigmas)} | vars(entry) for entry in result.checks],
+        "metres": [vars(entry) for entry in result.metres],
         "suspect_tags": [],
         "warnings": list(result.warnings),
     }
@@ -325,6 +334,16 @@ def _alignment(entry: dict[str, Any]) -> AlignmentResult:
         is_sure=entry["is_sure"],
         rivals=tuple(RivalResult(_array(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]),
     )
+
+
+def _measurement(entry: dict[str, Any]) -> MeasurementResult:
+    in_map = entry["in_map"]
+    arrays = {"measured": _array(entry["measured"]), "sigma": _array(entry["sigma"])}
+    return MeasurementResult(**entry | arrays | {"in_map": None if in_map is None else _array(in_map)})
+
+
+def _check(entry: dict[str, Any]) -> CheckResult:
+    return CheckResult(**{name: value for name, value in entry.items() if name != "sigmas"})
 
 
 def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:

@@ -66,6 +66,55 @@ class MeasuredDistance:
     sigma_m: float
 
 
+@dataclass(frozen=True)
+class TapeOptions:
+    """What stands on the command line: the texts of --start and of --distance."""
+
+    starts: Sequence[str] = ()
+    distances: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What a person measured.
+
+    Attributes:
+        frame: the run in whose start's frame starts are.
+    """
+
+    frame: str
+    starts: tuple[MeasuredStart, ...] = ()
+    distances: tuple[MeasuredDistance, ...] = ()
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.starts) + len(self.distances)
+
+    def placements(self, runs: Sequence[str]) -> dict[tuple[int, int], Placement]:
+        """What starts say of pairs of runs, by their indices, for `merge.merge`."""
+        index = {name: i for i, name in enumerate(runs)}
+        return {(index[self.frame], index[start.run]): start.placement for start in self.starts}
+
+
+def parse_measurements(options: TapeOptions, runs: Sequence[str], tags: Sequence[TagKey]) -> Measurements:
+    """All that is on the command line.
+
+    Args:
+        options: what was given.
+        runs: names of the runs; the start of the first is the frame.
+        tags: those that any run saw.
+
+    Raises:
+        OfflineError: one line that says what is wrong and what to write.
+    """
+    starts = tuple(parse_start(text, runs) for text in options.starts)
+    names = [start.run for start in starts]
+    for name in names:
+        if names.count(name) > 1:
+            raise OfflineError(f"--start: the start of {name} is given twice; leave one out")
+    return Measurements(runs[0], starts, tuple(parse_distance(text, runs, tags) for text in options.distances))
+
+
 def parse_start(text: str, runs: Sequence[str]) -> MeasuredStart:
     """From `RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad`.
 
@@ -106,21 +155,6 @@ def parse_distance(text: str, runs: Sequence[str], tags: Sequence[TagKey]) -> Me
         raise OfflineError(f"{option}: the distance is {distance_m:g} m, must be 0 or more")
     _check_sigmas(option, {"sigma_m": sigma_m})
     return MeasuredDistance(ends[0], ends[1], distance_m, sigma_m)
-
-
-def placements(starts: Sequence[MeasuredStart], runs: Sequence[str]) -> dict[tuple[int, int], Placement]:
-    """What starts say of pairs of runs, by their indices, for `merge.merge`.
-
-    Raises:
-        OfflineError: a run's start is given twice.
-    """
-    found: dict[tuple[int, int], Placement] = {}
-    for start in starts:
-        pair = (0, list(runs).index(start.run))
-        if pair in found:
-            raise OfflineError(f"--start: the start of {start.run} is given twice; leave one out")
-        found[pair] = start.placement
-    return found
 
 
 def _split(option: str, text: str, form: str, n: int) -> tuple[str, list[float]]:

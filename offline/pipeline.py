@@ -2,25 +2,32 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
 
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
+from offline.checks import COMPARED, check_warnings, checks_of, metre_of
 from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
 from offline.local_map import LocalMap, solve_local_map
+from offline.measured import Measurements, TapeOptions, parse_measurements
+from offline.measured_map import judged, measurement_warnings, unused
 from offline.merge import Group, merge
 from offline.merge_report import alignment_results, merge_warnings
 from offline.observations import check_tag_sizes
-from offline.result import CalibrationResult, Component, MapResult
+from offline.result import (
+    MAX_SIGMAS,
+    CalibrationResult,
+    CheckResult,
+    Component,
+    MapResult,
+    MeasurementResult,
+    MetreResult,
+)
 from offline.run import RobotFile, Run, load_run
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.weak_parts import weak_parts
-
-# A good calibration goes beyond this once in 16,000 times.
-MAX_PRIOR_SIGMAS: Final = 4.0
 
 
 def map_logs(
@@ -28,6 +35,7 @@ def map_logs(
     robot_files: Mapping[str, RobotFile] | None = None,
     noise: NoiseParameters | None = None,
     stages: Stages | None = None,
+    tape: TapeOptions | None = None,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
 
@@ -36,6 +44,7 @@ def map_logs(
         robot_files: calibrations by robot id that replace those in the logs.
         noise: sigmas of wheels and readings; defaults where None.
         stages: told what is being done, and keeps what it took.
+        tape: what somebody measured.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -53,10 +62,10 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return map_runs(runs, noise or NoiseParameters(), stages)
+    return map_runs(runs, noise or NoiseParameters(), stages, tape or TapeOptions())
 
 
-def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> MapResult:
+def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, tape: TapeOptions) -> MapResult:
     """As `map_logs`, from runs already read."""
     _check_distinct(runs)
     check_tag_sizes(runs)
@@ -65,33 +74,49 @@ def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> Map
         for run in runs:
             chains += chains_of(run, noise)
             done()
+    measurements = _measurements(tape, runs, chains)
     maps = []
     with stages.stage("local maps", len(chains)) as done:
         for chain in chains:
             maps.append(solve_local_map(chain))
             done()
     with stages.stage("aligning local maps"):
-        merged = merge(maps)
+        merged = merge(maps, measurements.placements([chain.name for chain in chains]))
     components: list[Component] = []
     calibration: list[CalibrationResult] = []
+    measured: list[MeasurementResult] = []
+    checks: list[CheckResult] = []
+    metres: list[MetreResult] = []
     warnings = [w for run in runs for w in run.warnings] + [w for chain in chains for w in chain.warnings]
     for i, members in enumerate(merged.groups):
-        graph, solution = solve_global_map(maps, members, stages)
+        graph, solution = solve_global_map(maps, members, stages, measurements)
         with stages.stage("covariances"):
             components.append(component_of(graph, solution))
             calibration.extend(calibration_of(graph, solution, i))
+            measured += judged(graph, solution, measurements, i)
+            checks += checks_of(graph, solution, i)
+            metres.append(metre_of(graph, i))
         if not solution.converged:
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
         warnings += weak_parts(graph, solution) + _contradictions(maps, members, i, solution)
-    warnings += _calibration_warnings(calibration)
+    measured += unused(measurements, measured)
+    warnings += measurement_warnings(measured) + check_warnings(checks) + _calibration_warnings(calibration, checks)
     warnings += _chain_warnings(chains) + merge_warnings(maps, merged)
     return MapResult(
         components=tuple(components),
         alignments=alignment_results(maps, merged),
         noise=noise,
         calibration=tuple(calibration),
+        measurements=tuple(measured),
+        checks=tuple(checks),
+        metres=tuple(metres),
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _measurements(tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain]) -> Measurements:
+    tags = sorted({tag for chain in chains for tag in chain.tags})
+    return parse_measurements(tape, [run.name for run in runs], tags)
 
 
 def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, solution: Solution) -> list[str]:
@@ -115,13 +140,14 @@ def _check_distinct(runs: Sequence[Run]) -> None:
         seen[run.name] = run
 
 
-def _calibration_warnings(calibration: Sequence[CalibrationResult]) -> list[str]:
-    """Corrections that what was known beforehand makes all but impossible."""
+def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
+    """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
+    told = {(check.component, name) for check in checks if check.contradicts for name in COMPARED[check.name]}
     return [
         f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
         "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
         for entry in calibration
-        if abs(entry.value) > MAX_PRIOR_SIGMAS * entry.prior_sigma
+        if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.name) not in told
     ]
 
 

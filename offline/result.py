@@ -6,9 +6,15 @@ A run with unbroken odometry is one chain; where the odometry broke, a run has s
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
+
+import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
+
+# What is right goes beyond this once in 16,000 times.
+MAX_SIGMAS: Final = 4.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,55 @@ class CalibrationResult:
 
 
 @dataclass(frozen=True)
+class MeasurementResult:
+    """What a person measured, and what the map makes of it."""
+
+    kind: str  # start or distance
+    a: str  # the run whose start is the frame, or one end: a run, or family:id of a tag
+    b: str  # the run, or the other end
+    measured: FloatArray  # (3,) x_m, y_m, theta_rad in map, or (1,) metres
+    sigma: FloatArray  # likewise
+    component: int | None  # in which it was used; None: its ends are in different components
+    in_map: FloatArray | None = None  # (3,) or (1,) as the map has it in the end
+    residual_sigmas: float | None = None  # length of what is left over, whitened
+    # How far it lies from what all else says, in sigmas of the difference; None where nothing else says anything.
+    off_sigmas: float | None = None
+    contradicts: bool = False  # by more than chance allows
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Two ways to know one thing, held against each other: wheels and tags."""
+
+    name: str  # scale: how much longer a metre by the tags is than one by the wheels; turn: likewise a full turn
+    component: int
+    robot_id: str
+    batch: str | None  # of tags; None for a turn, which needs no sizes
+    value: float  # as a share, by readings alone: without the priors
+    sigma: float
+    prior_sigma: float  # how far the two may differ by what robot.yaml says
+
+    @property
+    def sigmas(self) -> float:
+        """How far they differ, in sigmas of what readings and robot.yaml allow."""
+        return abs(self.value) / float(np.hypot(self.sigma, self.prior_sigma))
+
+    @property
+    def contradicts(self) -> bool:
+        """By more than chance allows."""
+        return self.sigmas > MAX_SIGMAS
+
+
+@dataclass(frozen=True)
+class MetreResult:
+    """What holds the length of a metre in a component: wheels, tags and all places could be stretched together."""
+
+    component: int
+    sigma: float  # relative
+    shares: dict[str, float]  # of wheels, track, tags, mount, distances, starts; they add up to 1
+
+
+@dataclass(frozen=True)
 class MapResult:
     """Everything that one `map` command found."""
 
@@ -133,6 +188,9 @@ class MapResult:
     alignments: tuple[AlignmentResult, ...]
     noise: NoiseParameters
     calibration: tuple[CalibrationResult, ...] = ()
+    measurements: tuple[MeasurementResult, ...] = ()
+    checks: tuple[CheckResult, ...] = ()
+    metres: tuple[MetreResult, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
     @property

@@ -10,8 +10,11 @@ from calib.noise import NoiseParameters
 from offline.result import (
     AlignmentResult,
     CalibrationResult,
+    CheckResult,
     Component,
     MapResult,
+    MeasurementResult,
+    MetreResult,
     RunResult,
     StartToStart,
     TagResult,
@@ -66,6 +69,14 @@ def made_map(*components: Component) -> MapResult:
         alignments=(AlignmentResult("red_one", "blue_two", START_B, 2, 2, 0.03, (("tag36h11", 9),)),),
         noise=NoiseParameters(),
         calibration=(CalibrationResult("red", "wheel_scale", 0, 0.001, 0.002, 0.005),),
+        measurements=(
+            MeasurementResult(
+                "start", "red_one", "blue_two", START_B, np.full(3, 0.1), 0, START_B + 0.01, 0.2, 0.5, contradicts=False
+            ),
+            MeasurementResult("distance", "red_one", "tag36h11:3", np.array([4.1]), np.array([0.01]), None),
+        ),
+        checks=(CheckResult("turn", 0, "red", None, 0.01, 0.002, 0.01),),
+        metres=(MetreResult(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
         warnings=("tag 9 lies elsewhere",),
     )
 

@@ -7,7 +7,14 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.errors import OfflineError
 from offline.factors import Columns, State, whitening
-from offline.measured import MeasuredDistance, parse_distance, parse_start, placements
+from offline.measured import (
+    MeasuredDistance,
+    Measurements,
+    TapeOptions,
+    parse_distance,
+    parse_measurements,
+    parse_start,
+)
 from offline.measured_factors import DistanceFactors, StartFactors
 from offline.run import TagKey
 
@@ -26,7 +33,7 @@ def test_a_start_is_read_with_its_sigmas() -> None:
 def test_sigmas_are_along_the_axes_of_the_map() -> None:
     start = parse_start(f"b_one=5,5,{np.pi / 2},0.3,0.1,0.02", RUNS)
     np.testing.assert_allclose(start.placement.covariance, np.diag([0.1, 0.3, 0.02]) ** 2, atol=1e-12)
-    (pair,) = placements([start], RUNS).items()
+    (pair,) = Measurements("a_one", (start,)).placements(RUNS).items()
     assert pair[0] == (0, 1)
     back = pair[1].inverse().inverse()
     np.testing.assert_allclose(back.covariance, start.placement.covariance, atol=1e-12)
@@ -52,9 +59,8 @@ def test_a_start_that_cannot_be_is_refused_in_one_line(text: str, told: str) -> 
 
 
 def test_a_start_given_twice_is_refused() -> None:
-    start = parse_start("b_one=1,2,3,1,1,1", RUNS)
     with pytest.raises(OfflineError, match="given twice"):
-        placements([start, start], RUNS)
+        parse_measurements(TapeOptions(["b_one=1,2,3,1,1,1"] * 2), RUNS, TAGS)
 
 
 def test_distances_are_between_starts_or_tags() -> None:

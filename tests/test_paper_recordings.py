@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -47,8 +48,17 @@ def test_readme_quotes_the_distance_found(merged: dict[str, list[dict[str, float
     assert float(quoted[3]) == MEASURED_BY_HAND_M
 
 
-def test_that_wheels_and_tags_disagree_about_the_metre_is_said(merged: dict[str, list[str]]) -> None:
-    assert any("tag_scale" in warning and "contradict" in warning for warning in merged["warnings"])
+def test_that_wheels_and_tags_disagree_about_the_metre_is_said_with_its_sigma(
+    merged: dict[str, list[Any]],
+) -> None:
+    scales = [check for check in merged["checks"] if check["name"] == "scale"]
+    assert [check["robot_id"] for check in scales] == ["hallway", "loop"]
+    for check in scales:
+        assert check["value"] > 0.0
+        assert check["sigmas"] > 4.0
+        figures = f"{100.0 * check['value']:.2f} % (sigma {100.0 * check['sigma']:.2f} %) longer by the wheels of"
+        (said,) = [warning for warning in merged["warnings"] if f"{figures} {check['robot_id']}" in warning]
+        assert "outer edge of the black border" in said
 
 
 def _succeeds(*words: object) -> None:
