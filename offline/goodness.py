@@ -131,7 +131,7 @@ def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows
     n_conditions = _freedom(problem) - _freedom(apart)
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     solution = solve(_scaled(apart, *factors), state, losses=losses)
-    if n_conditions:
+    if n_conditions and len(problem.readings.tag):
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
         sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
