@@ -1,8 +1,8 @@
 """Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
 
 Linearise all factors, eliminate the chains, meet in the border, substitute back: see `arrowhead`. Dellaert and Kaess,
-"Square Root SAM" (2006); step rule after Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems"
-(2004). Readings carry Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
+"Square Root SAM" (2006). How a step is taken stands in `step_taken`, what comes of it in `damping`. Readings carry
+Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
 """
 
 from dataclasses import dataclass, field
@@ -16,6 +16,7 @@ from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
 from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_build import build_arrowhead, build_skeleton
+from offline.damping import Damping
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
 from offline.measured_factors import NOTHING_MEASURED, Measured
@@ -27,19 +28,14 @@ from offline.tied_down import Untied, untied_parts
 HUBER_THRESHOLD: Final = 3.0
 
 _MAX_ITERATIONS: Final = 100
-_MAX_REJECTED: Final = 12
 # The cost is in squared sigmas: a step that would lower it by this much less is some 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
 _COST_ROUNDING: Final = 1e-14  # relative
-# Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
-# drive, so the first damping must be tiny to leave such modes free.
-_FIRST_DAMPING: Final = 1e-9
 # Where rounding leaves a matrix without a square root, its diagonal is raised by this share, then by ten times as much
 # until it has one.
 _LEAST_FLOOR: Final = 1e-16
 _MOST_FLOOR: Final = 1e-3
 _SURE: Final = 10.0
-_LEAST_DAMPING: Final = 1e-10  # below it a step is Gauss-Newton's
 
 
 class Losses(NamedTuple):
@@ -219,7 +215,7 @@ def solve(
     state, n_linearised = _relaxed(problem, start, relaxed_steps)
     _, cost = arrowhead.linearise(state, *losses, out=system)
     costs, n_linearised = [cost], n_linearised + 1
-    damping, growth, rejected, floor, rolled = 0.0, 2.0, 0, 0.0, False
+    damping, rolled = Damping(), False
 
     def ended(reason: str, *, converged: bool) -> Solution:
         return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
@@ -228,36 +224,32 @@ def solve(
         return ended("the cost is no number at the start", converged=False)
     for _ in range(_MAX_ITERATIONS):
         try:
-            factorisation, used = _factorised(arrowhead, system, max(damping, floor), rows, threads)
+            factorisation, used = _factorised(arrowhead, system, damping.share, rows, threads)
         except UnderDeterminedError:
             return ended("a variable is in no factor", converged=False)
-        if used > max(damping, floor):
-            damping = floor = used
+        damping.needed(used)
         step = -factorisation.solve_in_order(system.gradient)
-        expected = _expected_decrease(system, step, max(damping, floor))
+        expected = _expected_decrease(system, step, damping.share)
         if expected <= cost_tolerance + relative_tolerance * cost:
             return ended("converged", converged=True)
-        taken = take_step(problem.arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
+        taken = take_step(arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
         n_linearised += taken.n_linearised
-        if taken.cost < cost:
-            expected *= taken.share * (2.0 - taken.share)
-            gain = (cost - taken.cost) / expected
-            state, cost, rolled, rejected, growth = taken.state, taken.cost, taken.rolled, 0, 2.0
-            system, spare = spare, system
-            costs.append(cost)
-            # Where the model is off by a share, the next gradient is that share of this one, what another step could
-            # bring its square. By chance a model is right too early: not for who wants the last digit.
-            left = _SURE * expected * (1.0 - gain) ** 2
-            if relative_tolerance > _COST_ROUNDING and damping <= floor and left <= relative_tolerance * cost:
-                return ended("converged", converged=True)
-            damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
-            damping = damping if damping > _LEAST_DAMPING else 0.0
+        if not taken.cost < cost:
+            damping.step_rejected()
+            if damping.exhausted:
+                return ended("no step lowers the cost", converged=False)
             continue
-        rejected += 1
-        if rejected > _MAX_REJECTED:
-            return ended("no step lowers the cost", converged=False)
-        damping = max(damping * growth, _FIRST_DAMPING)
-        growth *= 2.0
+        expected *= taken.share * (2.0 - taken.share)
+        gain = (cost - taken.cost) / expected
+        state, cost, rolled = taken.state, taken.cost, taken.rolled
+        system, spare = spare, system
+        costs.append(cost)
+        # Where the model is off by a share, the next gradient is that share of this one, what another step could bring
+        # its square. By chance a model is right too early: not for who wants the last digit.
+        left = _SURE * expected * (1.0 - gain) ** 2
+        if relative_tolerance > _COST_ROUNDING and damping.is_least and left <= relative_tolerance * cost:
+            return ended("converged", converged=True)
+        damping.step_taken(gain)
     return ended(f"stopped after {_MAX_ITERATIONS} steps", converged=False)
 
 
