@@ -97,6 +97,8 @@ class CaptureGuide:
         return seen is not None
 
     def _next(self) -> str:
+        if self.enough:
+            return "that is enough"
         return (self.missing or ["show it in some other place or tilt it in some other way"])[0]
 
     def _keep(self, seen: SeenBoard) -> None:

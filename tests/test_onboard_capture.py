@@ -1,6 +1,8 @@
 """Capturing pictures of the board: which are kept, what is said, and what is on the disk afterwards."""
 
 import errno
+import io
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 from calib.board import DEFAULT_BOARD
 from fixtures.devices import PictureFolder
@@ -21,6 +24,7 @@ from onboard import cli
 from onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
 from onboard.capture import Capture
 from onboard.capture_guide import Advice, CaptureGuide
+from onboard.capture_view import CaptureView
 from onboard.clock import RunClock
 from onboard.detection_process import Picture
 from onboard.errors import OnboardError
@@ -64,8 +68,9 @@ def test_it_is_enough_when_nothing_is_missing() -> None:
     guide = CaptureGuide(DEFAULT_BOARD, 12)
     for index, picture in enumerate(rendered()):
         assert not guide.enough
-        taken = shown(guide, [picture] * 3, index * 10_000 * MS)
-        assert taken[-1].keep, (index, taken[-1])
+        taken = shown(guide, [picture] * 3, index * 10_000 * MS)[-1]
+        assert taken.keep, (index, taken)
+        assert (taken.text == "taken; that is enough") == guide.enough
     assert guide.kept == len(good_views())
     assert guide.missing == []
     assert guide.enough
@@ -233,6 +238,21 @@ def test_a_place_that_cannot_be_written_to_costs_only_the_picture_to_look_at(tmp
     taken = Taken(tmp_path, thrice(0, 1))
     assert taken.names == ["0001.png", "0002.png"]
     assert sum("capture.jpg: cannot be written (Is a directory); --picture names" in each for each in taken.said) == 1
+
+
+def test_a_terminal_shows_what_is_missing_and_rings_for_each_picture() -> None:
+    screen = io.StringIO()
+    guide, view = CaptureGuide(DEFAULT_BOARD, 30), CaptureView(Console(file=screen, force_terminal=True, width=120))
+    with view.shown():
+        for index, picture in enumerate([*thrice(0, 1), EMPTY]):
+            view.show(guide.handle_frame(picture, index * STEP_NS), guide)
+    last = screen.getvalue().rpartition("groundsbot capture")[2]
+    assert screen.getvalue().count("\a") == 2
+    assert "2 of 30 pictures" in last
+    assert "no board 7x9-25mm-18mm-5x5_100 in view" in last
+    regions = [re.findall("[■·]", line) for line in last.splitlines() if "·" in line]
+    assert regions == [["■", "■", "·"], ["■", "■", "·"], ["·", "·", "·"]]
+    assert "missing: show the board at the picture's top right" in last
 
 
 ROBOT = """
