@@ -1,0 +1,236 @@
+"""Where the corners of a chessboard are, to hundredths of a pixel: a picture of two edges fitted to what is there.
+
+Around a corner the light is modelled as
+
+    a + b erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2)),
+    l_k(x) = n_k . (x - c) - kappa_k / 2 (t_k . (x - c))^2
+
+two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
+shutter was open. Their bends kappa_k are given: a lens bends lines, and a bend left out moves corners. Whatever makes
+black grow or shrink (too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and
+the corner not at all.
+
+The fit gives each corner's covariance too, from the residuals themselves, and its blur.
+"""
+
+from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from calib.arrays import BoolArray, FloatArray, IntArray
+
+_RADIUS_PX: Final = 6
+_ROUNDS: Final = 15
+_N: Final = 8  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2)
+_ARRIVED_PX: Final = 1e-4
+_FIRST_BLUR_PX: Final = 0.7
+_CLEAR_OF_PX: Final = 1.5  # of the blur of what else is printed
+_FARTHEST_SQUARES: Final = 0.3  # that a corner may lie from where it was thought to be
+_LEAST_CONTRAST: Final = 16.0  # grey levels between black and white: markers are hardly read below
+_ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than two edges
+_MOST_BLUR_SQUARES: Final = 0.25
+_LEAST_PIXELS: Final = 40  # five for each parameter
+
+
+@dataclass(frozen=True)
+class Corners:
+    """N corners in one picture.
+
+    Attributes:
+        ids: (N,) OpenCV's numbers of the board's inner corners.
+        pixels: (N, 2).
+        covariance: (N, 2, 2) px^2, from the light's noise alone.
+        blur_px: (N,) sigma of the edges' blur, the more blurred one's.
+        contrast: (N,) grey levels between white and black.
+    """
+
+    ids: IntArray
+    pixels: FloatArray
+    covariance: FloatArray
+    blur_px: FloatArray
+    contrast: FloatArray
+
+    def where(self, mask: BoolArray) -> "Corners":
+        """Those of the mask."""
+        return Corners(*(getattr(self, field.name)[mask] for field in dataclass_fields(self)))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known around N corners before they are fitted.
+
+    Attributes:
+        pixels: (N, 2) about where they are.
+        squares_px: (N, 2, 2) in its columns, how far one square along the board's x and y leads.
+        white_diagonal: (N,) whether white lies where x and y both grow.
+        bend: (N, 2) curvature (1/px) of the edges along x and along y, see `bends`.
+        clear: how far in squares a white square is clear of its marker.
+    """
+
+    pixels: FloatArray
+    squares_px: FloatArray
+    white_diagonal: BoolArray
+    bend: FloatArray
+    clear: float
+
+
+def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
+    """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
+    inside = np.isfinite(around.pixels).all(axis=1) & np.isfinite(around.squares_px).all(axis=(1, 2))
+    size = np.array(picture.shape[::-1])
+    inside &= ((around.pixels > _RADIUS_PX) & (around.pixels < size - 1 - _RADIUS_PX)).all(axis=1)
+    kept = Surroundings(
+        around.pixels[inside],
+        around.squares_px[inside],
+        around.white_diagonal[inside],
+        around.bend[inside],
+        around.clear,
+    )
+    if not inside.any():
+        none = np.zeros((0, 2))
+        return Corners(ids[:0], none, np.zeros((0, 2, 2)), none[:, 0], none[:, 0])
+    return _Patches(picture, kept).fitted(ids[inside])
+
+
+class _Patches:
+    """The picture around each of N corners, P pixels each."""
+
+    def __init__(self, picture: NDArray[np.uint8], around: Surroundings) -> None:
+        offsets = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
+        dx, dy = (each.ravel() for each in np.meshgrid(offsets, offsets))
+        middle = np.rint(around.pixels).astype(np.int64)
+        columns, rows = middle[:, :1] + dx, middle[:, 1:] + dy
+        self._around = around
+        self._places = np.stack([columns, rows], axis=-1).astype(np.float64)  # (N, P, 2)
+        self._light = picture[rows, columns].astype(np.float64)  # (N, P)
+        self._seen = self._own_squares()
+
+    def _own_squares(self) -> FloatArray:
+        """(N, P) 1.0 where nothing is printed but the corner's own four squares."""
+        around = self._around
+        into_squares = np.linalg.inv(around.squares_px)
+        place = np.abs(np.einsum("nij,npj->npi", into_squares, self._places - around.pixels[:, None]))
+        sign = np.einsum("nij,npj->npi", into_squares, self._places - around.pixels[:, None]).prod(axis=-1) > 0.0
+        blur = _CLEAR_OF_PX / np.linalg.norm(around.squares_px, axis=1)  # (N, 2) in squares
+        near = (place < 1.0 - blur[:, None]).all(axis=-1)
+        in_marker = (place > around.clear - blur[:, None]).all(axis=-1) & (sign == around.white_diagonal[:, None])
+        return np.asarray(near & ~in_marker, dtype=np.float64)
+
+    def fitted(self, ids: IntArray) -> Corners:
+        """The corners that look right."""
+        p = self._settled(self._start())
+        return self._judged(ids, p, self._looks_right(p))
+
+    def _settled(self, p: FloatArray) -> FloatArray:
+        """Levenberg-Marquardt on all patches at once, each with its own damping, until it has arrived."""
+        residual, jacobian = self._linearise(p)
+        cost, damping = (residual**2).sum(axis=1), np.full(len(p), 1e-3)
+        moving = np.arange(len(p))
+        for _ in range(_ROUNDS):
+            J, r = jacobian[moving], residual[moving]
+            normal = J.swapaxes(-1, -2) @ J
+            gradient = (r[:, None, :] @ J)[:, 0]
+            diagonal = np.einsum("nii->ni", normal)
+            damped = normal + (damping[moving, None] * diagonal + 1e-9)[:, :, None] * np.eye(_N)
+            step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+            tried = p[moving] - step
+            tried[:, 6:] = np.clip(tried[:, 6:], np.log(0.2), np.log(5.0))
+            new_residual, new_jacobian = self._linearise(tried, moving)
+            new_cost = (new_residual**2).sum(axis=1)
+            better = new_cost < cost[moving]
+            gained = moving[better]
+            p[gained], cost[gained] = tried[better], new_cost[better]
+            residual[gained], jacobian[gained] = new_residual[better], new_jacobian[better]
+            damping[moving] *= np.where(better, 0.1, 10.0)
+            moving = moving[np.abs(step[:, :2]).max(axis=1) > _ARRIVED_PX]
+            if not len(moving):
+                break
+        return p
+
+    def _start(self) -> FloatArray:
+        around = self._around
+        p = np.zeros((len(around.pixels), _N))
+        p[:, :2] = around.pixels
+        along_x, along_y = around.squares_px[:, :, 0], around.squares_px[:, :, 1]
+        p[:, 2] = np.arctan2(along_x[:, 0], -along_x[:, 1])  # normals: the directions turned by 90 degrees
+        p[:, 3] = np.arctan2(along_y[:, 0], -along_y[:, 1])
+        p[:, 6:] = np.log(_FIRST_BLUR_PX)
+        p[:, 5] = 1.0
+        residual, _ = self._linearise(p)
+        shape = residual + self._seen * self._light  # the light of a = 0, b = 1
+        count = np.maximum(self._seen.sum(axis=1), 1.0)
+        mean_light, mean_shape = (self._seen * self._light).sum(axis=1) / count, shape.sum(axis=1) / count
+        off = self._seen * (shape - mean_shape[:, None])
+        p[:, 5] = (off * self._light).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-9)
+        p[:, 4] = mean_light - p[:, 5] * mean_shape
+        return p
+
+    def _linearise(self, p: FloatArray, of: IntArray | slice = slice(None)) -> tuple[FloatArray, FloatArray]:
+        """Residuals (N, P), model minus light, and their derivatives (N, P, 8), of some patches."""
+        off = self._places[of] - p[:, None, :2]
+        edges, slopes, by_centre, by_turn = [], [], [], []
+        for k in (0, 1):
+            cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
+            across, along = cos * off[..., 0] + sin * off[..., 1], -sin * off[..., 0] + cos * off[..., 1]
+            bend = self._around.bend[of, k, None]
+            blur = np.exp(p[:, 6 + k])[:, None]
+            q = (across - 0.5 * bend * along**2) / (np.sqrt(2.0) * blur)
+            edges.append(erf(q))
+            slopes.append((2.0 / np.sqrt(np.pi)) * np.exp(-(q**2)))
+            scale = 1.0 / (np.sqrt(2.0) * blur)
+            by_centre.append((scale * (-cos - bend * along * sin), scale * (-sin + bend * along * cos), -q))
+            by_turn.append(scale * (along + bend * along * across))
+        a, b = p[:, 4, None], p[:, 5, None]
+        jacobian = np.empty((*off.shape[:2], _N))
+        first, second = b * slopes[0] * edges[1], b * slopes[1] * edges[0]
+        for axis in (0, 1):
+            jacobian[..., axis] = first * by_centre[0][axis] + second * by_centre[1][axis]
+        jacobian[..., 2], jacobian[..., 3] = first * by_turn[0], second * by_turn[1]
+        jacobian[..., 4], jacobian[..., 5] = 1.0, edges[0] * edges[1]
+        jacobian[..., 6], jacobian[..., 7] = first * by_centre[0][2], second * by_centre[1][2]
+        seen = self._seen[of]
+        return seen * (a + b * edges[0] * edges[1] - self._light[of]), seen[..., None] * jacobian
+
+    def _looks_right(self, p: FloatArray) -> BoolArray:
+        """(N,) whether two edges that cross near enough explain the light."""
+        residual, _ = self._linearise(p)
+        count = self._seen.sum(axis=1)
+        contrast = 2.0 * np.abs(p[:, 5])
+        squares = self._around.squares_px
+        side_px = np.linalg.norm(squares, axis=1).min(axis=1)
+        rms = np.sqrt((residual**2).sum(axis=1) / np.maximum(count, 1.0))
+        moved_px = np.linalg.norm(p[:, :2] - self._around.pixels, axis=1)
+        return np.asarray(
+            (count > _LEAST_PIXELS)
+            & (moved_px < np.minimum(_FARTHEST_SQUARES * side_px, _RADIUS_PX))
+            & (contrast > _LEAST_CONTRAST)
+            & (rms < _ROUGHEST * contrast)
+            & (np.exp(p[:, 6:]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
+        )
+
+    def _judged(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
+        """The good ones with their covariance: bright pixels are noisier, so it is made of each one's own residual."""
+        residual, jacobian = self._linearise(p)
+        residual, jacobian, count = residual[good], jacobian[good], self._seen[good].sum(axis=1)
+        gain = np.linalg.inv(np.einsum("npi,npj->nij", jacobian, jacobian) + 1e-12 * np.eye(_N))
+        square = residual**2 * (count / np.maximum(count - _N, 1.0))[:, None]
+        covariance = gain @ np.einsum("npi,np,npj->nij", jacobian, square, jacobian) @ gain
+        return Corners(
+            ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, 6:]).max(axis=1), 2.0 * np.abs(p[good, 5])
+        )
+
+
+def bends(before_px: FloatArray, at_px: FloatArray, after_px: FloatArray) -> FloatArray:
+    """(N,) curvature of lines through three neighbouring points (N, 2) each, as `Surroundings` has it.
+
+    Positive where the line bends to its right-hand normal turned by 90 degrees from its direction (-y, x).
+    """
+    along = 0.5 * (after_px - before_px)
+    turned = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    second = after_px - 2.0 * at_px + before_px
+    length = np.linalg.norm(along, axis=1)
+    return np.asarray((turned * second).sum(axis=1) / np.maximum(length, 1e-12) ** 3)

@@ -1,0 +1,155 @@
+"""How near a calibration comes to the camera that took the pictures, and what its own statements are worth.
+
+    python -m tests.benchmarks.intrinsics_study                      the model given, 30 good views
+    python -m tests.benchmarks.intrinsics_study --against-plain      a tenth of them spoilt, OpenCV's way beside ours
+
+Each seed draws 30 views of the board, pictures rendered with noise, blur and a shaking hand. chi2 is that of the whole
+parameter vector; errors are root mean squares over the picture after the best rotation. `map` is the error over seeds
+over the predicted one, place by place.
+"""
+
+import argparse
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from scipy.stats import chi2
+
+from calib.arrays import FloatArray
+from calib.board import DEFAULT_BOARD
+from calib.board_finder import BoardFinder, View
+from calib.camera_model import CameraModel
+from calib.errors import CalibError
+from calib.intrinsics import KINDS, calibrated
+from calib.lens_parameters import parameters_of, undistorted_camera, with_parameters
+from calib.projection_uncertainty import (
+    PictureGrid,
+    difference_px,
+    expected_error_px,
+    projection_covariance,
+    rms_px,
+)
+from tests.board_cases import CASES, taken_views
+
+REGION: Final = 0.99
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One seed: squared errors and their prediction are (rows, columns) px^2."""
+
+    chi2: float
+    inside: bool
+    error_px: float
+    square: FloatArray
+    predicted: FloatArray
+    views: int
+    corner_sigma_px: float
+
+
+def run_seed(truth: CameraModel, seed: int, count: int = 30) -> Outcome:
+    """One calibration with the model given."""
+    lens = calibrated(
+        taken_views(truth, seed, count), BoardFinder(DEFAULT_BOARD), truth.name, [truth.distortion_model]
+    ).lens
+    covariance, off = lens.covariance(), parameters_of(lens.fit.model) - parameters_of(truth)
+    distance = float(off @ np.linalg.solve(covariance, off))
+    grid = PictureGrid.of(truth)
+    error = difference_px(truth, lens.fit.model, grid)
+    predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid)) ** 2
+    return Outcome(
+        distance, distance < float(chi2.ppf(REGION, len(off))), rms_px(error), (error**2).sum(axis=-1), predicted,
+        int(lens.views.sum()), lens.extra_sigma_px,
+    )  # fmt: skip
+
+
+def map_ratio(outcomes: Sequence[Outcome]) -> FloatArray:
+    """(rows, columns) error over predicted error, both root mean squares over seeds; NaN outside the image circle."""
+    found, said = (np.array([getattr(each, name) for each in outcomes]) for name in ("square", "predicted"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a place without image in any seed
+        return np.asarray(np.sqrt(np.nanmean(found, axis=0) / np.nanmean(said, axis=0)))
+
+
+def plain_error_px(truth: CameraModel, views: Sequence[View]) -> float:
+    """The error of cv2.calibrateCamera with its defaults on all views, corners as the detector gives them."""
+    board = DEFAULT_BOARD.charuco()
+    detector = cv2.aruco.CharucoDetector(board)
+    places, pixels = [], []
+    for view in views:
+        corners, ids, _, _ = detector.detectBoard(view.picture)
+        place, pixel = board.matchImagePoints(corners, ids)  # type: ignore[call-overload]
+        places.append(place)
+        pixels.append(pixel)
+    size = (truth.width_px, truth.height_px)
+    _, K, coefficients, _, _ = cv2.calibrateCamera(places, pixels, size, None, None)
+    found = with_parameters(
+        undistorted_camera("plain", size, "plumb_bob", float(K[0, 0])),
+        np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients.ravel()]),
+    )
+    return rms_px(difference_px(truth, found, PictureGrid.of(truth)))
+
+
+def study(case: str, seeds: Sequence[int]) -> None:
+    """Point 1: prints a line a seed and a summary."""
+    outcomes = []
+    for seed in seeds:
+        each = run_seed(CASES[case], seed)
+        outcomes.append(each)
+        print(  # noqa: T201
+            f"{case} seed {seed}: chi2 {each.chi2:.1f} {'inside' if each.inside else 'OUTSIDE'}, error "
+            f"{each.error_px:.4f} px, predicted {np.sqrt(np.nanmean(each.predicted)):.4f} px, {each.views} views",
+            flush=True,
+        )
+    ratio = map_ratio(outcomes)
+    low, middle, high = np.nanquantile(ratio, [0.0, 0.5, 1.0])
+    right = np.nanmean((ratio[np.isfinite(ratio)] < 1.5) & (ratio[np.isfinite(ratio)] > 1.0 / 1.5))
+    inside, largest = sum(each.inside for each in outcomes), max(each.error_px for each in outcomes)
+    mean = np.mean([each.chi2 for each in outcomes])
+    print(f"{case}: inside the {REGION:.0%} region {inside} of {len(outcomes)}, mean chi2 {mean:.2f}")  # noqa: T201
+    print(f"{case}: largest error {largest:.4f} px")  # noqa: T201
+    print(  # noqa: T201
+        f"{case}: map {low:.2f} to {high:.2f}, median {middle:.2f}, within 1.5 at {right:.0%} of places", flush=True
+    )
+
+
+def study_against_plain(case: str, seeds: Sequence[int]) -> None:
+    """Point 2: prints a line a seed and a summary."""
+    better = 0
+    for seed in seeds:
+        truth = CASES[case]
+        views = taken_views(truth, seed, spoilt_share=0.1)
+        try:
+            found = calibrated(views, BoardFinder(DEFAULT_BOARD), case, KINDS)
+        except CalibError as error:
+            print(f"{case} seed {seed}: refused: {error}", flush=True)  # noqa: T201
+            continue
+        ours, plain = rms_px(difference_px(truth, found.model, PictureGrid.of(truth))), plain_error_px(truth, views)
+        better += ours < plain
+        print(  # noqa: T201
+            f"{case} seed {seed}: ours {ours:.4f} px ({found.model.distortion_model}, {found.lens.views.sum()} of "
+            f"{len(views)} views), plain {plain:.4f} px",
+            flush=True,
+        )
+    print(f"{case}: ours lower in {better} of {len(seeds)}", flush=True)  # noqa: T201
+
+
+def main() -> None:
+    """Runs the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="0-49", help="FIRST-LAST")
+    parser.add_argument("--cases", default="", help="comma-separated, of " + ", ".join(CASES))
+    parser.add_argument("--against-plain", action="store_true")
+    arguments = parser.parse_args()
+    first, last = (int(number) for number in arguments.seeds.split("-"))
+    cv2.setNumThreads(1)
+    default = ["narrow", "wide"] if arguments.against_plain else list(CASES)
+    for case in arguments.cases.split(",") if arguments.cases else default:
+        (study_against_plain if arguments.against_plain else study)(case, range(first, last + 1))
+
+
+if __name__ == "__main__":
+    main()

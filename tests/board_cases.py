@@ -1,0 +1,50 @@
+"""Cameras that take pictures of the default board, and their views, found."""
+
+from typing import Final
+
+import numpy as np
+
+from calib.board import DEFAULT_BOARD
+from calib.board_finder import BoardFinder, View
+from calib.camera_model import CameraModel
+from fixtures.board_picture import BoardPainter, Glare, drawn_views
+from fixtures.board_picture import View as Taken
+
+NARROW: Final = CameraModel(
+    "narrow", 640, 480, 800.0, 801.0, 318.0, 243.0, "plumb_bob", (-0.1, 0.05, 0.0005, -0.0003, 0.0)
+)
+WIDE: Final = CameraModel(  # 90 degrees from left to right
+    "wide", 640, 480, 394.0, 395.0, 318.0, 243.0, "plumb_bob", (-0.25, 0.07, 0.0005, -0.0003, -0.008)
+)
+RATIONAL: Final = CameraModel(
+    "rational", 640, 480, 320.0, 319.5, 321.0, 238.0, "rational_polynomial",
+    (0.513, -2.741, 0.00064, -0.00022, 1.574, 0.393, -2.560, 1.499),
+)  # fmt: skip
+FISHEYE: Final = CameraModel(  # image of a half-sphere's rim just outside of the picture's sides
+    "fisheye", 640, 480, 220.0, 220.5, 322.0, 237.0, "equidistant", (0.02, -0.005, 0.001, 0.0)
+)
+CASES: Final = {camera.name: camera for camera in (NARROW, WIDE, RATIONAL, FISHEYE)}
+
+
+def spoilt(view: Taken, camera: CameraModel, rng: np.random.Generator) -> Taken:
+    """The same view moved too fast, out of focus, or under a lamp."""
+    what = rng.integers(3)
+    if what == 0:
+        distance_m = float(np.linalg.norm(view.T_camera_board[:3, 3]))
+        angle, length_m = rng.uniform(-np.pi, np.pi), rng.uniform(4.0, 10.0) * distance_m / camera.fx_px
+        return Taken(view.T_camera_board, length_m * np.array([np.cos(angle), np.sin(angle), 0, 0, 0, 0]))
+    if what == 1:
+        return Taken(view.T_camera_board, view.motion, defocus_px=rng.uniform(1.5, 3.0))
+    centre = camera.project(view.T_camera_board[:3] @ np.array([0.0875, 0.1125, 0.0, 1.0]))
+    return Taken(view.T_camera_board, view.motion, glare=Glare(tuple(centre.tolist()), rng.uniform(20.0, 60.0)))
+
+
+def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.0) -> list[View]:
+    """Pictures of the default board as `drawn_views` has them, and the board found in them."""
+    rng = np.random.default_rng(seed)
+    painter, finder = BoardPainter(camera, DEFAULT_BOARD), BoardFinder(DEFAULT_BOARD)
+    drawn = drawn_views(camera, DEFAULT_BOARD, count, rng)
+    for index in rng.choice(count, round(spoilt_share * count), replace=False):
+        drawn[index] = spoilt(drawn[index], camera, rng)
+    found = [finder.find(painter.picture(view, rng), f"picture {index}") for index, view in enumerate(drawn)]
+    return [view for view in found if view is not None]
