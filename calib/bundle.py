@@ -223,8 +223,12 @@ class _System:
         return _Blocks(residual, whitened, normal, gradient)
 
 
-def board_pose(model: CameraModel, points_m: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+def board_pose(
+    model: CameraModel, points_m: FloatArray, pixels: FloatArray, rank: int = 0
+) -> tuple[FloatArray, FloatArray] | None:
     """R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane; None where no pose explains them.
+
+    A plane has two poses that explain it nearly as well as each other: `rank` 0 is the better one.
 
     The pose is looked for by a camera without distortion that looks towards the board: far off the axis of a fisheye
     a plane at z = 1 stretches all errors, and the board's own origin may lie behind the camera.
@@ -246,7 +250,10 @@ def board_pose(model: CameraModel, points_m: FloatArray, pixels: FloatArray) -> 
         return None
     if not found:
         return None
-    best = int(np.argmin([float(np.asarray(error).ravel()[0]) for error in errors]))
+    order = np.argsort([float(np.asarray(error).ravel()[0]) for error in errors], kind="stable")
+    if rank >= len(order):
+        return None
+    best = int(order[rank])
     place = np.asarray(places[best], dtype=np.float64).ravel()
     if not np.isfinite(place).all():
         return None
@@ -254,8 +261,8 @@ def board_pose(model: CameraModel, points_m: FloatArray, pixels: FloatArray) -> 
     return (back * Rotation.from_rotvec(np.asarray(turns[best]).ravel())).as_matrix(), back.apply(place)
 
 
-def poses_of(model: CameraModel, seen: Observations, views: int) -> tuple[Poses, BoolArray]:
-    """A pose for each view as this camera would have it, and (V,) which views have one."""
+def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:
+    """A pose for each view as this camera would have it, and (V,) which views have one; `rank` as in `board_pose`."""
     rotation, place, good = (
         np.tile(np.eye(3), (views, 1, 1)),
         np.tile([0.0, 0.0, 1.0], (views, 1)),
@@ -263,7 +270,7 @@ def poses_of(model: CameraModel, seen: Observations, views: int) -> tuple[Poses,
     )
     for view in range(views):
         own = seen.view == view
-        pose = board_pose(model, seen.points_m[own], seen.pixels[own])
+        pose = board_pose(model, seen.points_m[own], seen.pixels[own], rank)
         if pose is not None:
             rotation[view], place[view], good[view] = *pose, True
     return Poses(rotation, place), good

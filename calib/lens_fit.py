@@ -40,7 +40,8 @@ class LensFit:
         views: (V,) which views were kept.
         corners: (N,) which corners were kept.
         extra_sigma_px: what a corner errs by beyond the light's noise.
-        view_misfit: (V,) mean squared whitened residual of each view's corners, NaN without a pose.
+        view_misfit: (V,) median squared whitened residual of each view's corners, 1 where they are as
+            others', NaN without a pose.
     """
 
     fit: Fit
@@ -81,9 +82,11 @@ def fitted_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit
     views &= counts >= _LEAST_CORNERS
     if views.sum() < 1:
         raise CalibError("the board fits no view; is it the board that the pictures show?")
-    poses = poses.where(views)
-    model, poses = _robust(start, poses, renumbered(seen, views))
-    return _without_outliers(seen, views, model, poses)
+    model, fitted = _robust(start, poses.where(views), renumbered(seen, views))
+    poses.rotation[views], poses.place_m[views] = fitted.rotation, fitted.place_m
+    poses, views = _posed_again(model, poses, views, seen)
+    views &= counts >= _LEAST_CORNERS
+    return _without_outliers(seen, views, model, poses.where(views))
 
 
 def first_guess(seen: Observations, n_views: int, size_px: tuple[int, int], kind: str, name: str) -> CameraModel:
@@ -125,6 +128,31 @@ def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[Camer
         scale = float(np.median(square)) / MEDIAN_CHI2 * _CAUCHY**2
         weight = 1.0 / (1.0 + square / max(scale, 1e-12))
     return model, poses
+
+
+def _posed_again(model: CameraModel, poses: Poses, views: BoolArray, seen: Observations) -> tuple[Poses, BoolArray]:
+    """Poses that a start far from the truth put wrong, a board's mirror image say, and views that it gave none."""
+    for rank in (0, 1):
+        fresh, found = poses_of(model, seen, len(views), rank)
+        own = renumbered(seen, found)
+        imaged = np.asarray(
+            np.isfinite(model.project(fresh.where(found).points(own.view, own.points_m)[0])).all(axis=1)
+        )
+        settled = adjusted(
+            model, fresh.where(found), own, imaged[:, None, None] * np.eye(2), hold_intrinsics=True
+        ).poses
+        fresh.rotation[found], fresh.place_m[found] = settled.rotation, settled.place_m
+        before, after = (_errors_by_view(model, each, seen) for each in (poses, fresh))
+        better = np.asarray(found & ~(views & ~(after < before)))
+        poses.rotation[better], poses.place_m[better] = fresh.rotation[better], fresh.place_m[better]
+        views = np.asarray(views | found)
+    return poses, views
+
+
+def _errors_by_view(model: CameraModel, poses: Poses, seen: Observations) -> FloatArray:
+    """(V,) median squared residuals."""
+    residual = model.project(poses.points(seen.view, seen.points_m)[0]) - seen.pixels
+    return _medians(seen, np.nan_to_num((residual**2).sum(axis=1), nan=np.inf), len(poses.place_m))
 
 
 @dataclass(frozen=True)
@@ -172,7 +200,7 @@ def _agreeing(seen: Observations, kept: _Kept, before: FloatArray) -> tuple[Bool
     square = _squares(seen, residual, extra_px)
     limit = float(chi2.isf(_WRONGLY_REJECTED / len(seen.view), 2))
     posed = np.asarray(kept.views[seen.view])
-    misfit = np.where(kept.views, _view_misfit(seen, np.minimum(square, 10.0 * limit), posed, count), before)
+    misfit = np.where(kept.views, _medians(seen, square, count) / MEDIAN_CHI2, before)
     corners = posed & (square < limit)
     enough = np.bincount(seen.view[corners], minlength=count) >= _LEAST_CORNERS
     stay = np.asarray(kept.views & ~_outlying(misfit, kept.views) & enough)
@@ -206,17 +234,16 @@ def _extra_sigma_px(seen: Observations, residual_px: FloatArray, freedom: int, t
     return float(brentq(excess, 0.0, _LARGEST_EXTRA_PX, xtol=1e-5))
 
 
-def _view_misfit(seen: Observations, square: FloatArray, posed: BoolArray, n_views: int) -> FloatArray:
-    """(V,) mean over a view's corners of the squares, halved: about 1; NaN without corners."""
-    count = np.bincount(seen.view[posed], minlength=n_views)
-    total = np.bincount(seen.view[posed], weights=square[posed], minlength=n_views)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(0.5 * total / count)
+def _medians(seen: Observations, square: FloatArray, n_views: int) -> FloatArray:
+    """(V,) of each view's corners: some that are wrong, or beyond a lens's image, do not condemn a view."""
+    return np.array(
+        [np.median(square[seen.view == view]) if (seen.view == view).any() else np.nan for view in range(n_views)]
+    )
 
 
 def _outlying(misfit: FloatArray, views: BoolArray) -> BoolArray:
     """(V,) views whose residuals are larger than the scatter among views allows."""
-    logarithm = np.log(np.maximum(misfit, 1e-12))
+    logarithm = np.log(np.clip(misfit, 1e-12, 1e12))
     middle = float(np.median(logarithm[views]))
     scatter = 1.4826 * float(np.median(np.abs(logarithm[views] - middle)))
     return np.asarray(np.nan_to_num(logarithm - middle) > _VIEW_SIGMAS * max(scatter, _LEAST_SCATTER))

@@ -8,10 +8,11 @@ import numpy as np
 from calib.camera_model import CameraModel, fitted_coefficients
 from calib.distortion import COEFFICIENTS
 from calib.errors import CalibError
+from calib.picture_bytes import is_jpeg
 from offline.bag_topics import COMPRESSED_IMAGE
 from offline.errors import OfflineError
 from onboard.detection_process import Picture
-from onboard.picture import is_jpeg, without_padding
+from onboard.picture import without_padding
 
 _GREY: Final[dict[str, np.dtype[Any]]] = {
     "mono8": np.dtype(np.uint8),

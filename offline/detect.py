@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.picture_bytes import claimed_size
 from calib.robot import parse_robot_yaml
 from offline.errors import OfflineError
 from offline.new_log import new_log
@@ -34,7 +35,6 @@ from onboard.messages import (
     TagDetections,
     WheelEncoders,
 )
-from onboard.picture import claimed_size
 
 _DETECTIONS: Final = "/tags/detections"
 # A camera's JPEG spends at least 6 bits on 64 pixels; a bomb takes minutes.

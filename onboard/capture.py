@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.files import written_whole
+from calib.picture_bytes import is_jpeg
 from calib.words import counted
 from onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
 from onboard.capture_guide import Advice, CaptureGuide
@@ -19,7 +20,7 @@ from onboard.clock import RunClock
 from onboard.detection_process import Picture
 from onboard.drawing import save_board
 from onboard.errors import OnboardError
-from onboard.picture import decode_grey, is_jpeg, to_grey
+from onboard.picture import decode_grey, to_grey
 
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.1

@@ -15,8 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.picture_bytes import is_jpeg
 from onboard.errors import OnboardError
-from onboard.picture import decode, decode_grey, encode_jpeg, is_jpeg, to_grey
+from onboard.picture import decode, decode_grey, encode_jpeg, to_grey
 from onboard.tag_detector import Detection, TagDetector
 
 Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]

@@ -17,6 +17,7 @@ from typing import Final
 
 from google.protobuf.message import Message
 
+from calib.picture_bytes import is_complete, is_jpeg
 from onboard.camera import Frame
 from onboard.clock import RunClock, read_clocks, wall_clock_synchronised
 from onboard.detection_process import ChildDetector, DetectionResult
@@ -26,7 +27,6 @@ from onboard.encoder_port import EncoderPort
 from onboard.log_keeper import LogKeeper
 from onboard.log_thread import LogThread
 from onboard.messages import Event, EventKind
-from onboard.picture import is_complete, is_jpeg
 from onboard.recorder import RecorderCore, Run, segment_limits
 from onboard.robot_files import RobotFiles
 from onboard.storage import Disk

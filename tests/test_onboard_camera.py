@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from calib.picture_bytes import is_jpeg
 from onboard.camera import (
     Camera,
     CameraEndedError,
@@ -20,7 +21,6 @@ from onboard.clock import RunClock
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
 from onboard.errors import OnboardError
 from onboard.messages import StampSource
-from onboard.picture import is_jpeg
 from onboard.picture_folder import FolderCamera
 from onboard.v4l2_camera import V4l2Camera
 from tests.fake_capture import FakeCapture

@@ -1,0 +1,142 @@
+"""The parts of a calibration: derivatives, corners, poses, the fit on made corners."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calib.board import DEFAULT_BOARD
+from calib.board_finder import BoardFinder
+from calib.bundle import Observations, board_pose
+from calib.camera_model import CameraModel
+from calib.lens_fit import first_guess, fitted_lens
+from calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
+from calib.projection_uncertainty import (
+    PictureGrid,
+    difference_px,
+    expected_error_px,
+    projection_covariance,
+    rms_px,
+)
+from fixtures.board_picture import BoardPainter, View, corners_of, drawn_views
+from tests.board_cases import CASES, FISHEYE, NARROW, WIDE
+
+SIGMA_PX = 0.05
+FINDER = BoardFinder(DEFAULT_BOARD)
+every_camera = pytest.mark.parametrize("camera", CASES.values(), ids=lambda camera: camera.name)
+
+
+def made_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Observations, list[View]]:
+    """Exact corners and noise, without pictures."""
+    rng = np.random.default_rng(seed)
+    views = drawn_views(camera, DEFAULT_BOARD, count, rng)
+    number, points, pixels = [], [], []
+    for index, view in enumerate(views):
+        own = corners_of(view, camera, DEFAULT_BOARD)
+        seen = ((own > 0) & (own < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
+        number.append(np.full(seen.sum(), index))
+        points.append(FINDER.corners_m[seen])
+        pixels.append(own[seen] + SIGMA_PX * rng.standard_normal((seen.sum(), 2)))
+    corners = np.concatenate(pixels)
+    covariance = np.tile(0.0001 * np.eye(2), (len(corners), 1, 1))
+    return Observations(np.concatenate(number).astype(np.int64), np.concatenate(points), corners, covariance), views
+
+
+@every_camera
+def test_derivatives_by_the_parameters_agree_with_differences(camera: CameraModel) -> None:
+    rays = PictureGrid.of(camera, 9).rays.reshape(-1, 3)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    exact = pixels_by_parameters(camera, rays, camera.project(rays))
+    at = parameters_of(camera)
+    for index in range(len(at)):
+        step = np.zeros(len(at))
+        step[index] = 1e-5 * max(abs(at[index]), 1.0)
+        ahead, behind = (with_parameters(camera, at + sign * step).project(rays) for sign in (1.0, -1.0))
+        difference = (ahead - behind) / (2.0 * step[index])
+        np.testing.assert_allclose(exact[..., index], difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("camera", [NARROW, WIDE, FISHEYE], ids=lambda camera: camera.name)
+def test_corners_lie_to_a_hundredth_of_a_pixel_and_their_covariance_says_so(camera: CameraModel) -> None:
+    rng = np.random.default_rng(5)
+    painter, errors, squares = BoardPainter(camera, DEFAULT_BOARD), [], []
+    for taken in drawn_views(camera, DEFAULT_BOARD, 3, rng):
+        view = FINDER.find(painter.picture(taken, rng))
+        assert view is not None
+        T = taken.T_camera_board
+        corners = FINDER.find_again(view, camera.project(FINDER.places_around_m() @ T[:3, :3].T + T[:3, 3])).corners
+        assert len(corners.ids) >= len(view.corners.ids)
+        error = corners.pixels - corners_of(taken, camera, DEFAULT_BOARD)[corners.ids]
+        errors.append(error)
+        squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(corners.covariance), error))
+    assert rms_px(np.concatenate(errors)) < 0.018  # both coordinates
+    assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.004
+    assert np.median(np.concatenate(squares)) == pytest.approx(chi2.median(2), rel=0.6)
+
+
+def test_a_board_far_off_the_axis_of_a_fisheye_has_a_pose() -> None:
+    """Its origin may even lie behind the camera."""
+    seen, views = made_corners(FISHEYE, 1, 30)
+    origins = np.array([view.T_camera_board[2, 3] for view in views])
+    assert origins.min() < 0.0
+    for index, view in enumerate(views):
+        own = seen.view == index
+        pose = board_pose(FISHEYE, seen.points_m[own], seen.pixels[own])
+        assert pose is not None
+        assert np.linalg.norm(pose[1] - view.T_camera_board[:3, 3]) < 0.01
+
+
+@every_camera
+def test_a_fit_finds_the_camera_to_within_its_covariance(camera: CameraModel) -> None:
+    squares = []
+    for seed in range(3):
+        seen, views = made_corners(camera, seed)
+        size_px = (camera.width_px, camera.height_px)
+        lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
+        off = parameters_of(lens.fit.model) - parameters_of(camera)
+        squares.append(float(off @ np.linalg.solve(lens.covariance(), off)))
+        assert lens.extra_sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
+        assert lens.views.all()
+    assert sum(squares) < chi2.ppf(0.999, 3 * len(parameters_of(camera)))
+    if camera.distortion_model != "rational_polynomial":  # there linear theory ends
+        assert sum(squares) > chi2.ppf(0.001, 3 * len(parameters_of(camera)))
+
+
+def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
+    seen, views = made_corners(WIDE, 1)
+    wrong = np.zeros(len(seen.view), dtype=bool)
+    wrong[np.random.default_rng(0).choice(len(wrong), 20, replace=False)] = True
+    seen.pixels[wrong] += [0.9, -0.7]
+    moved = seen.view == 3
+    seen.pixels[moved] += np.random.default_rng(1).normal(0.0, 0.6, (int(moved.sum()), 2))
+    lens = fitted_lens(seen, len(views), first_guess(seen, len(views), (640, 480), "plumb_bob", "c"))
+    assert list(np.nonzero(~lens.views)[0]) == [3]
+    assert not lens.corners[wrong].any()
+    assert lens.corners[~wrong & ~moved].mean() > 0.995
+    assert rms_px(difference_px(WIDE, lens.fit.model, PictureGrid.of(WIDE))) < 0.1
+
+
+def test_a_turned_camera_is_no_other_camera() -> None:
+    """What a rotation makes up for does not count: a shift of the centre, nearly, of a narrow one."""
+    grid = PictureGrid.of(NARROW)
+    shifted = with_parameters(NARROW, parameters_of(NARROW) + np.array([0, 0, 1.0, 0, 0, 0, 0, 0, 0]))
+    assert rms_px(difference_px(NARROW, shifted, grid)) < 0.2
+    longer = with_parameters(NARROW, parameters_of(NARROW) * np.array([1.01, 1.01, 1, 1, 1, 1, 1, 1, 1]))
+    assert rms_px(difference_px(NARROW, longer, grid)) > 1.0
+
+
+@every_camera
+def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera: CameraModel) -> None:
+    seen, views = made_corners(camera, 2)
+    start = first_guess(seen, len(views), (640, 480), camera.distortion_model, "c")
+    lens = fitted_lens(seen, len(views), start)
+    covariance, grid = 0.01 * lens.covariance(), PictureGrid.of(lens.fit.model, 12)
+    predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid))
+    root = np.linalg.cholesky(covariance + 1e-18 * np.diag(np.diag(covariance)))
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(60):
+        other = with_parameters(lens.fit.model, parameters_of(lens.fit.model) + root @ rng.standard_normal(len(root)))
+        drawn.append((difference_px(lens.fit.model, other, grid) ** 2).sum(axis=-1))
+    ratio = np.sqrt(np.mean(drawn, axis=0)) / predicted
+    assert np.nanmin(ratio) > 0.7
+    assert np.nanmax(ratio) < 1.3
