@@ -1,4 +1,4 @@
-"""A pinhole camera with lens distortion: points to pixels and back, and ROS camera_info files.
+"""A camera with lens distortion: points to pixels and back.
 
 Frame: optical, x right, y down, z forward. Pixels: OpenCV's, centres at whole numbers, so the picture covers
 (-0.5, width - 0.5) x (-0.5, height - 0.5).
@@ -6,19 +6,13 @@ Frame: optical, x right, y down, z forward. Pixels: OpenCV's, centres at whole n
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field
 
 from calib.arrays import FloatArray
 from calib.distortion import COEFFICIENTS, Distortion
 from calib.errors import CalibError
-from calib.files import written_whole
-from calib.yaml_file import parse_mapping, read_text, validated
 
 
 @dataclass(frozen=True)
@@ -117,91 +111,3 @@ class CameraModel:
             cx_px=(self.cx_px + 0.5) * scale_x - 0.5,
             cy_px=(self.cy_px + 0.5) * scale_y - 0.5,
         )
-
-
-class _Matrix(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    data: list[Annotated[float, Field(allow_inf_nan=False)]]
-
-
-class _CameraMatrix(_Matrix):
-    data: Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=9, max_length=9)]
-
-
-class _CameraInfo(BaseModel):
-    """What we use of a ROS camera_info file; the rest of it (rectification, projection) follows from this."""
-
-    model_config = ConfigDict(strict=True)
-
-    image_width: Annotated[int, Field(gt=0)]
-    image_height: Annotated[int, Field(gt=0)]
-    camera_name: str = "camera"
-    camera_matrix: _CameraMatrix
-    distortion_model: str
-    distortion_coefficients: _Matrix
-
-
-def read_camera_yaml(path: Path) -> CameraModel:
-    """Reads a camera_info file as ROS's camera_calibration writes it.
-
-    plumb_bob with four coefficients (no k3) is accepted, as are trailing zeros.
-
-    Raises:
-        CalibError: one line that names file, field, value, limit and way out.
-    """
-    info = validated(_CameraInfo, parse_mapping(read_text(path), str(path)), str(path))
-    fx, skew, cx, *lower = info.camera_matrix.data
-    below, fy, cy = lower[:3]
-    if skew or below or lower[3:] != [0.0, 0.0, 1.0]:
-        raise CalibError(
-            f"{path}: camera_matrix.data is {info.camera_matrix.data} but must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]; "
-            "calibrate without skew"
-        )
-    coefficients = fitted_coefficients(info.distortion_coefficients.data, COEFFICIENTS.get(info.distortion_model))
-    try:
-        return CameraModel(
-            info.camera_name,
-            info.image_width,
-            info.image_height,
-            fx,
-            fy,
-            cx,
-            cy,
-            info.distortion_model,
-            tuple(coefficients),
-        )
-    except CalibError as error:
-        raise CalibError(f"{path}: {error}") from error
-
-
-def fitted_coefficients(coefficients: list[float], expected: int | None) -> list[float]:
-    """The coefficients without surplus zeros, and with plumb_bob's k3 where it was left out."""
-    if expected == COEFFICIENTS["plumb_bob"] and len(coefficients) == expected - 1:
-        return [*coefficients, 0.0]
-    if expected is not None and not any(coefficients[expected:]):
-        return coefficients[:expected]
-    return coefficients
-
-
-def write_camera_yaml(model: CameraModel, path: Path) -> None:
-    """Writes a ROS camera_info file that `read_camera_yaml` gives back to the last bit; whole or not at all."""
-    projection = np.hstack([model.matrix, np.zeros((3, 1))])
-    info = {
-        "image_width": model.width_px,
-        "image_height": model.height_px,
-        "camera_name": model.name,
-        "camera_matrix": _as_ros_matrix(model.matrix),
-        "distortion_model": model.distortion_model,
-        "distortion_coefficients": _as_ros_matrix(np.array([model.distortion])),
-        "rectification_matrix": _as_ros_matrix(np.eye(3)),
-        "projection_matrix": _as_ros_matrix(projection),
-    }
-    text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None, width=120)
-    with written_whole(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-
-
-def _as_ros_matrix(matrix: FloatArray) -> dict[str, int | list[float]]:
-    rows, columns = matrix.shape
-    return {"rows": rows, "cols": columns, "data": [float(value) for value in matrix.ravel()]}

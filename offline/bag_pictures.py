@@ -5,7 +5,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from calib.camera_model import CameraModel, fitted_coefficients
+from calib.camera_file import fitted_coefficients
+from calib.camera_model import CameraModel
 from calib.distortion import COEFFICIENTS
 from calib.errors import CalibError
 from calib.picture_bytes import is_jpeg

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel, read_camera_yaml
+from calib.camera_file import read_camera_yaml
+from calib.camera_model import CameraModel
 from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from calib.words import counted

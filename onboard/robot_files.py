@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 from typing import Final
 
-from calib.camera_model import CameraModel, read_camera_yaml
+from calib.camera_file import read_camera_yaml
+from calib.camera_model import CameraModel
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from calib.yaml_file import read_text
 from onboard.camera import CameraSettings

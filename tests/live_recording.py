@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.camera_model import CameraModel, write_camera_yaml
+from calib.camera_file import write_camera_yaml
+from calib.camera_model import CameraModel
 from fixtures.devices import PtyPort, wheel_line
 from onboard.live_recorder import LiveRecorder
 from onboard.messages import Event

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib.arrays import FloatArray
-from calib.camera_model import CameraModel, read_camera_yaml, write_camera_yaml
+from calib.camera_file import CameraEstimate, read_camera_yaml, read_estimate, write_camera_yaml
+from calib.camera_model import CameraModel
 from calib.errors import CalibError
 
 PLUMB_BOB = CameraModel(
@@ -252,3 +253,64 @@ def test_a_file_that_is_none_gives_one_clear_line(tmp_path: Path, content: bytes
         read_camera_yaml(path)
     for word in [str(path), *words]:
         assert word in str(caught.value)
+
+
+KALIBR_FILE = """\
+cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.01, 0.02, -0.003, 0.0004]
+  distortion_model: equidistant
+  intrinsics: [461.6, 460.3, 362.7, 248.1]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+"""
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "coefficients"),
+    [
+        ("equidistant", "equidistant", (-0.01, 0.02, -0.003, 0.0004)),
+        ("radtan", "plumb_bob", (-0.01, 0.02, -0.003, 0.0004, 0.0)),
+    ],
+)
+def test_reads_what_kalibr_writes(tmp_path: Path, theirs: str, ours: str, coefficients: tuple[float, ...]) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR_FILE.replace("equidistant", theirs))
+    assert read_camera_yaml(path) == CameraModel("cam0", 752, 480, 461.6, 460.3, 362.7, 248.1, ours, coefficients)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("pinhole", "omni", ["cam0", "omni", "pinhole"]),
+        ("equidistant", "fov", ["fov", "radtan"]),
+        ("[461.6, ", "[", ["intrinsics", "3 numbers"]),
+        ("0.0004]", "0.0004, 1.0]", ["distortion_coeffs", "5 numbers"]),
+        ("resolution: [752, 480]", "", ["resolution", "missing"]),
+        ("cam0:", "cam1: {camera_model: pinhole}\ncam0:", ["2 cameras", "cam0"]),
+    ],
+)
+def test_a_kalibr_file_that_is_no_camera_of_ours_gives_one_clear_line(
+    tmp_path: Path, old: str, new: str, words: list[str]
+) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR_FILE.replace(old, new))
+    with pytest.raises(CalibError) as caught:
+        read_camera_yaml(path)
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+
+
+def test_what_a_calibration_says_of_its_errors_stands_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    estimate = CameraEstimate(
+        n_views=30, n_corners=1200, corner_sigma_px=0.01, expected_error_px=0.02, parameters=["fx_px", "fy_px"],
+        sigmas=[0.1, 0.2], covariance=[0.01, 0.005, 0.005, 0.04],
+    )  # fmt: skip
+    write_camera_yaml(UNDISTORTED, path, estimate)
+    assert read_camera_yaml(path) == UNDISTORTED
+    assert read_estimate(path) == estimate
+    np.testing.assert_array_equal(estimate.matrix(), [[0.01, 0.005], [0.005, 0.04]])
+    write_camera_yaml(UNDISTORTED, path)
+    assert read_estimate(path) is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.camera_model import write_camera_yaml
+from calib.camera_file import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import Mount, write_robot_yaml
 from offline.bag_frames import FixedFrames, mount_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from calib.camera_model import write_camera_yaml
+from calib.camera_file import write_camera_yaml
 from calib.robot import write_robot_yaml
 from offline.map_io import read_map
 from onboard.log_head import log_head

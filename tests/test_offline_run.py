@@ -9,7 +9,7 @@ import pytest
 from google.protobuf.message import Message
 
 from calib import se2
-from calib.camera_model import write_camera_yaml
+from calib.camera_file import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import write_robot_yaml
 from offline.run import RobotFile, load_run, read_robot_file

@@ -24,7 +24,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from calib.camera_model import CameraModel, write_camera_yaml
+from calib.camera_file import write_camera_yaml
+from calib.camera_model import CameraModel
 from fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
 from onboard.log_reader import find_logs, read_log, read_run_info
 from onboard.messages import TagDetections, WheelEncoders
