@@ -6,13 +6,17 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from reportlab.lib.units import mm
-from reportlab.pdfbase.pdfmetrics import stringWidth
-from reportlab.pdfgen.canvas import Canvas
 
 from calib.arrays import BoolArray
 from calib.errors import CalibError
 from calib.files import written_whole
+
+try:
+    from reportlab.lib.units import mm
+    from reportlab.pdfbase.pdfmetrics import stringWidth
+    from reportlab.pdfgen.canvas import Canvas
+except ImportError as error:  # a robot's computer has no need of it
+    raise CalibError("printing needs reportlab, which is not installed; pip install 'groundsbot[laptop]'") from error
 
 PAPERS_MM: Final = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}
 HOW_TO_PRINT: Final = 'Print at 100 % (not "fit to page"). Hold a ruler against both rulers: 100 mm must be 100 mm.'

@@ -1,5 +1,6 @@
 """Printed tags and rulers, scanned: the robot's detector finds each tag at its id, the right way up, at its size."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -175,3 +176,15 @@ def test_the_same_tags_make_the_same_file(calib: Run, tmp_path: Path) -> None:
     for name in ("a.pdf", "b.pdf"):
         calib("tags", "--ids", "0-3", "--size-mm", "50", "-o", tmp_path / name)
     assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+
+
+@pytest.mark.parametrize("command", [["board"], ["tags", "--ids", "0", "--size-mm", "80"]], ids=["board", "tags"])
+def test_a_robot_without_the_printing_library_says_so(
+    calib: Run, tmp_path: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("calib.sheet", "calib.board_sheet", "calib.tag_sheet"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "reportlab.lib.units", None)
+    done = calib(*command, "-o", tmp_path / "page.pdf")
+    assert (done.code, done.out) == (1, "")
+    assert done.err == ("error: printing needs reportlab, which is not installed; pip install 'groundsbot[laptop]'\n")
