@@ -128,10 +128,11 @@ def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows
         state = solution.state
         if np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
             break
-    n_conditions = _freedom(problem) - _freedom(apart)
+    # Drives that only a tape joins have more unknowns together than apart.
+    n_conditions = max(0, _freedom(problem) - _freedom(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     solution = solve(_scaled(apart, *factors), state, losses=losses)
-    if n_conditions and len(problem.readings.tag):
+    if n_conditions:
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
         sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
