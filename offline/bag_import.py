@@ -24,7 +24,11 @@ from onboard.messages import PlanarOdometry
 
 
 def import_bag(
-    path: Path, output: Path, options: ImportOptions, bag_options: BagOptions, progress: Progress
+    path: Path,
+    output: Path,
+    options: ImportOptions | None = None,
+    bag_options: BagOptions | None = None,
+    progress: Progress = lambda *_: None,
 ) -> ImportReport:
     """Writes `output/<run_id>/0000.core.mcap` from a bag of ROS 1 or ROS 2; the same bytes for the same bag.
 
@@ -40,6 +44,7 @@ def import_bag(
     Raises:
         GroundsbotError: one line that names bag, topic, value and what to do.
     """
+    options, bag_options = options or ImportOptions(), bag_options or BagOptions()
     run_id = options.run_id or safe_name(path)
     check_output(output, output / run_id)
     with open_bag(path) as bag:

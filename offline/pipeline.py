@@ -62,11 +62,27 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return map_runs(runs, noise or NoiseParameters(), stages, tape or TapeOptions())
+    return build_map(runs, noise, stages, tape)
 
 
-def map_runs(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, tape: TapeOptions) -> MapResult:
-    """As `map_logs`, from runs already read."""
+def build_map(
+    runs: Sequence[Run],
+    noise: NoiseParameters | None = None,
+    stages: Stages | None = None,
+    tape: TapeOptions | None = None,
+) -> MapResult:
+    """As `map_logs`, from runs already read.
+
+    Args:
+        runs: of `load_run`; the frame is the start of the first.
+        noise: sigmas of wheels and readings; defaults where None.
+        stages: told what is being done, and keeps what it took.
+        tape: what somebody measured.
+
+    Raises:
+        GroundsbotError: one line that says why there can be no map.
+    """
+    noise, stages, tape = noise or NoiseParameters(), stages or Stages(), tape or TapeOptions()
     _check_distinct(runs)
     check_tag_sizes(runs)
     chains: list[Chain] = []

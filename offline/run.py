@@ -169,7 +169,7 @@ def read_robot_file(path: Path) -> RobotFile:
     return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
 
 
-def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> Run:
+def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None) -> Run:
     """Reads one log.
 
     Args:
@@ -179,6 +179,7 @@ def load_run(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> R
     Raises:
         GroundsbotError: one line that says why the log cannot be mapped.
     """
+    log = Path(log)
     collected, losses = _Collected(), LogLosses()
     for entry in read_log(log, topics=_TOPICS, losses=losses):
         collected.add(entry)

@@ -8,7 +8,7 @@ from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline.checks import check_warnings
 from offline.measured import TapeOptions
-from offline.pipeline import map_runs
+from offline.pipeline import build_map
 from offline.result import CheckResult, MapResult
 from offline.run import TagKey
 from offline.stages import Stages
@@ -39,7 +39,7 @@ def mapped(size: float = 1.0, track: float = 1.0, seed: int | None = None, dista
         tags=[TagKey(FAMILY, i) for i in range(len(PLACES))],
         positions=made_positions(drive.stamps_ns[at], tag, seen, SIGMA_M),
     )
-    return map_runs([run], NoiseParameters(), Stages(), TapeOptions(distances=[distance] if distance else []))
+    return build_map([run], NoiseParameters(), Stages(), TapeOptions(distances=[distance] if distance else []))
 
 
 def check(result: MapResult, name: str) -> CheckResult:

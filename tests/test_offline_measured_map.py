@@ -12,7 +12,7 @@ from calib.noise import NoiseParameters
 from calib.robot import Robot
 from offline.errors import OfflineError
 from offline.measured import TapeOptions
-from offline.pipeline import map_runs
+from offline.pipeline import build_map
 from offline.result import MapResult
 from offline.run import Run, TagKey
 from offline.stages import Stages
@@ -48,7 +48,7 @@ def run_of(
 
 
 def mapped(runs: Sequence[Run], starts: Sequence[str] = (), distances: Sequence[str] = ()) -> MapResult:
-    return map_runs(runs, NoiseParameters(), Stages(), TapeOptions(starts, distances))
+    return build_map(runs, NoiseParameters(), Stages(), TapeOptions(starts, distances))
 
 
 def test_a_measured_start_joins_runs_that_share_no_tag() -> None:
