@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.board import DEFAULT_BOARD
 from calib.files import written_whole
 from calib.picture_bytes import is_jpeg
 from calib.words import counted
@@ -181,7 +182,7 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def summary(guide: CaptureGuide, output: Path) -> list[str]:
-    """How it ended, in words."""
+    """How it ended, and what comes next, in words."""
     if not guide.kept:
         return [f"{output}: no picture was taken"]
     lines = [f"{output}: {counted(guide.kept, 'picture')}"]
@@ -189,4 +190,7 @@ def summary(guide: CaptureGuide, output: Path) -> list[str]:
         lines.append(f"still missing: {'; '.join(guide.missing)}")
     elif not guide.enough:
         lines.append(f"{guide.wanted} are wanted")
+    else:
+        told = "" if guide.board == DEFAULT_BOARD else f" --board {guide.board.specification}"
+        lines.append(f"next: groundsbot-calib camera {output} -o camera.yaml{told}")
     return lines

@@ -297,7 +297,7 @@ def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> No
     assert process.returncode == 0, said
     lines = said.splitlines()
     assert "17 of 12: taken; bring the board nearer" in lines
-    assert lines[-1] == f"{pictures}: 18 pictures"
+    assert lines[-2:] == [f"{pictures}: 18 pictures", f"next: groundsbot-calib camera {pictures} -o camera.yaml"]
     assert sorted(each.name for each in pictures.iterdir()) == [f"{number:04}.jpg" for number in range(1, 19)]
     for path in (pictures / "0018.jpg", tmp_path / "capture.jpg"):
         assert cv2.imread(str(path)) is not None
