@@ -163,11 +163,12 @@ def test_joints_may_be_named_and_start_over_after_a_turn(tmp_path: Path, log: Pa
     sent = []
     for each in made.sent:
         if each.topic == "/joint_states" and starts_over:
-            wrapped = (np.array(each.fields["position"]) + np.pi) % (2 * np.pi) - np.pi
+            wrapped = (np.array(each.fields["position"]) + 2.0 + np.pi) % (2 * np.pi) - np.pi  # the left one passes pi
             each = each._replace(fields=each.fields | {"position": wrapped})
         sent.append(each)
     options = BagOptions(left_joint="a", right_joint="b", tag_size_m=0.15)
     _, run = imported(sent, tmp_path, options, wheel_radius_m=0.1, track_width_m=0.5)
+    np.testing.assert_allclose(run.stretches[0].left_m, made.track.left_m, atol=1e-9)
     np.testing.assert_allclose(run.stretches[0].right_m, made.track.right_m, atol=1e-9)
 
 
