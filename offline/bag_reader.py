@@ -113,7 +113,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Opens a bag: a `.bag` file of ROS 1; a folder, an `.mcap` or a `.db3` file of ROS 2.
 
     Raises:
-        OfflineError: it is missing, damaged, not finished, or no bag.
+        OfflineError: it is missing, damaged, not finished, or no bag; or, inside, its messages are not what they
+            should be.
     """
     if not path.exists():
         raise OfflineError(f"{path}: does not exist; give a .bag file, a folder of ROS 2, or an .mcap or .db3 file")
@@ -123,7 +124,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader = Reader1(path) if path.suffix == ".bag" and path.is_file() else Reader2(path)
         reader.open()
     try:
-        yield Bag(path, reader)
+        with _told(path):
+            bag = Bag(path, reader)
+        with _content_told(path):
+            yield bag
     finally:
         reader.close()
 
@@ -137,6 +141,18 @@ def _types_of(definition: MessageDefinition, msgtype: str) -> dict[str, Any]:
     for part in definition.data.split(_IDL_RULE)[1:]:
         types |= get_types_from_idl(part.partition("\n")[2])
     return types
+
+
+@contextmanager
+def _content_told(path: Path) -> Iterator[None]:
+    """A message is what the bag's own definition makes of it: it may lack what its type should have."""
+    try:
+        yield
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise OfflineError(
+            f"{path}: holds a message that is not as its type should be: {error}; was it damaged, or recorded under "
+            "another definition?"
+        ) from error
 
 
 @contextmanager

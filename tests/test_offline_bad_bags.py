@@ -87,6 +87,14 @@ def unknown_type(made: BagOfLog, folder: Path) -> Path:
     return renamed
 
 
+def other_definition(made: BagOfLog, folder: Path) -> Path:
+    """CameraInfo without its width, by the definition in the bag."""
+    bag = made.write(folder / "drive_db3")
+    (database,) = bag.glob("*.db3")
+    database.write_bytes(database.read_bytes().replace(b"uint32 width", b"uint32 wodth"))
+    return bag
+
+
 def spoilt_quaternion(made: BagOfLog, folder: Path) -> Path:
     def spoil(fields: dict[str, Any]) -> dict[str, Any]:
         first, *rest = fields["transforms"]
@@ -140,6 +148,7 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
         SIZE,
         r"no tags: .*/detections \(somebody_msgs/AprilTagDetectionArray, 8 messages\)",
     ),
+    "another definition": (other_definition, SIZE, r"holds a message that is not as its type should be: .*'width'"),
     "broken index": (broken_index, SIZE, r"drive\.bag: cannot be read as a bag: .*`rosbag reindex`"),
     "cut short, ROS 1": (shortened("drive.bag", 0.6), SIZE, r"cannot be read as a bag: .*`rosbag reindex`"),
     "cut short, MCAP": (shortened("drive", 0.7), SIZE, r"\.mcap: cannot be read as a bag: .*`mcap recover`"),
