@@ -39,11 +39,18 @@ def held(
 
 
 def good_views() -> list[View]:
-    """All over the picture twice, tilted every way, near and far."""
-    corners = [held((x, y), 0.42, 20.0 * sign) for x in (0.2, 0.8) for y in (0.27, 0.73) for sign in (-1, 1)]
-    edges = [held(at, 0.33) for at in ((0.5, 0.2), (0.5, 0.8), (0.15, 0.5), (0.85, 0.5))]
-    tilted = [held((x, 0.5), 0.33, lower_deg=25.0 * sign) for x in (0.4, 0.6) for sign in (-1, 1)]
-    return [*corners, *edges, *tilted, held(share=0.62), held(share=0.6, right_deg=25.0)]
+    """No more than it takes: into each corner tilted both ways, far and near."""
+    corners = [((x, y), x - 0.5, y - 0.5) for x in (0.17, 0.83) for y in (0.25, 0.75)]
+    across = [held(at, 0.42, right_deg=np.copysign(20.0, -right)) for at, right, _ in corners]
+    down = [held(at, 0.42, lower_deg=np.copysign(22.0, -lower)) for at, _, lower in corners]
+    return [
+        *across,
+        *down,
+        held((0.4, 0.5), 0.3),
+        held((0.6, 0.5), 0.3),
+        held(share=0.62),
+        held(share=0.6, right_deg=25.0),
+    ]
 
 
 @cache

@@ -65,7 +65,7 @@ def test_nothing_is_taken_while_the_board_moves_or_is_away() -> None:
 
 
 def test_it_is_enough_when_nothing_is_missing() -> None:
-    guide = CaptureGuide(DEFAULT_BOARD, 12)
+    guide = CaptureGuide(DEFAULT_BOARD, 8)
     for index, picture in enumerate(rendered()):
         assert not guide.enough
         taken = shown(guide, [picture] * 3, index * 10_000 * MS)[-1]
@@ -74,10 +74,10 @@ def test_it_is_enough_when_nothing_is_missing() -> None:
     assert guide.kept == len(good_views())
     assert guide.missing == []
     assert guide.enough
-    few = CaptureGuide(DEFAULT_BOARD, 12)
+    few = CaptureGuide(DEFAULT_BOARD, 8)
     for picture in rendered()[:-2]:
         assert few.remember(picture)
-    assert few.kept == 16
+    assert few.kept == 10
     assert few.missing == ["bring the board nearer"]
     assert not few.enough
 
@@ -160,9 +160,9 @@ def test_pictures_are_kept_as_they_came_or_without_loss(tmp_path: Path) -> None:
 
 def test_it_ends_when_there_are_enough(tmp_path: Path) -> None:
     everything = [picture for picture in rendered() for _ in range(3)]
-    taken = Taken(tmp_path, [*everything, EMPTY], wanted=18)
+    taken = Taken(tmp_path, [*everything, EMPTY], wanted=12)
     assert taken.guide.enough
-    assert len(taken.names) == 18
+    assert len(taken.names) == 12
     assert taken.said == ["camera_fps is 30, asked for 15"]  # the last one was not asked for
 
 
@@ -244,7 +244,7 @@ def test_a_terminal_shows_what_is_missing_and_rings_for_each_picture() -> None:
     screen = io.StringIO()
     guide, view = CaptureGuide(DEFAULT_BOARD, 30), CaptureView(Console(file=screen, force_terminal=True, width=120))
     with view.shown():
-        for index, picture in enumerate([*thrice(0, 1), EMPTY]):
+        for index, picture in enumerate([*thrice(0, 4), EMPTY]):
             view.show(guide.handle_frame(picture, index * STEP_NS), guide)
     last = screen.getvalue().rpartition("groundsbot capture")[2]
     assert screen.getvalue().count("\a") == 2
@@ -291,15 +291,15 @@ def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> No
     pictures.mkdir()
     for number, picture in enumerate(rendered()[:-2], start=1):  # of an earlier time
         (pictures / f"{number:04}.jpg").write_bytes(jpeg(picture))
-    with program(tmp_path, "--views", "12") as process:
-        hold_up(camera, pictures, process, [16, 17])
+    with program(tmp_path, "--views", "8") as process:
+        hold_up(camera, pictures, process, [10, 11])
         said, _ = process.communicate(timeout=30)
     assert process.returncode == 0, said
     lines = said.splitlines()
-    assert "17 of 12: taken; bring the board nearer" in lines
-    assert lines[-2:] == [f"{pictures}: 18 pictures", f"next: groundsbot-calib camera {pictures} -o camera.yaml"]
-    assert sorted(each.name for each in pictures.iterdir()) == [f"{number:04}.jpg" for number in range(1, 19)]
-    for path in (pictures / "0018.jpg", tmp_path / "capture.jpg"):
+    assert "11 of 8: taken; bring the board nearer" in lines
+    assert lines[-2:] == [f"{pictures}: 12 pictures", f"next: groundsbot-calib camera {pictures} -o camera.yaml"]
+    assert sorted(each.name for each in pictures.iterdir()) == [f"{number:04}.jpg" for number in range(1, 13)]
+    for path in (pictures / "0012.jpg", tmp_path / "capture.jpg"):
         assert cv2.imread(str(path)) is not None
 
 
