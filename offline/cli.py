@@ -128,7 +128,8 @@ def map_command(
 ) -> None:
     """Turns the drives in logs into one map of all tags and trajectories, in the frame of the first log's start.
 
-    Exit 3: the runs do not all hang together; the map has several components, and the reasons are printed.
+    Exit 3: the runs do not all hang together, so that the map has several components; or a log is damaged, and the map
+    is without what is lost of it. Which of these is printed.
     """
     from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
@@ -149,7 +150,8 @@ def info(
 ) -> None:
     """Tells what logs hold: run, robot, duration, rates, distance, tags, gaps, events, sizes.
 
-    A log that cannot be read is named at the end, with exit 1; the others are described all the same.
+    A log that cannot be read is named at the end, with exit 1; the others are described all the same. Exit 3: something
+    of a log is lost, and it is said what.
     """
     import json
 
@@ -171,6 +173,8 @@ def info(
         typer.echo(f"error: {earlier}", err=True)
     if refused:
         raise refused[-1]
+    if any(each.lost for each in described):
+        raise typer.Exit(EXIT_WITH_LOSSES)
 
 
 @app.command()
@@ -221,7 +225,7 @@ def detect(
         report = detect_again(log, output, options, show)
     for line in report.lines():
         typer.echo(line)
-    if report.n_unusable or report.losses.n_lost:
+    if report.n_unusable or report.losses.in_words:
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 

@@ -32,6 +32,12 @@ def coarse_keyframes(chain: Chain) -> IntArray:
     return np.array(chosen, dtype=np.int64)
 
 
+def reading_keyframes(chain: Chain) -> IntArray:
+    """(k,) the first and the last keyframe of a chain and those that read tags, rising."""
+    ends = [0, len(chain.stamps_ns) - 1]
+    return np.union1d(chain.readings.keyframe, ends)
+
+
 def coarsened(chain: Chain, keyframes: IntArray) -> Chain:
     """The chain at some of its keyframes, the first one and the last among them; other readings are passed over.
 

@@ -16,12 +16,13 @@ import numpy as np
 from scipy import stats
 
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import Columns, State, stacked
+from offline.effort import Effort
+from offline.factors import Columns, OdometryFactors, State, stacked
 from offline.measured_factors import NOTHING_MEASURED
 from offline.odometry import chained
 from offline.robust import losses_and_weights
 from offline.shared_errors import fit_shared_errors
-from offline.solver import DEFAULT_LOSSES, Losses, Problem, Solution, solve
+from offline.solver import DEFAULT_LOSSES, MAX_STEPS, Losses, Problem, Solution, solve
 
 # Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
@@ -36,6 +37,7 @@ _FACTOR_TOLERANCE: Final = 0.02
 _MAX_FITS: Final = 20
 _ROUNDING: Final = 1e-6
 _N_SIGNS: Final = 8
+_AT_ONCE: Final = 4096  # motions: a Jacobian of all of them takes as much memory as the solve
 _SEED: Final = 7
 
 
@@ -87,6 +89,7 @@ class Windows:
         freedom: what chi-square's degrees of freedom the noise is known like.
         cost: of all windows apart, under that noise.
         n_conditions: how many numbers more the windows have to fit with than the whole.
+        most_steps: of a solve.
     """
 
     problem: Problem
@@ -96,11 +99,12 @@ class Windows:
     freedom: float
     cost: float
     n_conditions: int
+    most_steps: int = MAX_STEPS
 
     def judge(self, state: State) -> Goodness:
         """What it costs to join them in the valley of a state."""
         problem = _scaled(self.problem, self.factors[0], self.factors[1] * self.sharing)
-        together = solve(problem, state, losses=self.losses)
+        together = solve(problem, state, losses=self.losses, most_steps=self.most_steps)
         n = self.n_conditions
         quantile = stats.f.isf(FALSE_ALARM, n, self.freedom) if n else 1.0
         return Goodness(
@@ -112,32 +116,62 @@ class Windows:
         )
 
 
-def fitted_windows(problem: Problem, losses: Losses = DEFAULT_LOSSES) -> Windows:
+def fitted_windows(
+    problem: Problem, losses: Losses = DEFAULT_LOSSES, effort: Effort | None = None, share: float = 1.0
+) -> Windows:
     """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
 
     What somebody measured is left out on both sides: it is held against the map on its own.
+
+    Args:
+        problem: the whole.
+        losses: of wheels and readings.
+        effort: what the logs are worth, of which a share is for this; without end where None. Where it does not suffice
+            windows are longer, or not solved to their end: the whole then seems to fit better than it does.
+        share: of it.
     """
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
-    apart = in_windows(problem)
+    apart = _affordable_windows(problem, effort)
     state = _dead_reckoned(problem, apart)
+    left = effort.steps(apart, share, _MAX_FITS * MAX_STEPS) if effort else _MAX_FITS * MAX_STEPS
     factors, redundancy = np.ones(2), np.zeros(2)
     for _ in range(_MAX_FITS):
-        solution = solve(_scaled(apart, *factors), state, losses=losses)
+        solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=min(left, MAX_STEPS))
+        left -= len(solution.costs)
+        if effort:
+            effort.spend(solution)
         squares, redundancy = _left_over(solution)
         before, factors = factors, np.sqrt((squares * factors**2 + _TOLD) / (redundancy + _TOLD))
         state = solution.state
-        if np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
+        del solution  # and what it takes, before the next one
+        if left <= 0 or np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
             break
     # Drives that only a tape joins have more unknowns together than apart.
     n_conditions = max(0, _freedom(problem) - _freedom(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
-    solution = solve(_scaled(apart, *factors), state, losses=losses)
+    most_steps = max(1, min(left, MAX_STEPS))
+    solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=most_steps)
     if n_conditions:
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
         sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
-        solution = solve(_scaled(apart, factors[0], factors[1] * sharing), solution.state, losses=losses)
-    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions)
+        state = solution.state
+        del solution
+        shared = _scaled(apart, factors[0], factors[1] * sharing)
+        solution = solve(shared, state, losses=losses, most_steps=most_steps)
+    of_the_whole = effort.steps(problem, share) if effort else MAX_STEPS
+    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, of_the_whole)
+
+
+def _affordable_windows(problem: Problem, effort: Effort | None) -> Problem:
+    """In windows, which are longer where there is not enough effort for so many tags of their own."""
+    window_m = WINDOW_M
+    apart = in_windows(problem)
+    driven_m = float(np.hypot(problem.odometry.motion[:, 0], problem.odometry.motion[:, 1]).sum())
+    while effort and window_m < driven_m and not effort.suffices(apart):
+        window_m *= 2.0
+        apart = in_windows(problem, window_m)
+    return apart
 
 
 def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
@@ -148,18 +182,22 @@ def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
     tag = _numbered(window[readings.pose], readings.tag)
     _, first_reading = np.unique(tag, return_index=True)
     return Problem(
-        odometry=replace(
-            odometry,
-            first=odometry.first[inside],
-            motion=odometry.motion[inside],
-            whitening=odometry.whitening[inside],
-            jacobian=odometry.jacobian[inside],
-            parameters=odometry.parameters[inside],
-        ),
+        odometry=_part(odometry, inside),
         readings=replace(readings, tag=tag),
         prior=problem.prior,
         columns=_columns(window, len(first_reading), problem.columns.calibration >= 0),
         anchor=readings.pose[first_reading],
+    )
+
+
+def _part(odometry: OdometryFactors, which: BoolArray | slice) -> OdometryFactors:
+    return replace(
+        odometry,
+        first=odometry.first[which],
+        motion=odometry.motion[which],
+        whitening=odometry.whitening[which],
+        jacobian=odometry.jacobian[which],
+        parameters=odometry.parameters[which],
     )
 
 
@@ -235,12 +273,14 @@ def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
     problem, state = solution.problem, solution.state
     odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
     readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))
-    jacobian, _ = stacked((problem.odometry.linearise(state, problem.columns),), problem.columns.n)
-    signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (_N_SIGNS, jacobian.shape[0]))
-    taken = 0.0
-    for z in signs:
-        pulled = jacobian.T @ z
-        taken += float(pulled @ solution.factorisation.solve(pulled)) / _N_SIGNS
-    free = max(0.0, jacobian.shape[0] - taken)
+    columns, n_columns = problem.columns, problem.columns.n
+    signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (_N_SIGNS, problem.odometry.motion.size))
+    pulled = np.zeros((_N_SIGNS, n_columns))
+    for begin in range(0, len(problem.odometry.first), _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        jacobian, _ = stacked((_part(problem.odometry, some).linearise(state, columns),), n_columns)
+        pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
+    taken = sum(float(each @ solution.factorisation.solve(each)) for each in pulled) / _N_SIGNS
+    free = max(0.0, problem.odometry.motion.size - taken)
     whole = max(0, _freedom(problem))
     return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])

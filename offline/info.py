@@ -72,7 +72,8 @@ class LogInfo:
     gaps: tuple[Gap, ...]
     events: dict[str, int]  # kind: how many messages
     file_bytes: dict[str, int]
-    losses: tuple[str, ...]  # what of it cannot be read, in words
+    losses: tuple[str, ...]  # what is amiss with its files, in words
+    lost: str  # what of it cannot be read, in words; empty where all can
 
     def as_json(self) -> dict[str, Any]:
         """For `--json`: plain data."""
@@ -125,6 +126,8 @@ class LogInfo:
         if self.n_wheel_lines_lost:
             lines.append(f"  {counted(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
         lines.extend(f"  damaged: {loss}" for loss in self.losses)
+        if self.lost:
+            lines.append(f"  lost: {self.lost}")
         return lines
 
 
@@ -163,6 +166,7 @@ def describe_log(log: Path) -> LogInfo:
         events=dict(sorted(collected.events.items())),
         file_bytes=_file_bytes(log),
         losses=tuple(losses.lines(_PLACES_TOLD)),
+        lost=losses.in_words,
     )
 
 

@@ -3,9 +3,9 @@
 A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
 from there does not fit together, the drive is built up again with other draws of the wheels' noise, until one fits.
 
-Readings that contradict each other everywhere make each of these solves take hundreds of steps, where those of a drive
-take four. So that a small file of them does not take minutes, the search has an effort to spend, which grows with the
-log: a drive's log has some hundred bytes a keyframe.
+Readings that contradict each other everywhere make each of these solves take a hundred steps, where those of a drive
+take four. So that a small file of them does not take minutes, all of it shares the effort that the log is worth: solves
+end early, and the map says that they did.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.chain import Chain
-from offline.coarse_chain import coarse_keyframes, coarsened, refined
-from offline.errors import OfflineError
-from offline.goodness import Goodness, fitted_windows
+from offline.coarse_chain import coarse_keyframes, coarsened, reading_keyframes, refined
+from offline.effort import Effort
+from offline.goodness import Goodness, Windows, fitted_windows
 from offline.graph import Graph, Parameter, build_graph
 from offline.odometry import chained
 from offline.run import TagKey
@@ -32,12 +32,12 @@ _PIECE_SHARE: Final = 0.01
 # In squared sigmas: a piece is only the next one's start.
 _PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
-# Effort: factors linearised. A drive of 10,000 keyframes takes 0.4 million a start, and its log has 4 MB; one of 2 km
-# past few tags takes 0.5 million.
-_FREE_EFFORT: Final = 1_000_000
-_EFFORT_PER_BYTE: Final = 1.0
-# Linearisations a piece, on average: three to five on any drive, hundreds where no reading agrees with the next.
-_MOST_STEPS: Final = 50
+# A piece takes three to five steps on any drive.
+_MOST_STEPS_A_PIECE: Final = 20
+# Of the effort that a log is worth.
+_BUILDING_SHARE: Final = 0.5
+_WINDOWS_SHARE: Final = 0.2
+_SOLVING_SHARE: Final = 0.2
 
 
 @dataclass(frozen=True)
@@ -72,40 +72,60 @@ class _BuiltUp(NamedTuple):
     wheel_calibration: FloatArray
     tags: dict[TagKey, FloatArray]
     calibration: dict[Parameter, float]
-    effort: float = 0.0
 
 
-def solve_local_map(chain: Chain) -> LocalMap:
+def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort left; the first that fits
     counts, else the one of least cost, whose `goodness` then says that it does not fit.
 
+    Args:
+        chain: what was measured.
+        effort: that all stretches of its log share; the whole log's where None.
+
     Raises:
-        OfflineError: the readings contradict each other so much that nothing comes of building up.
+        OfflineError: there are more readings than a log of this size can be worth.
     """
+    effort = effort or Effort.of_log(chain.run.log_bytes)
     graph = build_graph([chain])
+    effort.check(graph.problem, chain.run.log, chain.name)
     keyframes = coarse_keyframes(chain)
     coarse = coarsened(chain, keyframes)
-    known = _built_up(coarse)
-    windows = fitted_windows(graph.problem)
+    known = _built_up(coarse, effort)
+    check = _Check(graph, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
-    left = _allowed_effort(chain)
     for _ in range(1 + _OTHER_STARTS):
         poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
-        solution = solve(graph.problem, graph.start(poses, known.tags, known.calibration))
+        start = graph.start(poses, known.tags, known.calibration)
+        solution = solve(graph.problem, start, most_steps=effort.steps(graph.problem, _SOLVING_SHARE))
+        effort.spend(solution)
         if best is None or solution.cost < best.solution.cost:
-            best = LocalMap(chain, graph, solution, windows.judge(solution.state))
+            best = LocalMap(chain, graph, solution, check.judge(solution))
             if best.goodness.fits:
                 break
-        left -= known.effort + _effort(solution)
-        if left < 0.0:
+        if effort.left < 0.0:
             break
-        known = _built_up(_redrawn(coarse, rng))
+        known = _built_up(_redrawn(coarse, rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
     return best
+
+
+class _Check:
+    """Whether solutions of a chain fit together; from poses that read tags, since the others have nothing to say."""
+
+    def __init__(self, graph: Graph, effort: Effort) -> None:
+        (chain,) = graph.chains
+        self._keyframes = reading_keyframes(chain)
+        if len(self._keyframes) < len(chain.stamps_ns):
+            graph = build_graph([coarsened(chain, self._keyframes)])
+        self._windows: Windows = fitted_windows(graph.problem, effort=effort, share=_WINDOWS_SHARE)
+
+    def judge(self, solution: Solution) -> Goodness:
+        state = solution.state
+        return self._windows.judge(replace(state, poses=state.poses[self._keyframes]))
 
 
 def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
@@ -115,37 +135,24 @@ def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
     return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _built_up(chain: Chain) -> _BuiltUp:
-    """Solves the chain piece by piece, each from the solution of the last."""
+def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
+    """Solves the chain piece by piece, each from the solution of the last; dead reckoning where effort ends."""
     known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
-    n_linearised = 0
-    for n_solved, n_keyframes in enumerate(_pieces(chain), start=1):
+    enough = effort.left - _BUILDING_SHARE * effort.allowed
+    for n_keyframes in _pieces(chain):
         part = chain.prefix(n_keyframes)
         graph = build_graph([part])
         poses = _extended(part, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE)
-        n_linearised += solution.n_linearised
-        state, effort = solution.state, known.effort + _effort(solution)
-        if effort > _allowed_effort(chain) and n_linearised > _MOST_STEPS * n_solved:
-            raise OfflineError(
-                f"{chain.run.log}: {chain.name}: its wheels and tag readings contradict each other all along "
-                f"({n_linearised / n_solved:.0f} steps of the solver a piece, limit {_MOST_STEPS}; a drive takes 4); "
-                "are robot.yaml and the camera's calibration those of this robot?"
-            )
+        most_steps = effort.steps(graph.problem, _BUILDING_SHARE, _MOST_STEPS_A_PIECE)
+        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_steps=most_steps)
+        effort.spend(solution)
+        state = solution.state
         wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
-        known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state), effort)
-    return known
-
-
-def _allowed_effort(chain: Chain) -> float:
-    return _FREE_EFFORT + _EFFORT_PER_BYTE * chain.run.log_bytes
-
-
-def _effort(solution: Solution) -> float:
-    """How many factors were linearised."""
-    problem = solution.problem
-    return float(solution.n_linearised * (len(problem.odometry.first) + len(problem.readings.tag)))
+        known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state))
+        if effort.left < enough:
+            break
+    return known._replace(poses=_extended(chain, known.poses, known.wheel_calibration))
 
 
 def _pieces(chain: Chain) -> list[int]:

@@ -84,8 +84,8 @@ def _say(text: str) -> None:
 
 
 def exit_code(result: MapResult) -> int:
-    """Done, or done in several components."""
-    return EXIT_WITH_LOSSES if len(result.components) > 1 else EXIT_DONE
+    """Done, or done in several components or with logs of which something is lost."""
+    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses else EXIT_DONE
 
 
 def summary(result: MapResult, output: Path) -> list[str]:
@@ -102,6 +102,7 @@ def summary(result: MapResult, output: Path) -> list[str]:
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
     lines += [_metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     lines += [f"warning: {warning}" for warning in result.warnings]
+    lines += [f"lost: {loss}" for loss in result.losses]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
 
 

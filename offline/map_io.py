@@ -95,6 +95,7 @@ def read_map(folder: Path) -> MapResult:
             checks=tuple(_check(entry) for entry in data["checks"]),
             metres=tuple(MetreResult(**entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
+            losses=tuple(data.get("losses", ())),
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
@@ -132,6 +133,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "metres": [vars(entry) for entry in result.metres],
         "suspect_tags": [],
         "warnings": list(result.warnings),
+        "losses": list(result.losses),
     }
 
 

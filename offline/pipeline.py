@@ -6,6 +6,7 @@ from pathlib import Path
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
 from offline.checks import COMPARED, check_warnings, checks_of, metre_of
+from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
@@ -93,8 +94,9 @@ def build_map(
     measurements = _measurements(tape, runs, chains)
     maps = []
     with stages.stage("local maps", len(chains)) as done:
+        efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
         for chain in chains:
-            maps.append(solve_local_map(chain))
+            maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
@@ -127,6 +129,7 @@ def build_map(
         checks=tuple(checks),
         metres=tuple(metres),
         warnings=tuple(dict.fromkeys(warnings)),
+        losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
     )
 
 

@@ -192,6 +192,7 @@ class MapResult:
     checks: tuple[CheckResult, ...] = ()
     metres: tuple[MetreResult, ...] = ()
     warnings: tuple[str, ...] = field(default=())
+    losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

@@ -78,6 +78,7 @@ class Run:
         camera: None in an imported log.
         warnings: what a person should know.
         log_bytes: of the log; how much work it is worth.
+        lost: what of the log cannot be read, in words; empty where all can.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Run:
     positions: Positions
     warnings: tuple[str, ...]
     log_bytes: int = 0
+    lost: str = ""
 
 
 # Readings with corrected bits are the ones that turn out to be phantoms.
@@ -100,6 +102,9 @@ MAX_HAMMING = 0
 # All that the families we know have together: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
 # kilobytes with a thousand tags took over 400 MiB.
 _MOST_TAGS = 652
+# A reading that was measured takes twelve bytes at least: noise cannot be compressed.
+_FREE_READINGS = 60_000
+_LEAST_BYTES_A_READING = 10
 
 
 @dataclass
@@ -116,6 +121,7 @@ class _Collected:
     observations: list[TagObservations] = field(default_factory=list)
     n_other_size: int = 0
     n_corrected: int = 0
+    n_readings: int = 0
 
     def add(self, entry: LogMessage) -> None:
         """Takes one message of the log."""
@@ -128,6 +134,7 @@ class _Collected:
             self.odometry.append(message)
         elif isinstance(message, TagObservations):
             self.observations.append(message)
+            self.n_readings += len(message.observations)
         elif isinstance(message, RunInfo):
             self.info = self.info or message
         elif isinstance(message, CameraCalibration):
@@ -140,6 +147,7 @@ class _Collected:
             self.n_other_size += 1
             return
         self.pictures.append(message.stamp_ns)
+        self.n_readings += len(message.detections)
         for detection in message.detections:
             if detection.hamming > MAX_HAMMING or len(detection.corners_px) != 8:
                 self.n_corrected += 1
@@ -181,8 +189,15 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
     """
     log = Path(log)
     collected, losses = _Collected(), LogLosses()
+    log_bytes = _size_bytes(log)
+    most = _FREE_READINGS + log_bytes // _LEAST_BYTES_A_READING
     for entry in read_log(log, topics=_TOPICS, losses=losses):
         collected.add(entry)
+        if collected.n_readings > most:
+            raise OfflineError(
+                f"{log}: more than {most} tag readings, the limit for a log of {log_bytes} bytes: a tag that was "
+                "measured takes more room; was this file made for a test? leave out some of the looks"
+            )
     info = collected.info
     if info is None:
         found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
@@ -213,7 +228,8 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
         detections=replace(detections, stamps_ns=detections.stamps_ns - late_ns),
         positions=positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
-        log_bytes=_size_bytes(log),
+        log_bytes=log_bytes,
+        lost=losses.in_words,
     )
 
 

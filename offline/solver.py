@@ -27,7 +27,7 @@ from offline.tied_down import Untied, untied_parts
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0
 
-_MAX_ITERATIONS: Final = 100
+MAX_STEPS: Final = 100
 # The cost is in squared sigmas: a step that would lower it by this much less is some 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
 _COST_ROUNDING: Final = 1e-14  # relative
@@ -187,6 +187,7 @@ def solve(
     relative_tolerance: float = _COST_ROUNDING,
     relaxed_steps: int = 0,
     threads: int = 1,
+    most_steps: int = MAX_STEPS,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -195,7 +196,7 @@ def solve(
     - "converged": by its linear model the next step, Gauss-Newton's unless damping was needed up to here, would lower
       the cost by no more than the tolerance. At an optimum that is before the first step.
     - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
-    - "stopped after 100 steps".
+    - "stopped after N steps", where `most_steps` says N.
     - "a variable is in no factor", "the cost is no number at the start".
 
     What nothing ties down stays where it was: damping holds it.
@@ -209,6 +210,7 @@ def solve(
         relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
             that a start lies in.
         threads: on how many cores chains are eliminated.
+        most_steps: how many to try, relaxed ones aside.
     """
     arrowhead = problem.arrowhead
     system, spare, rows = arrowhead.scratch
@@ -222,7 +224,7 @@ def solve(
 
     if not np.isfinite(cost):
         return ended("the cost is no number at the start", converged=False)
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(most_steps):
         try:
             factorisation, used = _factorised(arrowhead, system, damping.share, rows, threads)
         except UnderDeterminedError:
@@ -250,7 +252,7 @@ def solve(
         if relative_tolerance > _COST_ROUNDING and damping.is_least and left <= relative_tolerance * cost:
             return ended("converged", converged=True)
         damping.step_taken(gain)
-    return ended(f"stopped after {_MAX_ITERATIONS} steps", converged=False)
+    return ended(f"stopped after {most_steps} steps", converged=False)
 
 
 def _factorised(

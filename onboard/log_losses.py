@@ -75,6 +75,17 @@ class LogLosses:
         """How many things are lost, as far as they can be counted; a missing end or index as such is none."""
         return self.n_torn + self.n_chunks + self.n_undecodable
 
+    @property
+    def in_words(self) -> str:
+        """What is lost, in a line; empty where nothing is."""
+        counts = (
+            (self.n_torn, f"damaged place of {self.n_bytes} bytes", f"damaged places of {self.n_bytes} bytes in all"),
+            (self.n_chunks, "chunk that the index names", "chunks that the index names"),
+            (self.n_undecodable, "message that cannot be decoded", "messages that cannot be decoded"),
+            (len(self.unusable), "file that holds nothing", "files that hold nothing"),
+        )
+        return ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts if n)
+
     def __bool__(self) -> bool:
         """Whether anything is amiss, an unfinished file included."""
         return bool(self.n_places or self.n_chunks or self.n_undecodable or self.unfinished or self.unusable)

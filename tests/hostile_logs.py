@@ -177,19 +177,48 @@ def tags_seen(count: int, per_message: int) -> bytes:
     return of_messages(*contents)
 
 
-def observed(count: int, n_tags: int | None = None, per_message: int = 2) -> bytes:
-    """A straight drive past tags that all seem to lie a metre ahead; after `n_tags` the first ones come again."""
+def observed(
+    count: int, n_tags: int | None = None, per_message: int = 2, step_m: float = 0.05, agree: bool = False
+) -> bytes:
+    """A straight drive past tags that all seem to lie a metre ahead; after `n_tags` the first ones come again.
+
+    Args:
+        count: looks.
+        n_tags: different ones; two new ones a look where None.
+        per_message: tags a look.
+        step_m: from look to look.
+        agree: all tags lie at the start instead, so that readings of one fit together.
+    """
     contents: list[Content] = []
     for index in range(count):
         at_ns = START_NS + index * 100 * MS
-        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
-        place = TagObservation.Cartesian(x_m=1.0, y_m=0.1)
+        rolled = PlanarOdometry.WheelDistances(left_m=index * step_m, right_m=index * step_m)
+        place = TagObservation.Cartesian(x_m=-index * step_m if agree else 1.0, y_m=0.1)
         ids = [index * per_message + k if n_tags else index + k for k in range(per_message)]
         numbers = [each % n_tags if n_tags else each for each in ids]
         tags = [TagObservation(family="tag36h11", tag_id=number, cartesian=place) for number in numbers]
         contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
         seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
         contents.append(("/tags/observations", seen, at_ns))
+    return of_messages(*contents)
+
+
+def resets(stretches: int, n_tags: int, looks: int = 2) -> bytes:
+    """A controller that restarts, and some looks at all tags in between."""
+    corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
+    lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
+    camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
+    contents: list[Content] = [("/camera/calibration", camera, START_NS)]
+    tags = [TagDetection(family="tag36h11", tag_id=k, corners_px=corners) for k in range(n_tags)]
+    for index in range(stretches * looks):
+        at_ns = START_NS + index * 100 * MS
+        rolled = 100 * (index % looks)
+        wheels = WheelEncoders(
+            stamp_ns=at_ns, boot_id=index // looks, sequence=index, ticks_left=rolled, ticks_right=rolled
+        )
+        contents.append(("/wheels", wheels, at_ns))
+        found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
+        contents.append(("/tags/detections", found, at_ns))
     return of_messages(*contents)
 
 
@@ -249,6 +278,13 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "all tags again and again": lambda: observed(2000, 650),
     "few tags all along": lambda: full(lambda n: observed(n, 50)),
     "a hundred tags a look": lambda: observed(2000, 600, 100),
+    "a hundred tags a look that fit": lambda: observed(2000, 600, 100, step_m=0.041, agree=True),
+    "twenty tags a look": lambda: full(lambda n: observed(n, 600, 20)),
+    "tags a look, far apart": lambda: observed(2000, 600, 100, step_m=2.0),
+    "few tags, far apart": lambda: full(lambda n: observed(n, 50, step_m=10.0)),
+    "few tags that fit": lambda: full(lambda n: observed(n, 50, step_m=0.041, agree=True)),
+    "a reset each look": lambda: resets(100, 400),
+    "resets": lambda: resets(100, 10, 80),
     "keyframes": lambda: full(driven),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),

@@ -200,6 +200,7 @@ def made_run(
         detections=detections or Detections(none, none, np.zeros((0, 4, 2))),
         positions=positions or made_positions(none, none, np.zeros((0, 2))),
         warnings=(),
+        log_bytes=1 << 24,
     )
 
 

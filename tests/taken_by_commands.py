@@ -1,4 +1,4 @@
-"""What a command takes in memory and time of a file that may be hostile."""
+"""What a command takes in memory and processor time of a file that may be hostile."""
 
 import json
 import subprocess
@@ -11,14 +11,14 @@ class Taken(NamedTuple):
     """What one command took of one file."""
 
     code: int
-    seconds: float
+    seconds: float  # of the processor, children included
     extra_bytes: int  # above the idle size
     said: str
 
 
 # Measures in one process what each file takes; the peak is reset in between. Children count too.
 _MEASURE = """
-import contextlib, importlib, io, json, re, shutil, sys, tempfile, time
+import contextlib, importlib, io, json, re, resource, shutil, sys, tempfile
 from pathlib import Path
 from offline import cli
 for name in sys.argv[1].split(","):
@@ -27,6 +27,9 @@ for name in sys.argv[1].split(","):
 def status(name, pid="self"):
     return int(re.search(name + r":\\s+(\\d+)", Path(f"/proc/{pid}/status").read_text())[1]) * 1024
 
+def cpu_seconds():
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
 for line in sys.stdin:
     command, path = json.loads(line)
     place = Path(tempfile.mkdtemp())
@@ -34,7 +37,7 @@ for line in sys.stdin:
     sys.argv = ["groundsbot-offline", command, path, *map(str, output)]
     Path("/proc/self/clear_refs").write_text("5")
     idle = status("VmRSS")
-    out, start = io.StringIO(), time.monotonic()
+    out, start = io.StringIO(), cpu_seconds()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         try:
             cli.main()
@@ -43,7 +46,7 @@ for line in sys.stdin:
         except BaseException as error:
             code = 99
             print("TRACEBACK", type(error).__name__, error)
-    taken = time.monotonic() - start, status("VmHWM") - idle
+    taken = cpu_seconds() - start, status("VmHWM") - idle
     shutil.rmtree(place)
     print(json.dumps([code or 0, *taken, out.getvalue()[-300:]]), flush=True)
 """

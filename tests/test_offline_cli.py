@@ -1,6 +1,7 @@
 """groundsbot-offline as a person meets it: text, JSON, exit codes."""
 
 import json
+import struct
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,22 @@ def test_info_describes_the_good_and_names_the_bad(run: Run, drive: Path, tmp_pa
     missing = run("info", tmp_path / "nowhere")
     assert (missing.code, missing.out) == (1, "")
     assert "nowhere" in missing.err
+
+
+def test_info_of_a_damaged_log_ends_with_exit_code_3(run: Run, drive: Path, tmp_path: Path) -> None:
+    run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
+    (file,) = (tmp_path / "logs").rglob("*.mcap")
+    whole = file.read_bytes()
+    data_end = whole.index(struct.pack("<BQ", 0x0F, 4))
+    file.write_bytes(whole[:data_end] + b"x" * 100 + whole[data_end:])
+    outcome = run("info", tmp_path / "logs")
+    assert outcome.code == 3
+    assert "lost: 1 damaged place of " in outcome.out
+    file.unlink()
+    file.with_name(file.name + ".active").write_bytes(whole[:data_end])
+    outcome = run("info", tmp_path / "logs")
+    assert outcome.code == 0
+    assert "was never finished" in outcome.out
 
 
 def test_compare_prints_figures_as_text_and_json(run: Run, truth_file: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from offline import pipeline
 from offline.chain import Chain
+from offline.effort import Effort
 from offline.goodness import Goodness, fitted_windows, in_windows
 from offline.graph import build_graph
 from offline.local_map import LocalMap, solve_local_map
@@ -97,7 +98,7 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     log = write_drive(tmp_path, made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert pipeline.map_logs([log]).warnings == ()
 
-    def contradictory(chain: Chain) -> LocalMap:
+    def contradictory(chain: Chain, _: Effort) -> LocalMap:
         return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
 
     monkeypatch.setattr(pipeline, "solve_local_map", contradictory)

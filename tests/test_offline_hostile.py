@@ -19,7 +19,16 @@ PICTURES = ("JPEG of 65535 x 65535", "PNG of 12000 x 12000")
         ("info", QUICK),
         ("salvage", QUICK),
         ("detect", (*QUICK, *PICTURES)),
-        ("map", ("claimed lengths", "extreme numbers", "a reset each reading", "tags in one picture")),
+        (
+            "map",
+            (
+                "claimed lengths",
+                "extreme numbers",
+                "a reset each reading",
+                "tags in one picture",
+                "a hundred tags a look",
+            ),
+        ),
         *(pytest.param(command, tuple(HOSTILE), marks=pytest.mark.long) for command in ("info", "salvage", "detect")),
     ],
 )

@@ -10,6 +10,7 @@ from calib import se2
 from offline import local_map
 from offline.chain import Chain
 from offline.coarse_chain import coarse_keyframes, coarsened, refined
+from offline.effort import Effort
 from offline.graph import build_graph
 from offline.local_map import solve_local_map
 from offline.solver import solve
@@ -47,11 +48,11 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
     """Has the first start be dead reckoning; gathers what is started from."""
     starts: list[Chain] = []
-    built_up: Callable[[Chain], Any] = local_map._built_up
+    built_up: Callable[[Chain, Effort], Any] = local_map._built_up
 
-    def worse(chain: Chain) -> Any:
+    def worse(chain: Chain, effort: Effort) -> Any:
         starts.append(chain)
-        known = built_up(chain)
+        known = built_up(chain, effort)
         if len(starts) > 1:
             return known
         return known._replace(

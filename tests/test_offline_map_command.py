@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from google.protobuf.message import Message
+from mcap.reader import make_reader
 
 from calib.camera_file import write_camera_yaml
+from calib.command_line import EXIT_WITH_LOSSES
 from calib.robot import write_robot_yaml
 from offline.map_io import read_map
 from onboard.log_head import log_head
@@ -151,9 +154,41 @@ def test_a_damaged_log_is_mapped_as_far_as_it_goes(
         flipped[whole.index(ZSTD_MAGIC, len(whole) // 2) + 100] ^= 0x10
         damaged.write_bytes(flipped)
     outcome = map_to(damaged)
+    assert outcome.code == EXIT_WITH_LOSSES
     assert "damaged.mcap" in outcome.out[outcome.out.index("warning: ") :]
-    (run,) = read_map(tmp_path / "out").runs
+    (said,) = [line for line in outcome.out.splitlines() if line.startswith("lost: ")]
+    assert f"what is lost of {damaged}: 1 damaged place of " in said
+    found = read_map(tmp_path / "out")
+    (run,) = found.runs
     assert run.log == damaged
+    assert found.losses == (said.removeprefix("lost: "),)
+
+
+def test_a_killed_recording_in_a_folder_of_runs_is_mapped_with_a_word(
+    map_to: Run, logs: dict[str, Path], tmp_path: Path
+) -> None:
+    """Its file is still called `.active` and has no end; all whole chunks are there, so nothing is known to be lost."""
+    runs = tmp_path / "runs"
+    for name in ("a", "b"):
+        shutil.copytree(logs[name], runs / name)
+    finished = runs / "b" / "0000.core.mcap"
+    data = finished.read_bytes()
+    finished.unlink()
+    with (logs["b"] / "0000.core.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    last = summary.chunk_indexes[-1]
+    end = last.chunk_start_offset + last.chunk_length
+    active = runs / "b" / "0000.core.mcap.active"
+    active.write_bytes(data[:end])
+    outcome = map_to(runs)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "0000.core.mcap.active: was never finished; read as far as it goes" in outcome.out
+    assert {run.log for run in read_map(tmp_path / "out").runs} == {runs / "a", runs / "b"}
+    active.write_bytes(data[: end - 7])
+    outcome = map_to(runs, "--overwrite")
+    assert outcome.code == EXIT_WITH_LOSSES
+    assert "lost: b_" in outcome.out
 
 
 def test_a_camera_file_of_another_size(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:

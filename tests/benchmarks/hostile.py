@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.hostile [info salvage detect map]
 
-Prints seconds and memory above the idle size; marks what takes over 10 s or 256 MiB, and ends with exit code 1 then.
+Prints seconds of the processor and memory above the idle size; marks what takes over 10 s or 256 MiB, and ends with
+exit code 1 then.
 """
 
 import sys

@@ -1,0 +1,70 @@
+"""How long a process was ready to run while others had the processor.
+
+A limit of seconds is a promise about a computer that has nothing better to do; a machine full of tests holds a process
+up for as long as it likes. Linux counts that time for each thread (proc(5), /proc/PID/task/TID/schedstat: its second
+number), so a test can hold the promise to its seconds on any machine.
+"""
+
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+_LOOK_S = 0.01
+_PATIENCE_S = 300.0
+
+
+class ProcessorWait:
+    """Adds up, look by look, what the threads of a process and of its children waited."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._waited_ns: dict[str, int] = {}
+        self._at_start_ns: dict[str, int] = {}
+        self.look()
+        self._at_start_ns = dict(self._waited_ns)
+
+    def look(self) -> None:
+        for pid in (str(self._pid), *_children(self._pid)):
+            for thread in _listed(Path(f"/proc/{pid}/task")):
+                try:
+                    self._waited_ns[thread.name] = int((thread / "schedstat").read_text().split()[1])
+                except (OSError, IndexError):
+                    continue  # it ended just now
+
+    @property
+    def seconds(self) -> float:
+        """Since the beginning; by all threads, of which one or two matter: an upper bound."""
+        return 1e-9 * sum(ns - self._at_start_ns.get(thread, 0) for thread, ns in self._waited_ns.items())
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError:
+        return []
+
+
+def _children(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return []
+
+
+def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
+    """Waits for the end of a process; fails where it takes longer than the limit, waits for a processor aside.
+
+    Returns:
+        What it said.
+    """
+    wait, start_s = ProcessorWait(process.pid), time.monotonic()
+    said: list[str] = []
+    reader = threading.Thread(target=lambda: said.append(process.communicate(timeout=_PATIENCE_S)[0]), daemon=True)
+    reader.start()
+    while reader.is_alive():
+        wait.look()
+        took_s = time.monotonic() - start_s
+        assert took_s - wait.seconds <= limit_s, f"{took_s:.1f} s, {wait.seconds:.1f} s of them waiting for a processor"
+        reader.join(_LOOK_S)
+    return said[0]

@@ -1,0 +1,106 @@
+"""How much a log is worth: what a small file may ask for, and that drives stay far below it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.noise import NoiseParameters
+from offline.chain import chains_of
+from offline.effort import Effort, step_work
+from offline.errors import OfflineError
+from offline.graph import build_graph
+from offline.local_map import solve_local_map
+from offline.run import load_run
+from offline.solver import MAX_STEPS
+from tests.hostile_logs import observed, resets
+from tests.made_long_drives import made_long_drive, made_town
+
+# As few as noise can be packed into.
+BYTES_A_LOOK = 50
+BYTES_A_READING = 12
+
+
+def written(data: bytes, folder: Path) -> Path:
+    path = folder / "made.mcap"
+    path.write_bytes(data)
+    return path
+
+
+def refusal(log: Path) -> str:
+    with pytest.raises(OfflineError) as refused:
+        load_run(log)
+    (line,) = str(refused.value).splitlines()
+    return line
+
+
+def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
+    line = refusal(written(observed(652), tmp_path))
+    assert line.endswith(
+        "made.mcap: 653 different tags, limit 652 (as many as all families have); are their numbers right?"
+    )
+    assert len(load_run(written(observed(651), tmp_path)).tags) == 652
+
+
+def test_more_than_a_hundred_restarts_of_the_controller_are_refused(tmp_path: Path) -> None:
+    line = refusal(written(resets(102, 1), tmp_path))
+    assert "made.mcap" in line
+    assert "101" in line
+    assert "100" in line
+    assert len(load_run(written(resets(101, 1), tmp_path)).stretches) == 101
+
+
+def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = written(observed(4000, 10), tmp_path)
+    assert len(load_run(log).positions.tag) == 8000
+    monkeypatch.setattr("offline.run._FREE_READINGS", 0)
+    most = log.stat().st_size // 10
+    assert most < 8000
+    assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
+
+
+def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
+    (chain,) = chains_of(load_run(written(observed(300, 600, 100), tmp_path)), NoiseParameters())
+    with pytest.raises(OfflineError) as refused:
+        solve_local_map(chain)
+    (line,) = str(refused.value).splitlines()
+    for words in ("made.mcap: gb1_r: 30000 readings of 600 tags from 300 keyframes", "limit 1.0e9", "leave out some"):
+        assert words in line
+
+
+def test_stretches_share_what_their_log_is_worth() -> None:
+    chain = made_long_drive(4, 100.0).chain
+    work = step_work(build_graph([chain]).problem)
+    effort = Effort.of_log(0)
+    effort.allowed = 2.5 * 30 * work
+    solve_local_map(chain, effort)
+    solve_local_map(chain, effort)
+    with pytest.raises(OfflineError, match="multiplications"):
+        solve_local_map(chain, effort)
+
+
+def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
+    """Tags seem to travel along with the robot. That is said, not refused."""
+    (chain,) = chains_of(load_run(written(observed(1500, 20), tmp_path)), NoiseParameters())
+    effort = Effort(6e9, 6e9, 1e9)
+    found = solve_local_map(chain, effort)
+    assert not found.goodness.fits
+    assert "contradict each other" in found.goodness.warnings("it")[0]
+    assert effort.left > -0.5 * effort.allowed
+
+
+@pytest.mark.parametrize(("length_m", "picture_every"), [(250.0, 1), (500.0, 5)])
+def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every: int) -> None:
+    """Even where its log is as small as it can be."""
+    chain = made_long_drive(3, length_m, picture_every, town=made_town(3, (0.5, 1.5))).chain
+    log_bytes = BYTES_A_LOOK * len(chain.stamps_ns) + BYTES_A_READING * len(chain.readings.tag)
+    effort = Effort.of_log(log_bytes)
+    found = solve_local_map(chain, effort)
+    assert found.solution.converged
+    assert found.goodness.fits
+    assert effort.left > 0.5 * effort.allowed
+    assert effort.steps(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
+    everything = solve_local_map(chain, Effort.of_log(1 << 30))
+    np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)
