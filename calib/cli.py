@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from calib.command_line import new_app, run
+from calib.command_line import EXIT_WITH_LOSSES, new_app, run
 
 app = new_app("Prints calibration boards and tags, calibrates a camera, and tells whether a calibration still fits.")
 
@@ -61,6 +61,60 @@ def tags(
     typer.echo(f"{output}: {counted(len(wanted), 'tag')} {family} of {size_mm:g} mm on {counted(n_sheets, 'sheet')}")
     typer.echo("print at 100 %, check the rulers; in robot.yaml:")
     typer.echo(f"tags: [{{family: {family}, default_size_m: {size_mm / 1e3:g}}}]")
+
+
+PicturesArgument = Annotated[
+    list[Path], typer.Argument(metavar="PICTURES|VIDEO...", help="Files, folders of pictures, or videos.")
+]
+BoardOption = Annotated[
+    str | None, typer.Option("--board", metavar="WORD", help="The word on the print. [default: that of `board`]")
+]
+
+
+@app.command()
+def camera(
+    pictures: PicturesArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The camera file to write.")],
+    board: BoardOption = None,
+    model: Annotated[
+        str,
+        typer.Option(help="plumb_bob, rational_polynomial, equidistant (fisheye); auto: what predicts best."),
+    ] = "auto",
+    ruler_mm: Annotated[
+        str | None,
+        typer.Option(metavar="MM[,MM]", help="What a ruler shows beside the print's 100 mm: across, and down."),
+    ] = None,
+    name: Annotated[str, typer.Option(help="The camera's name in the file.")] = "camera",
+    most_views: Annotated[int, typer.Option(help="Of more views the most telling ones are used.", min=5)] = 60,
+    overwrite: OverwriteFlag = False,
+) -> None:
+    """Calibrates a camera from pictures of the board: ROS camera_info with sigmas, and a page to look at.
+
+    The page lies beside FILE as .html: how many pixels predictions may be off where, views, residuals, what is missing.
+    """
+    from calib.camera_command import calibrate_camera
+
+    for line in calibrate_camera(pictures, output, board, model, ruler_mm, name, most_views, overwrite):
+        typer.echo(line)
+
+
+@app.command()
+def check(
+    camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="The camera file: ROS camera_info or Kalibr.")],
+    pictures: PicturesArgument,
+    board: BoardOption = None,
+) -> None:
+    """Does a calibration still fit the camera? Fits it anew to pictures of the board and compares.
+
+    Exit code 0: it fits; 3: it does not any more.
+    """
+    from calib.camera_command import check_camera
+
+    result = check_camera(camera, pictures, board)
+    for line in result.lines:
+        typer.echo(line)
+    if not result.fits:
+        raise typer.Exit(EXIT_WITH_LOSSES)
 
 
 def main() -> None:

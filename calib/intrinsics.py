@@ -47,6 +47,11 @@ class Calibration:
         """The camera."""
         return self.lens.fit.model
 
+    @property
+    def corner_sigma_px(self) -> float:
+        """Sigma of a typical corner's coordinate."""
+        return float(np.sqrt(np.median((self.lens.fit.residual_px**2).sum(axis=1)) / MEDIAN_CHI2))
+
 
 def calibrated(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS) -> Calibration:
     """The camera that took the views, of the kind that predicts best what it was not fitted to.
@@ -54,8 +59,7 @@ def calibrated(views: Sequence[View], finder: BoardFinder, name: str, kinds: Seq
     Raises:
         CalibError: the views do not tell a camera.
     """
-    size_px = views[0].picture.shape[1], views[0].picture.shape[0]
-    lens = _best_at_first(views, finder, name, size_px, kinds)
+    lens = first_fit(views, finder, name, kinds)
     poses = every_pose(lens, observed(views, finder), len(views))
     views = seen_again(views, finder, lens.fit.model, poses)
     lens = _fitted_without(blurred(views), observed(views, finder), lens.fit.model)
@@ -90,9 +94,13 @@ def seen_again(views: Sequence[View], finder: BoardFinder, model: CameraModel, p
     return again
 
 
-def _best_at_first(
-    views: Sequence[View], finder: BoardFinder, name: str, size_px: tuple[int, int], kinds: Sequence[str]
-) -> LensFit:
+def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
+    """The camera as the first look at the corners has it, of the kind that fits best.
+
+    Raises:
+        CalibError: none fits.
+    """
+    size_px = views[0].picture.shape[1], views[0].picture.shape[0]
     seen = observed(views, finder)
     best, least, why = None, np.inf, ""
     for kind in kinds:
@@ -204,8 +212,3 @@ def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
         square = np.where(imaged, (again.residual_px**2).sum(axis=1), float(trained.width_px) ** 2)
         out[tested] = np.bincount(test.view, weights=square) / np.bincount(test.view)
     return out
-
-
-def typical_error_px(lens: LensFit) -> float:
-    """Sigma of a corner's coordinate as the residuals' median has it."""
-    return float(np.sqrt(np.median((lens.fit.residual_px**2).sum(axis=1)) / MEDIAN_CHI2))
