@@ -23,7 +23,7 @@ from calib.words import counted
 _LEAST_VIEWS: Final = 5
 _ANOTHER_VIEW_SHARE: Final = 0.02  # of the picture's width that a corner shifts by
 _MOST_OUTLYING: Final = 1.0 / 3.0
-_LARGEST_EXTRA_PX: Final = 1.0  # a corner errs by hundredths; OpenCV's own ones by some tenths
+_LARGEST_EXTRA_PX: Final = 0.5  # a corner errs by hundredths; OpenCV finds the coarsest to a third
 _LARGEST_FOCAL_SIGMA: Final = 0.01  # relative; the field of view in a data sheet is as good
 _LARGEST_ERROR_PX: Final = 3.0
 _KEPT_WITHOUT_BOARD: Final = 20

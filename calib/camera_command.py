@@ -44,13 +44,14 @@ def calibrate_camera(
     require_board(found, printed, finder)
     result = calibrate_from(found, printed, finder, name, model, most_views)
     sentences = verdict(result, printed)
-    with written_whole(page) as partial:
-        partial.write_text(report_html(result, sentences), encoding="utf-8")
-        write_camera_yaml(result.model, output, estimate_of(result))
-    used = (
-        f"{int(result.lens.views.sum())} of {len(found.views)} views, {counted(len(found.without), 'picture')} without"
-    )
-    return [*left_out(result), *sentences, f"{output}: {used}; look at {page}"]
+    try:
+        with written_whole(page) as partial:
+            partial.write_text(report_html(result, sentences), encoding="utf-8")
+            write_camera_yaml(result.model, output, estimate_of(result))
+    except OSError as error:
+        raise CalibError(f"{output}: cannot be written ({error.strerror}); name a file that you may write") from error
+    used = f"{int(result.lens.views.sum())} of {counted(len(found.views), 'view')} used"
+    return [*_without_board(found.without), *left_out(result), *sentences, f"{output}: {used}; look at {page}"]
 
 
 def check_camera(camera: Path, pictures: Sequence[Path], board: str | None) -> Check:

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 from typing import Final
 
-import cv2
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray
+from calib.bundle import board_pose
 from calib.camera_model import CameraModel
 
 # Corners of a tag with side 1 in its own frame; the order is that of groundsbot.proto.
@@ -118,19 +118,14 @@ def general_readings(
     n = len(corners_px)
     centres = np.full((n, 3), np.nan)
     chi2 = np.full(n, np.nan)
-    rays = camera.unproject(corners_px)
     for i in range(n):
-        if not (np.isfinite(rays[i]).all() and (rays[i, :, 2] > 0.0).all()):
-            continue
-        flat = rays[i, :, :2] / rays[i, :, 2:]
-        corners_tag = np.column_stack([UNIT_CORNERS * sides_m[i], np.zeros(4)])
-        found, _, translations, errors = cv2.solvePnPGeneric(
-            corners_tag, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-        )
-        if found and np.isfinite(translations[0]).all() and translations[0][2, 0] > 0.0:
-            centres[i] = R_base_camera @ translations[0][:, 0]
-            focal_px = 0.5 * (camera.fx_px + camera.fy_px)
-            chi2[i] = 8.0 * (float(errors[0][0]) * focal_px / sigma_corner_px) ** 2
+        corners_m = np.column_stack([UNIT_CORNERS * sides_m[i], np.zeros(4)])
+        pose = board_pose(camera, corners_m, corners_px[i]) if np.isfinite(corners_px[i]).all() else None
+        if pose is not None:
+            rotation, centre = pose
+            centres[i] = R_base_camera @ centre
+            missed_px = camera.project(corners_m @ rotation.T + centre) - corners_px[i]
+            chi2[i] = float((missed_px**2).sum()) / sigma_corner_px**2
     with np.errstate(all="ignore"):
         distance_m = np.linalg.norm(centres, axis=-1)
         direction = centres / distance_m[:, None]
