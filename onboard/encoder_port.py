@@ -1,5 +1,6 @@
 """The serial port of the wheel controller: open, read what is there, close. Whatever goes wrong is a PortLostError."""
 
+import errno
 import select
 import termios
 from typing import Final
@@ -61,4 +62,6 @@ class EncoderPort:
 
 
 def _reason(error: Exception) -> str:
+    if getattr(error, "errno", None) == errno.EWOULDBLOCK:  # of the lock: a port has one reader
+        return "another program has it, a recorder perhaps; stop that first"
     return str(getattr(error, "strerror", None) or error)
