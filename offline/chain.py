@@ -50,14 +50,19 @@ class Chain:
 
     def prefix(self, n_keyframes: int) -> "Chain":
         """The same chain as far as its first keyframes, with the tags read until then."""
-        readings = self.readings.where(self.readings.keyframe < n_keyframes)
+        return self.part(0, n_keyframes)
+
+    def part(self, first: int, end: int) -> "Chain":
+        """Keyframes first to end - 1 of the same chain, with the tags read there."""
+        inside = (self.readings.keyframe >= first) & (self.readings.keyframe < end)
+        readings = self.readings.where(inside)
         seen, tag = np.unique(readings.tag, return_inverse=True)
         return replace(
             self,
-            stamps_ns=self.stamps_ns[:n_keyframes],
-            odometry=self.odometry.prefix(n_keyframes - 1),
+            stamps_ns=self.stamps_ns[first:end],
+            odometry=self.odometry.part(first, end - 1),
             tags=tuple(self.tags[i] for i in seen),
-            readings=replace(readings, tag=tag),
+            readings=replace(readings, tag=tag, keyframe=readings.keyframe - first),
         )
 
     def weighed(self, noise: NoiseParameters) -> "Chain":

@@ -68,7 +68,7 @@ def refined(chain: Chain, keyframes: IntArray, poses: FloatArray, wheel_calibrat
 def _composed(odometry: ChainOdometry, keyframes: IntArray) -> ChainOdometry:
     """Motions from each of some keyframes to the next; covariances and Jacobians carried to the step's end."""
     if len(keyframes) < 2:
-        return odometry.prefix(0)
+        return odometry.part(0, 0)
     first = keyframes[:-1]
     poses = chained(odometry.motion, np.zeros(3))
     end = np.repeat(keyframes[1:], np.diff(keyframes))

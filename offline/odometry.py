@@ -90,15 +90,15 @@ class ChainOdometry:
         """Number of steps."""
         return len(self.motion)
 
-    def prefix(self, n_steps: int) -> "ChainOdometry":
-        """The first steps only."""
-        part = slice(0, n_steps)
+    def part(self, first: int, end: int) -> "ChainOdometry":
+        """Steps first to end - 1 only."""
+        steps = slice(first, end)
         return ChainOdometry(
-            self.motion[part],
-            self.covariance[part],
-            self.parts.where(part),
-            self.jacobian[part],
-            self.distance_m[part],
+            self.motion[steps],
+            self.covariance[steps],
+            self.parts.where(steps),
+            self.jacobian[steps],
+            self.distance_m[steps],
         )
 
     def weighed(self, noise: NoiseParameters) -> "ChainOdometry":

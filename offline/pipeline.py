@@ -16,6 +16,7 @@ from offline.measured_map import judged, measurement_warnings, unused
 from offline.merge import Group, merge
 from offline.merge_report import alignment_results, merge_warnings
 from offline.observations import check_tag_sizes
+from offline.odometry_breaks import split_where_broken
 from offline.result import (
     MAX_SIGMAS,
     CalibrationResult,
@@ -98,6 +99,9 @@ def build_map(
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()
+    with stages.stage("looking for breaks of odometry"):
+        maps, broken = split_where_broken(maps)
+    chains = [each.chain for each in maps]
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
     components: list[Component] = []
@@ -105,7 +109,7 @@ def build_map(
     measured: list[MeasurementResult] = []
     checks: list[CheckResult] = []
     metres: list[MetreResult] = []
-    warnings = [w for run in runs for w in run.warnings] + [w for chain in chains for w in chain.warnings]
+    warnings = [w for run in runs for w in run.warnings] + broken + [w for chain in chains for w in chain.warnings]
     for i, members in enumerate(merged.groups):
         graph, solution = solve_global_map(maps, members, stages, measurements)
         with stages.stage("covariances"):

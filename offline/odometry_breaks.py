@@ -1,0 +1,276 @@
+"""Where a drive's wheels do not tell how it moved: lifted, pushed, or slipping for metres.
+
+Only tags tell. From the beginning on the drive is built up as far as its readings fit together, and likewise backwards
+from its end. What lies between them, the wheels cannot explain; where they overlap, it is that place without whose
+motion the whole costs least. The drive is split there if that pays: the whole costs less by more than chance explains,
+however many places there were to choose from, and two or more tags seen on both sides agree on how the robot moved.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import degrees, hypot
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib import se2
+from calib.arrays import FloatArray
+from offline.alignment import Alignment, align
+from offline.chain import Chain
+from offline.condensed import condense
+from offline.errors import OfflineError
+from offline.factors import State
+from offline.graph import Graph
+from offline.grown_parts import COST_TOLERANCE, FALSE_ALARM, Grown, grown_parts, limit_of, noise_factor
+from offline.local_map import LocalMap, solve_local_map
+from offline.odometry import chained
+from offline.solver import Problem, solve
+
+_MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
+_MOST_PLACES: Final = 24
+# Half of what chance adds to a place once in a thousand times: with less, readings do not tell which it was.
+_SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
+_FREED: Final = 1e-4  # of a motion's whitening: metres and turns for nothing
+
+
+@dataclass(frozen=True)
+class Break:
+    """A part of a drive that its wheels do not tell.
+
+    Attributes:
+        end: of what comes before, one beyond its last keyframe.
+        begin: the first keyframe of what comes after.
+        reach: the keyframes between which it may be as well.
+        jump: (3,) how the robot moved besides, seen from the last keyframe before.
+        chi_square: by how much more it costs to believe the wheels.
+        bound: what chance explains of that.
+    """
+
+    end: int
+    begin: int
+    reach: tuple[int, int]
+    jump: FloatArray
+    chi_square: float
+    bound: float
+
+
+class Mended(NamedTuple):
+    """The chains and local maps of all runs after those that broke were split, and sentences that say so."""
+
+    maps: list[LocalMap]
+    warnings: list[str]
+
+
+class _Place(NamedTuple):
+    """Of a break: one beyond the last keyframe before it, and the first after it."""
+
+    end: int
+    begin: int
+
+
+class _Start(NamedTuple):
+    """Where to begin a solve with a break."""
+
+    place: _Place
+    state: State
+
+
+def split_where_broken(maps: Sequence[LocalMap]) -> Mended:
+    """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own."""
+    mended, warnings = [], []
+    for whole in maps:
+        parts, breaks = _split(whole, _MOST_BREAKS)
+        mended += parts
+        warnings += [_sentence(whole.chain, each) for each in breaks]
+    return Mended(_numbered(mended) if warnings else mended, warnings)
+
+
+def find_break(local_map: LocalMap) -> Break | None:
+    """The break that explains most of what does not fit in a drive; None where it fits, or none explains it."""
+    chain = local_map.chain
+    if _fits(local_map):
+        return None
+    grown = [grown_parts(chain, backwards=backwards) for backwards in (False, True)]
+    factor = noise_factor(grown)
+    ahead, behind = (limit_of(chain, parts, factor) for parts in grown)
+    if ahead is None or behind is None:
+        return None
+    places = _places(chain, ahead, behind)
+    middle = places[len(places) // 2]
+    starts = [
+        _start(local_map.graph, ahead, behind, place, T_ahead_behind)
+        for T_ahead_behind in _ways_to_align(chain, behind, middle)
+        for place in places
+    ]
+    if not starts:
+        return None
+    apart = [solve(_freed(local_map.graph.problem, *start.place), start.state, COST_TOLERANCE) for start in starts]
+    costs = np.array([solution.cost for solution in apart])
+    equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
+    best = max(equal.tolist(), key=lambda i: _seconds_between(chain, starts[i].place))
+    return _judged(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal])
+
+
+def _split(whole: LocalMap, most: int) -> tuple[list[LocalMap], list[tuple[int, Break]]]:
+    """The stretches of a drive, and its breaks with the keyframe at which the part begins that each is told of."""
+    found = find_break(whole) if most else None
+    if found is None:
+        return [whole], []
+    chain = whole.chain
+    parts: list[LocalMap] = []
+    breaks: list[tuple[int, Break]] = [(0, found)]
+    for first, end in ((0, found.end), (found.begin, len(chain.stamps_ns))):
+        more, inner = _split(solve_local_map(_without_ends(chain.part(first, end), first, end, chain)), most - 1)
+        parts += more
+        breaks += [(first + offset, each) for offset, each in inner]
+    return parts, breaks
+
+
+def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
+    """Without what was read where the break is: pictures of one standing pose may show two places."""
+    keyframe = part.readings.keyframe
+    kept = (keyframe > 0) | (first == 0)
+    kept &= (keyframe < len(part.stamps_ns) - 1) | (end == len(whole.stamps_ns))
+    readings = part.readings.where(kept)
+    seen, tag = np.unique(readings.tag, return_inverse=True)
+    return replace(part, tags=tuple(part.tags[i] for i in seen), readings=replace(readings, tag=tag))
+
+
+def _fits(local_map: LocalMap) -> bool:
+    """Whether the whole fits together, and no stretch between two readings strains the wheels beyond chance.
+
+    What is between two readings is laid out as the wheels like it best, so that its squares add up to those of the
+    motion from one reading to the next: chi-square with 3 degrees of freedom at most.
+    """
+    problem, state = local_map.graph.problem, local_map.solution.state
+    if len(local_map.chain.tags) < 2:
+        return True
+    reads = np.zeros(len(problem.columns.poses), dtype=np.bool_)
+    reads[problem.readings.pose] = True
+    between = np.cumsum(reads)[problem.odometry.first]
+    squares = np.bincount(between, (problem.odometry.residual(state) ** 2).sum(axis=1))
+    return local_map.goodness.fits and bool((squares <= chi2.isf(FALSE_ALARM / len(squares), 3)).all())
+
+
+def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
+    """Where the break may be: what lies between the two parts, or wherever they overlap."""
+    if behind.first > ahead.end:
+        return [_between_readings(chain, _Place(ahead.end, behind.first))]
+    reading = np.unique(chain.readings.keyframe)
+    cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
+    cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
+    cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
+    return list(dict.fromkeys(_between_readings(chain, _Place(cut, cut)) for cut in cuts.tolist()))
+
+
+def _seconds_between(chain: Chain, place: _Place) -> float:
+    """Who carries a robot has it stand meanwhile."""
+    return float(chain.stamps_ns[place.begin] - chain.stamps_ns[place.end - 1]) * 1e-9
+
+
+def _between_readings(chain: Chain, place: _Place) -> _Place:
+    """As far as nothing was read: nobody knows where in there it happened."""
+    reading = np.unique(chain.readings.keyframe)
+    before, after = reading[reading < place.end], reading[reading >= place.begin]
+    n = len(chain.stamps_ns)
+    return _Place(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
+
+
+def _ways_to_align(chain: Chain, behind: Grown, place: _Place) -> list[FloatArray]:
+    """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
+    apart = _solved_apart(chain, place)
+    if apart is None:
+        return []
+    at_begin = behind.poses[place.begin - behind.first]
+    alignment = _aligned(*apart)
+    ways = [] if alignment is None else [alignment, *alignment.rivals]
+    return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
+
+
+def _solved_apart(chain: Chain, place: _Place) -> tuple[LocalMap, LocalMap] | None:
+    """What comes before and what comes after, each on its own; None where one of them cannot be."""
+    n = len(chain.stamps_ns)
+    if not 1 < place.end <= place.begin < n - 1:
+        return None
+    try:
+        return solve_local_map(chain.part(0, place.end)), solve_local_map(chain.part(place.begin, n))
+    except OfflineError:
+        return None
+
+
+def _aligned(before: LocalMap, after: LocalMap) -> Alignment | None:
+    shared = sorted(set(before.graph.tags) & set(after.graph.tags))
+    return align(condense(before, shared), condense(after, shared)) if len(shared) > 1 else None
+
+
+def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_behind: FloatArray) -> _Start:
+    """Starting values for the whole with a break in that place."""
+    before, after = ahead.poses[: place.end], behind.poses[place.begin - behind.first :]
+    between = chained(graph.chains[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
+    poses = np.concatenate([before, between, se2.compose(T_ahead_behind, after)])
+    tags = {tag: se2.apply(T_ahead_behind, at) for tag, at in behind.tags.items()} | ahead.tags
+    return _Start(place, graph.start(poses, tags, ahead.calibration))
+
+
+def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place]) -> Break | None:
+    """The break, if two tags agree on it and it pays to believe in it."""
+    chain, problem = local_map.chain, local_map.graph.problem
+    parts = _solved_apart(chain, place)
+    alignment = None if parts is None else _aligned(*parts)
+    if parts is None or alignment is None or not alignment.is_sure:
+        return None
+    apart = solve(_freed(problem, *place), start)
+    joined = min(local_map.solution.cost, solve(problem, apart.state).cost)
+    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
+    n_places = len(np.unique(chain.readings.keyframe))
+    bound = factor**2 * chi2.isf(FALSE_ALARM / n_places, 3 * (place.begin - place.end + 1))
+    chi_square = 2.0 * (joined - apart.cost)
+    if chi_square <= bound:
+        return None
+    jump = _jump(local_map.graph, apart.state, *place)
+    reach = min(other.end for other in equal) - 1, max(other.begin for other in equal)
+    return Break(place.end, place.begin, reach, jump, chi_square, float(bound))
+
+
+def _freed(problem: Problem, end: int, begin: int) -> Problem:
+    """Without the motions from keyframe end - 1 to begin."""
+    inside = (problem.odometry.first >= end - 1) & (problem.odometry.first < begin)
+    weak = np.where(inside[:, None, None], _FREED * problem.odometry.whitening, problem.odometry.whitening)
+    return replace(problem, odometry=replace(problem.odometry, whitening=weak))
+
+
+def _jump(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
+    """(3,) the motion that the wheels do not have."""
+    odometry = graph.chains[0].odometry.part(end - 1, begin)
+    told = odometry.dead_reckoned(graph.wheel_calibration(state, 0))[-1]
+    return se2.between(told, se2.between(state.poses[end - 1], state.poses[begin]))
+
+
+def _numbered(maps: Sequence[LocalMap]) -> list[LocalMap]:
+    """Stretches named after their run and their place in it."""
+    count: dict[str, int] = {}
+    numbered = []
+    for each in maps:
+        run = each.chain.run.name
+        count[run] = count.get(run, 0) + 1
+        chain = replace(each.chain, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
+        numbered.append(replace(each, chain=chain, graph=replace(each.graph, chains=(chain,))))
+    return numbered
+
+
+def _sentence(chain: Chain, told: tuple[int, Break]) -> str:
+    """When, how much, how sure, and what became of it."""
+    first, found = told
+    keyframes = np.array([found.end - 1, found.begin, *found.reach]) + first
+    begin_s, end_s, earliest_s, latest_s = (chain.stamps_ns[keyframes] - chain.stamps_ns[0]) * 1e-9
+    or_else = ""
+    if (earliest_s, latest_s) != (begin_s, end_s):
+        or_else = f"; readings would as well have it anywhere from {earliest_s:.1f} s to {latest_s:.1f} s"
+    x_m, y_m, theta_rad = found.jump
+    return (
+        f"{chain.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start the robot moved by "
+        f"{hypot(x_m, y_m):.2f} m and {round(degrees(theta_rad))} deg that its wheels do not explain (chi-square "
+        f"{found.chi_square:.0f}, chance explains {found.bound:.0f}): lifted, pushed, or slipping? The run is split "
+        f"there into stretches, which only tags join{or_else}"
+    )
