@@ -99,7 +99,7 @@ def build_map(
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()
-    with stages.stage("looking for breaks of odometry"):
+    with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps)
     chains = [each.chain for each in maps]
     with stages.stage("aligning local maps"):

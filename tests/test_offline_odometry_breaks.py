@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 
 from calib import se2
-from calib.noise import NoiseParameters
 from offline.local_map import solve_local_map
-from offline.measured import TapeOptions
 from offline.odometry import WheelTrack
 from offline.odometry_breaks import find_break, split_where_broken
-from offline.pipeline import map_runs
+from offline.pipeline import build_map
 from offline.result import MapResult
 from offline.run import TagKey
-from offline.stages import Stages
 from tests.benchmarks.breaks_study import broken_drive, outcome_of, summary
 from tests.made_breaks import made_clean_drive
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
@@ -78,7 +75,7 @@ def mapped(T_moved: tuple[float, float, float]) -> MapResult:
         tags=[TagKey(FAMILY, key) for key in PLACES],
         positions=made_positions(stamps_ns[at], tag, seen),
     )
-    return map_runs([run], NoiseParameters(), Stages(), TapeOptions())
+    return build_map([run])
 
 
 @pytest.mark.parametrize("T_moved", [(0.0, 0.0, np.pi / 2), (-1.6, 1.2, 0.0)])

@@ -15,6 +15,7 @@ ALL = [
     "reading logs",
     "keyframes and readings",
     "local maps",
+    "breaks of odometry",
     "aligning local maps",
     "building the graph",
     "solving all runs together",
