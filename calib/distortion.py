@@ -13,6 +13,7 @@ Sources: OpenCV, calib3d and fisheye module documentation; ROS sensor_msgs/disto
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -62,6 +63,16 @@ class Distortion:
         with np.errstate(all="ignore"):  # where the denominator ends the lens, its image goes to infinity
             factor, _ = unlimited._factor(np.array(limit * limit))
         return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
+
+    @cached_property
+    def _numerator_slope(self) -> Polynomial:
+        slope: Polynomial = self.numerator.deriv()
+        return slope
+
+    @cached_property
+    def _denominator_slope(self) -> Polynomial:
+        slope: Polynomial = self.denominator.deriv()
+        return slope
 
     def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
@@ -124,7 +135,7 @@ class Distortion:
             return self._equidistant_factor(square)
         above, below = self.numerator(square), self.denominator(square)
         factor = above / below
-        return factor, (self.numerator.deriv()(square) - factor * self.denominator.deriv()(square)) / below
+        return factor, (self._numerator_slope(square) - factor * self._denominator_slope(square)) / below
 
     def _equidistant_factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         radius = np.sqrt(square)
@@ -133,7 +144,7 @@ class Distortion:
         near_axis = square < 1e-16
         safe = np.where(near_axis, 1.0, square)
         factor = np.where(near_axis, 1.0, angle * polynomial / np.sqrt(safe))
-        angle_slope = polynomial + 2 * angle * angle * self.numerator.deriv()(angle * angle)
+        angle_slope = polynomial + 2 * angle * angle * self._numerator_slope(angle * angle)
         slope = (angle_slope / (1.0 + safe) - factor) / (2.0 * safe)
         # Near the axis t = r - r^3/3, so g = 1 + (k1 - 1/3) s.
         return factor, np.where(near_axis, self.numerator.coef[1] - 1.0 / 3.0, slope)

@@ -18,7 +18,7 @@ from calib.errors import CalibError
 from calib.lens_parameters import undistorted_camera
 
 _FOCALS: Final = np.geomspace(0.15, 5.0, 30)  # of the picture's width: from a fisheye to a telescope
-_VIEWS_FOR_GUESS: Final = 12
+_VIEWS_FOR_GUESS: Final = 8
 _ROBUST_ROUNDS: Final = 5
 _CAUCHY: Final = 2.4  # robust sigmas
 _REJECTING_ROUNDS: Final = 10
