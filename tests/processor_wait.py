@@ -8,6 +8,7 @@ number), so a test can hold the promise to its seconds on any machine.
 import subprocess
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 _LOOK_S = 0.01
@@ -60,7 +61,12 @@ def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
     """
     wait, start_s = ProcessorWait(process.pid), time.monotonic()
     said: list[str] = []
-    reader = threading.Thread(target=lambda: said.append(process.communicate(timeout=_PATIENCE_S)[0]), daemon=True)
+
+    def listen() -> None:
+        with suppress(ValueError):  # closed by a caller who had enough
+            said.append(process.communicate(timeout=_PATIENCE_S)[0])
+
+    reader = threading.Thread(target=listen, daemon=True)
     reader.start()
     while reader.is_alive():
         wait.look()
