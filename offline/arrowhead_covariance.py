@@ -5,6 +5,7 @@ from its node to the top: so a tag in the border costs one triangular solve ther
 """
 
 import heapq
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -25,8 +26,37 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
     """
-    covariance = np.zeros((len(wanted), len(wanted)))
-    # What is on its way at each node: which of the wanted, and the right-hand sides (front, q) for them.
+    return quadratic_form(tree, system, rows, top, Entries(wanted, np.arange(len(wanted)), np.ones(len(wanted))))
+
+
+class Entries(NamedTuple):
+    """A sparse matrix E (n, k): entry `value` in each `row`, in the arrowhead's order, and `column`."""
+
+    row: IntArray
+    column: IntArray
+    value: FloatArray
+
+    def where(self, which: IntArray) -> "Entries":
+        """Some of them."""
+        return Entries(self.row[which], self.column[which], self.value[which])
+
+
+def quadratic_form(
+    tree: Tree, system: System, rows: Rows, top: FloatArray, entries: Entries, n_columns: int | None = None
+) -> FloatArray:
+    """E^T H^-1 E (k, k): cheap where a column of E has entries in few leaves.
+
+    Args:
+        tree: the order.
+        system: the blocks.
+        rows: what elimination left of them.
+        top: lower triangular R^T of the top.
+        entries: of E.
+        n_columns: k, where the last columns may be empty.
+    """
+    k = int(entries.column.max(initial=-1)) + 1 if n_columns is None else n_columns
+    square = np.zeros((k, k))
+    # What is on its way at each node: which of the columns, and the right-hand sides (front, q) for them.
     waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
     queue: list[int] = []
 
@@ -35,29 +65,42 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
             heapq.heappush(queue, node)
         waiting.setdefault(node, []).append((who, values))
 
-    for node, who in _by_node(tree, wanted):
+    for node, which in _by_node(tree, entries.row):
+        own = entries.where(which)
+        who, column = np.unique(own.column, return_inverse=True)
+        own = own._replace(column=column)
         if tree.level[node] == 0:
-            square, values = _through_leaf(tree, system, rows, node, wanted[who])
-            covariance[np.ix_(who, who)] += square
+            inner, values = _through_leaf(tree, system, rows, node, own)
+            square[np.ix_(who, who)] += inner
             send(int(tree.parent[node]), who, values)
         else:
             front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
             sorter = np.argsort(front)
-            units = np.zeros((len(front), len(who)))
-            units[sorter[np.searchsorted(front, wanted[who], sorter=sorter)], np.arange(len(who))] = 1.0
-            send(node, who, units)
+            values = np.zeros((len(front), len(who)))
+            np.add.at(values, (sorter[np.searchsorted(front, own.row, sorter=sorter)], own.column), own.value)
+            send(node, who, values)
     while queue:
         node = heapq.heappop(queue)
-        arrived = waiting.pop(node)
-        who = np.concatenate([members for members, _ in arrived])
-        values = np.concatenate([sent for _, sent in arrived], axis=1)
+        who, values = _together(waiting.pop(node))
         if node == len(tree.level) - 1:
             Z = linalg.solve_triangular(top, values, lower=True, check_finite=False) if len(top) else values
         else:
             Z, left = _through_front(tree, rows, node, values)
             send(int(tree.parent[node]), who, left)
-        covariance[np.ix_(who, who)] += Z.T @ Z
-    return 0.5 * (covariance + covariance.T)
+        square[np.ix_(who, who)] += Z.T @ Z
+    return 0.5 * (square + square.T)
+
+
+def _together(arrived: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
+    """Columns of one number added up."""
+    members = np.concatenate([who for who, _ in arrived])
+    values = np.concatenate([sent for _, sent in arrived], axis=1)
+    who, index = np.unique(members, return_inverse=True)
+    if len(who) == len(members):
+        return members, values
+    total = np.zeros((len(who), len(values)))
+    np.add.at(total, index, values.T)
+    return who, total.T
 
 
 def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
@@ -77,22 +120,22 @@ def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
     return list(zip(nodes.tolist(), np.split(order, first[1:]), strict=True))
 
 
-def _through_leaf(
-    tree: Tree, system: System, rows: Rows, leaf: int, columns: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """E^T A^-1 E of some columns of a leaf's poses, and what they leave in the parent's front."""
+def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, entries: Entries) -> tuple[FloatArray, FloatArray]:
+    """E^T A^-1 E of entries in a leaf's poses, and what they leave in the parent's front."""
     first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
     start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
     parent = int(tree.parent[leaf])
-    solved = np.zeros((len(columns), n, 3))
-    values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), len(columns)))
-    for i, column in enumerate(columns - 3 * first):
-        solved[i, column // 3, column % 3] = 1.0
+    k = int(entries.column.max()) + 1
+    right = np.zeros((k, 3 * n))
+    np.add.at(right, (entries.column, entries.row - 3 * first), entries.value)
+    solved = right.reshape(k, n, 3).copy()
+    values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), k))
+    for i in range(k):
         arrowhead_substitution.solve_leaf(tree, rows, leaf, solved[i])
         outside = np.zeros(end - start)
         arrowhead_substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
         values[tree.up[start:end], i] = -outside
-    return solved.reshape(len(columns), 3 * n)[:, columns - 3 * first], values
+    return right @ solved.reshape(k, 3 * n).T, values
 
 
 def _through_front(tree: Tree, rows: Rows, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -120,6 +120,9 @@ def map_command(
         list[str] | None,
         typer.Option(help="Between two runs' starts or tags, as measured: A,B=metres,sigma_m; repeatable."),
     ] = None,
+    keep_suspects: Annotated[
+        bool, typer.Option("--keep-suspects", help="Name tags that do not belong, but keep them as one tag each.")
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
@@ -133,7 +136,7 @@ def map_command(
     """
     from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
-    options = MapOptions(logs, output, robot or (), noise, overwrite, start or (), distance or ())
+    options = MapOptions(logs, output, robot or (), noise, overwrite, start or (), distance or (), keep_suspects)
     result, costs = make_map(options)
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))

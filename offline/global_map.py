@@ -131,8 +131,8 @@ def _tag_results(graph: Graph, state: State, covariances: Sequence[FloatArray]) 
             TagResult(
                 family=tag.family,
                 tag_id=tag.tag_id,
-                instance="",
-                size_m=robot.tag_size_m(*tag)[0] if has_size else None,
+                instance=tag.instance,
+                size_m=robot.tag_size_m(tag.family, tag.tag_id)[0] if has_size else None,
                 position_m=state.tags[i],
                 covariance=covariances[i],
                 n_observations=n,

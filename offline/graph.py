@@ -233,7 +233,7 @@ def _scale_parameter(chain: Chain, tag: TagKey) -> Parameter:
     robot = chain.run.robot
     if not any(batch.family == tag.family for batch in robot.tags):
         return Parameter(f"imported {tag.family}", TAG_SCALE, (), RELATIVE_TAG_SIZE_SIGMA)
-    size_m, sigma_m, batch = robot.tag_size_m(*tag)
+    size_m, sigma_m, batch = robot.tag_size_m(tag.family, tag.tag_id)
     return Parameter(f"{batch} {tag.family}", TAG_SCALE, (), sigma_m / size_m)
 
 

@@ -35,6 +35,7 @@ class MapOptions:
     overwrite: bool = False
     starts: Sequence[str] = ()
     distances: Sequence[str] = ()
+    keep_suspects: bool = False
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -52,7 +53,8 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     noise = read_noise_yaml(options.noise) if options.noise else None
     with compilation_announced(_say), progress_bar() as show:
         stages = Stages(show)
-        result = map_logs(logs, robot_files, noise, stages, TapeOptions(options.starts, options.distances))
+        tape = TapeOptions(options.starts, options.distances)
+        result = map_logs(logs, robot_files, noise, stages, tape, keep_suspects=options.keep_suspects)
         with folder_written_whole(options.output) as folder:
             _write_files(result, folder, options.output, stages)
     return result, stages.costs
@@ -101,6 +103,7 @@ def summary(result: MapResult, output: Path) -> list[str]:
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
     lines += [_metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+    lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]

@@ -29,6 +29,7 @@ from offline.result import (
     RivalResult,
     RunResult,
     StartToStart,
+    SuspectTag,
     TagResult,
 )
 from offline.trajectory_file import read_tum, write_tum
@@ -96,6 +97,7 @@ def read_map(folder: Path) -> MapResult:
             metres=tuple(MetreResult(**entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
             losses=tuple(data.get("losses", ())),
+            suspects=tuple(SuspectTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
@@ -131,7 +133,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "measurements": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.measurements],
         "checks": [{"sigmas": _plain(entry.sigmas)} | vars(entry) for entry in result.checks],
         "metres": [vars(entry) for entry in result.metres],
-        "suspect_tags": [],
+        "suspect_tags": [_suspect_json(suspect) for suspect in result.suspects],
         "warnings": list(result.warnings),
         "losses": list(result.losses),
     }
@@ -192,6 +194,12 @@ def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
             for rival in alignment.rivals
         ],
     }
+
+
+def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
+    entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence")}
+    other = {} if suspect.swapped_with is None else {"swapped_with": suspect.swapped_with}
+    return entry | {"runs": list(suspect.runs)} | other
 
 
 def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:

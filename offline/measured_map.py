@@ -29,7 +29,7 @@ def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
         return graph
     places = [start.placement for start in starts]
     firsts: dict[str | TagKey, int] = dict(zip(_names(graph), graph.first_pose.tolist(), strict=True))
-    tags: dict[str | TagKey, int] = {tag: i for i, tag in enumerate(graph.tags)}
+    tags: dict[str | TagKey, int] = _first_instances(graph)
     ends = [[distance.a for distance in distances], [distance.b for distance in distances]]
     (pose_a, pose_b), (tag_a, tag_b) = (
         [np.array([index.get(end, -1) for end in side], dtype=np.int64) for side in ends] for index in (firsts, tags)
@@ -100,10 +100,15 @@ def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
 
 
 def _usable(graph: Graph, measurements: Measurements) -> tuple[tuple[MeasuredStart, ...], tuple[MeasuredDistance, ...]]:
-    names, known = _names(graph), {*_names(graph), *graph.tags}
+    names, known = _names(graph), {*_names(graph), *_first_instances(graph)}
     has_frame = names[0] == measurements.frame
     starts = tuple(start for start in measurements.starts if has_frame and start.run in names)
     return starts, tuple(each for each in measurements.distances if each.a in known and each.b in known)
+
+
+def _first_instances(graph: Graph) -> dict[str | TagKey, int]:
+    """The tag of each id; of one that hangs in several places the first."""
+    return {tag.whole: i for i, tag in reversed(list(enumerate(graph.tags)))}
 
 
 def _names(graph: Graph) -> list[str]:

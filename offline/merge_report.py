@@ -1,6 +1,6 @@
 """What merging found, in words for a person and typed for the result."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import degrees
 
 from calib.arrays import FloatArray
@@ -18,8 +18,14 @@ def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[Alignmen
     return tuple(_result(maps, pair, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
 
 
-def merge_warnings(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
-    """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart."""
+def merge_warnings(maps: Sequence[LocalMap], merged: Merge, named: Collection[tuple[str, int]] = ()) -> list[str]:
+    """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart.
+
+    Args:
+        maps: that were merged.
+        merged: the result.
+        named: family and id of tags of which nothing more is to be said.
+    """
     component = {m: i for i, group in enumerate(merged.groups) for m in group.members}
     warnings = []
     for pair in merged.pairs:
@@ -27,7 +33,7 @@ def merge_warnings(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
         if alignment is None:
             continue
         if alignment.is_sure:
-            warnings += _elsewhere(maps, pair, alignment)
+            warnings += _elsewhere(maps, pair, alignment, named)
         elif component[pair.a] == component[pair.b]:
             warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
     warnings += _contradictions(maps, merged)
@@ -91,7 +97,9 @@ def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
     )
 
 
-def _elsewhere(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment) -> list[str]:
+def _elsewhere(
+    maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment, named: Collection[tuple[str, int]]
+) -> list[str]:
     a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
     return [
         f"tag {tag.tag_id} lies {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
@@ -99,7 +107,7 @@ def _elsewhere(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignme
         for tag, fits, off_m, sigmas in zip(
             alignment.shared, alignment.inlier, alignment.off_m, alignment.off_sigmas, strict=True
         )
-        if not fits
+        if not fits and (tag.family, tag.tag_id) not in named
     ]
 
 
@@ -124,10 +132,14 @@ def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment)
         n_shared=len(pair.shared),
         n_inliers=alignment.n_inliers,
         inlier_rmse_m=alignment.rmse_m,
-        outliers=tuple((*tag,) for tag in alignment.outliers),
+        outliers=_ids(alignment.outliers),
         is_sure=alignment.is_sure,
-        rivals=tuple(RivalResult(each.T_a_b, tuple((*tag,) for tag in each.inliers)) for each in alignment.rivals),
+        rivals=tuple(RivalResult(each.T_a_b, _ids(each.inliers)) for each in alignment.rivals),
     )
+
+
+def _ids(tags: Sequence[TagKey]) -> tuple[tuple[str, int], ...]:
+    return tuple((tag.family, tag.tag_id) for tag in tags)
 
 
 def _names(tags: Sequence[TagKey]) -> str:

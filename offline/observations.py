@@ -158,7 +158,7 @@ def _upright_or_askew(
     The level is how many times the corners' variance is what it is said to be.
     """
     seen, index = np.unique(tag, return_inverse=True)
-    sides_m = np.array([run.robot.tag_size_m(*run.tags[t])[0] for t in seen])[index]
+    sides_m = np.array([run.robot.tag_size_m(run.tags[t].family, run.tags[t].tag_id)[0] for t in seen])[index]
     rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
     upright = upright_readings(corners_px, sides_m, camera, rotation, sigma_corner_px)
     level = _level(upright.chi2)
@@ -275,7 +275,7 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
         for index in np.unique(run.detections.tag):
             key = run.tags[index]
             try:
-                size_m = run.robot.tag_size_m(*key)[0]
+                size_m = run.robot.tag_size_m(key.family, key.tag_id)[0]
             except CalibError as error:
                 raise OfflineError(f"{run.log}: {error}") from error
             other_m, other = known.setdefault(key, (size_m, run))

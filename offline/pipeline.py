@@ -25,10 +25,13 @@ from offline.result import (
     MapResult,
     MeasurementResult,
     MetreResult,
+    SuspectTag,
 )
 from offline.run import RobotFile, Run, load_run
 from offline.solver import Solution
 from offline.stages import Stages
+from offline.suspects import split_alone, split_together, with_outliers_apart
+from offline.suspects_report import suspect_tags
 from offline.weak_parts import weak_parts
 
 
@@ -38,6 +41,8 @@ def map_logs(
     noise: NoiseParameters | None = None,
     stages: Stages | None = None,
     tape: TapeOptions | None = None,
+    *,
+    keep_suspects: bool = False,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
 
@@ -47,6 +52,7 @@ def map_logs(
         noise: sigmas of wheels and readings; defaults where None.
         stages: told what is being done, and keeps what it took.
         tape: what somebody measured.
+        keep_suspects: tags that do not belong are named only, not told apart from what they were.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -64,7 +70,7 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return build_map(runs, noise, stages, tape)
+    return build_map(runs, noise, stages, tape, keep_suspects=keep_suspects)
 
 
 def build_map(
@@ -72,6 +78,8 @@ def build_map(
     noise: NoiseParameters | None = None,
     stages: Stages | None = None,
     tape: TapeOptions | None = None,
+    *,
+    keep_suspects: bool = False,
 ) -> MapResult:
     """As `map_logs`, from runs already read.
 
@@ -80,6 +88,7 @@ def build_map(
         noise: sigmas of wheels and readings; defaults where None.
         stages: told what is being done, and keeps what it took.
         tape: what somebody measured.
+        keep_suspects: tags that do not belong are named only, not told apart from what they were.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -102,8 +111,13 @@ def build_map(
     with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps)
     chains = [each.chain for each in maps]
+    whole = maps
+    with stages.stage("tags that do not belong"):
+        maps = [split_alone(each) for each in whole]
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
+        maps = with_outliers_apart(maps, merged)
+    suspects: list[SuspectTag] = []
     components: list[Component] = []
     calibration: list[CalibrationResult] = []
     measured: list[MeasurementResult] = []
@@ -112,6 +126,13 @@ def build_map(
     warnings = [w for run in runs for w in run.warnings] + broken + [w for chain in chains for w in chain.warnings]
     for i, members in enumerate(merged.groups):
         graph, solution = solve_global_map(maps, members, stages, measurements)
+        with stages.stage("tags that do not belong"):
+            searched = split_together(graph, solution, [maps[m] for m in members.members])
+            found = suspect_tags(searched)
+        suspects += found
+        graph, solution = searched.graph, searched.solution
+        if keep_suspects and found:
+            graph, solution = solve_global_map(whole, members, stages, measurements)
         with stages.stage("covariances"):
             components.append(component_of(graph, solution))
             calibration.extend(calibration_of(graph, solution, i))
@@ -121,9 +142,10 @@ def build_map(
         if not solution.converged:
             warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
         warnings += weak_parts(graph, solution) + _contradictions(maps, members, i, solution)
+    named = {(each.family, each.tag_id) for each in suspects}
     measured += unused(measurements, measured)
     warnings += measurement_warnings(measured) + check_warnings(checks) + _calibration_warnings(calibration, checks)
-    warnings += _chain_warnings(chains) + merge_warnings(maps, merged)
+    warnings += _chain_warnings(chains) + merge_warnings(maps, merged, named)
     return MapResult(
         components=tuple(components),
         alignments=alignment_results(maps, merged),
@@ -134,6 +156,7 @@ def build_map(
         metres=tuple(metres),
         warnings=tuple(dict.fromkeys(warnings)),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
+        suspects=tuple(suspects),
     )
 
 

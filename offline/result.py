@@ -120,6 +120,31 @@ class Component:
 
 
 @dataclass(frozen=True)
+class SuspectTag:
+    """A tag that does not belong.
+
+    Attributes:
+        kind: moved (between runs), moving (during one), swapped, duplicated (two tags with one id), phantom (a false
+            detection) or inconsistent (its run has most of its tags elsewhere).
+        runs: moved, swapped: in which it is not where it was first; moving: during which it was moved; duplicated:
+            that saw it; phantom: with the false detections; inconsistent: the one that is wrong.
+        evidence: in words, with numbers.
+        swapped_with: the other tag's id.
+    """
+
+    family: str
+    tag_id: int
+    kind: str
+    runs: tuple[str, ...]
+    evidence: str
+    swapped_with: int | None = None
+
+    def line(self) -> str:
+        """For a terminal."""
+        return f"tag {self.tag_id} ({self.family}) {self.kind}: {self.evidence}"
+
+
+@dataclass(frozen=True)
 class CalibrationResult:
     """One calibration number that the solve carried, as a correction to what robot.yaml says."""
 
@@ -193,6 +218,7 @@ class MapResult:
     metres: tuple[MetreResult, ...] = ()
     warnings: tuple[str, ...] = field(default=())
     losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
+    suspects: tuple[SuspectTag, ...] = ()
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

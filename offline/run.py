@@ -24,10 +24,16 @@ from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDete
 
 
 class TagKey(NamedTuple):
-    """What a detector can tell of a tag."""
+    """What a detector can tell of a tag; and which one it is where an id turned out to hang in several places."""
 
     family: str
     tag_id: int
+    instance: str = ""
+
+    @property
+    def whole(self) -> "TagKey":
+        """The id alone, whichever instance."""
+        return TagKey(self.family, self.tag_id)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from calib import se2
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.noise import NoiseParameters
 from calib.robot import Robot
 from offline.chain import Chain, chains_of
@@ -46,10 +46,16 @@ class Town:
     Attributes:
         tags_m: (T, 2) by tag id.
         tag_scale: of the batch that all tags were printed in.
+        n_crossings: along each side.
+        tag_ids: (T,) where they are not the numbers of the rows.
+        there: (T, 2) between which shares of a drive each tag is there, where not all of the time.
     """
 
     tags_m: FloatArray
     tag_scale: float
+    n_crossings: int = N_CROSSINGS
+    tag_ids: IntArray | None = None
+    there: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ def made_long_drive(
     """
     rng = np.random.default_rng(seed)
     robot = _robot(radius_sigma, "carl" if town is None else f"carl{seed}")
-    driven = _driven(rng, length_m)
+    driven = _driven(rng, length_m, N_CROSSINGS if town is None else town.n_crossings)
     poses = se2.compose(se2.inverse(driven[0]), driven)
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses), dtype=np.int64)
     placed = _placed_tags(rng, TAG_SPACING_M) if town is None else town.tags_m
@@ -108,7 +114,13 @@ def made_long_drive(
     odometry_factor, reading_factor = noise_factors[0] * (noise_factors[1] / noise_factors[0]) ** rng.random(2)
     pictures = np.arange(0, len(poses), picture_every)
     picture, tag, value = _readings(rng, poses[pictures], tags_m, robot, calibration, reading_factor)
-    seen, tag = np.unique(tag, return_inverse=True)
+    ids = np.arange(len(placed))
+    if town is not None:
+        ids = ids if town.tag_ids is None else town.tag_ids
+        shown = _is_there(town, tag, picture / len(pictures))
+        picture, tag, value = picture[shown], tag[shown], value[shown]
+    row_of = tag
+    seen, first, tag = np.unique(ids[tag], return_index=True, return_inverse=True)
     keys = tuple(TagKey(FAMILY, int(i)) for i in seen)
     n = len(picture)
     positions = Positions(
@@ -121,7 +133,7 @@ def made_long_drive(
     return LongDrive(
         _with_noise(rng, chain, odometry_factor),
         poses[np.searchsorted(stamps_ns, chain.stamps_ns)],
-        dict(zip(keys, tags_m[seen], strict=True)),
+        dict(zip(keys, tags_m[row_of[first]], strict=True)),
         calibration,
         driven[0],
     )
@@ -158,10 +170,18 @@ def with_a_moved_tag(drive: LongDrive, chain: Chain | None = None) -> Chain:
     return replace(chain, readings=replace(readings, value=value))
 
 
-def made_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M) -> Town:
+def made_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_crossings: int = N_CROSSINGS) -> Town:
     """Roads with tags so far apart, and their batch a draw from its prior."""
     rng = np.random.default_rng(seed)
-    return Town(_placed_tags(rng, spacing_m), made_robot().tags[0].relative_sigma * float(rng.standard_normal()))
+    placed = _placed_tags(rng, spacing_m, n_crossings)
+    return Town(placed, made_robot().tags[0].relative_sigma * float(rng.standard_normal()), n_crossings)
+
+
+def _is_there(town: Town, tag: IntArray, share: FloatArray) -> BoolArray:
+    """(M,) whether each tag read hangs there after that share of the drive."""
+    if town.there is None:
+        return np.ones(len(tag), dtype=np.bool_)
+    return np.asarray((town.there[tag, 0] <= share) & (share < town.there[tag, 1]))
 
 
 def _robot(radius_sigma: float | None, robot_id: str) -> Robot:
@@ -177,13 +197,13 @@ def _robot(radius_sigma: float | None, robot_id: str) -> Robot:
     return robot.model_copy(update={"wheels": wheels_section})
 
 
-def _driven(rng: np.random.Generator, length_m: float) -> FloatArray:
+def _driven(rng: np.random.Generator, length_m: float, n_crossings: int) -> FloatArray:
     """(N, 3) true poses at the wheel readings: along roads, turning on the spot."""
-    place, way = rng.integers(0, N_CROSSINGS, 2), int(rng.integers(0, 4))
+    place, way = rng.integers(0, n_crossings, 2), int(rng.integers(0, 4))
     turns, steps = round(0.5 * np.pi / STEP_RAD), round(ROAD_M / STEP_M)
     poses: list[FloatArray] = [np.r_[ROAD_M * place, 0.5 * np.pi * way][None]]
     for _ in range(round(length_m / ROAD_M)):
-        free = [turn for turn in (0, 1, -1, 2) if _is_crossing(place + _WAYS[(way + turn) % 4])]
+        free = [turn for turn in (0, 1, -1, 2) if _is_crossing(place + _WAYS[(way + turn) % 4], n_crossings)]
         onward = [turn for turn in free if turn != 2]
         turn = 2 if 2 in free and (not onward or rng.random() < TURN_ROUND_SHARE) else int(rng.choice(onward))
         heading = 0.5 * np.pi * way + np.sign(turn) * STEP_RAD * np.arange(1, abs(turn) * turns + 1)
@@ -197,17 +217,19 @@ def _driven(rng: np.random.Generator, length_m: float) -> FloatArray:
     return driven
 
 
-def _is_crossing(place: IntArray) -> bool:
-    return bool(((place >= 0) & (place < N_CROSSINGS)).all())
+def _is_crossing(place: IntArray, n_crossings: int) -> bool:
+    return bool(((place >= 0) & (place < n_crossings)).all())
 
 
-def _placed_tags(rng: np.random.Generator, spacing_m: tuple[float, float]) -> FloatArray:
+def _placed_tags(
+    rng: np.random.Generator, spacing_m: tuple[float, float], n_crossings: int = N_CROSSINGS
+) -> FloatArray:
     """(T, 2) beside the roads, now left, now right."""
     tags = []
-    for across in range(N_CROSSINGS):
+    for across in range(n_crossings):
         for along_x in (True, False):
             along_m = rng.uniform(0.0, spacing_m[1])
-            while along_m < ROAD_M * (N_CROSSINGS - 1):
+            while along_m < ROAD_M * (n_crossings - 1):
                 place = np.array([along_m, ROAD_M * across + TAG_OFFSET_M * rng.choice([-1.0, 1.0])])
                 tags.append(place if along_x else place[::-1])
                 along_m += rng.uniform(*spacing_m)

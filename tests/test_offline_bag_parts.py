@@ -23,7 +23,7 @@ from offline.bag_tags import Sighting, read_look
 from offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
 from offline.import_robot import ImportOptions
 from offline.imported_run import ImportReport
-from offline.run import Run, load_run
+from offline.run import Run, TagKey, load_run
 from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, header, made_message, write_bag
 from tests.made_drives import CAMERA as LENS
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
@@ -182,7 +182,7 @@ def test_poses_about_the_base_need_no_camera(tmp_path: Path, log: Path) -> None:
     _, run = imported(made.sent, tmp_path, BagOptions())
     np.testing.assert_allclose(run.positions.value, [[3.0, -1.0]])
     assert not run.positions.in_camera.any()
-    assert run.tags == (("tag36h11", 5),)
+    assert run.tags == (TagKey("tag36h11", 5),)
 
 
 def test_corners_of_the_older_definition_are_eight_numbers() -> None:

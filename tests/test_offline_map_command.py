@@ -396,7 +396,9 @@ def test_a_tag_that_another_robot_carries_about(map_to: Run, tmp_path: Path) -> 
         parts.append(write_drive(tmp_path / f"part{i}", DRIVES["b"], [*TAGS, carried], made_robot("b")))
     outcome = map_to(log_a, spliced(parts, tmp_path / "carried"))
     assert outcome.code == 0
-    assert re.search(r"tag 9 lies [\d.]+ m \(\d+ sigma\) elsewhere in b_one than in a_one", outcome.out)
+    assert re.search(
+        r"suspect: tag 9 \(tag36h11\) moving: by [\d.]+ m \(\d+ sigma\) during b_one: in a_one", outcome.out
+    )
 
 
 def spliced(parts: list[Path], folder: Path) -> Path:

@@ -12,7 +12,7 @@ from calib import se2
 from calib.camera_file import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import write_robot_yaml
-from offline.run import RobotFile, load_run, read_robot_file
+from offline.run import RobotFile, TagKey, load_run, read_robot_file
 from offline.stretches import wheel_distances
 from onboard.log_head import log_head
 from onboard.log_writer import LogWriter
@@ -121,10 +121,8 @@ def test_readings_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> No
 def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
     seen = [picture(0.01, tag(7), tag(3)), picture(0.02), picture(0.03, tag(3, "tag25h9"))]
     run = load_run(write_log(tmp_path, [*TWO_READINGS, *seen]))
-    assert run.tags == ((FAMILY, 3), (FAMILY, 7), ("tag25h9", 3)) or run.tags == (
-        ("tag25h9", 3), (FAMILY, 3), (FAMILY, 7),
-    )  # fmt: skip
-    named = [run.tags[i] for i in run.detections.tag]
+    assert set(run.tags) == {TagKey(FAMILY, 3), TagKey(FAMILY, 7), TagKey("tag25h9", 3)}
+    named = [(run.tags[i].family, run.tags[i].tag_id) for i in run.detections.tag]
     assert named == [(FAMILY, 7), (FAMILY, 3), ("tag25h9", 3)]
     np.testing.assert_array_equal(run.detections.corners_px, np.tile(np.reshape(CORNERS, (4, 2)), (3, 1, 1)))
     assert (run.picture_stamps_ns - START_NS).tolist() == [10_000_000, 20_000_000, 30_000_000]
@@ -142,7 +140,7 @@ def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
 def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:
     seen = picture(0.01, tag(7, hamming=1), tag(8), tag(9, corners=CORNERS[:6]))
     run = load_run(write_log(tmp_path, [*TWO_READINGS, seen]))
-    assert run.tags == ((FAMILY, 8),)
+    assert run.tags == (TagKey(FAMILY, 8),)
 
 
 def test_pictures_of_another_size_are_left_out_and_said(tmp_path: Path) -> None:
@@ -287,6 +285,6 @@ def test_a_fast_robot_is_not_refused(tmp_path: Path) -> None:
 def test_a_run_that_saw_tags_and_one_that_saw_none(tmp_path: Path) -> None:
     drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     run = load_run(write_drive(tmp_path, drive, [MadeTag(5, (4.0, 0.3, 0.5), np.pi)]))
-    assert run.tags == ((FAMILY, 5),)
+    assert run.tags == (TagKey(FAMILY, 5),)
     assert len(run.detections.tag) == len(run.picture_stamps_ns)
     assert load_run(write_drive(tmp_path, drive, run_id="two")).tags == ()

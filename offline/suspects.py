@@ -1,0 +1,217 @@
+"""Tags that do not belong: found after the solve, given places of their own, and solved again.
+
+A run on its own first: a tag that was carried about while it drove wrecks a local map, and with it the alignment. Then
+all runs of a component together, begun with those tags apart that alignments found elsewhere.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from offline.factors import State
+from offline.graph import Graph, build_graph
+from offline.local_map import LocalMap, solve_local_map
+from offline.measured_factors import Measured
+from offline.merge import Merge
+from offline.run import TagKey
+from offline.solver import Solution, solve
+from offline.suspects_evidence import Evidence, contradicted, gathered, noise_scales
+from offline.suspects_search import FALSE_ALARM, Places, bound, excess, search, settled
+from offline.suspects_sightings import (
+    Sightings,
+    instances,
+    places_told_apart,
+    sightings_of,
+    with_instances,
+)
+
+# Each search is linearised where the last one led; two do where a move is far beyond its sigma.
+_MOST_SEARCHES: Final = 5
+_LOOSER: Final = 1e3
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A solve whose tags are where its readings say, split where need be.
+
+    Attributes:
+        graph, solution: with the splits.
+        sightings: of the graph's chains.
+        place: (S,) equal where sightings are of one tag.
+        evidence: at the solution, and places: of its sightings.
+    """
+
+    graph: Graph
+    solution: Solution
+    sightings: Sightings
+    place: IntArray
+    evidence: Evidence
+    places: Places
+
+    @property
+    def tags(self) -> list[TagKey]:
+        """The tag of each sighting (S,)."""
+        of = zip(self.sightings.chain, self.sightings.tag, strict=True)
+        return [self.graph.chains[c].tags[t] for c, t in of]
+
+
+def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalMap:
+    """A local map in which tags that were not in one place all along have several; the same where there are none.
+
+    A drive that does not fit together may have ended in a wrong valley, led there by two tags with one id. Then it is
+    solved with each sighting's tag apart, which wheels alone hold together, and sightings are joined from there, the
+    surest first.
+    """
+    found = local_map
+    if not found.goodness.fits:
+        factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
+        sightings = _sightings(found.graph, found.solution.state, factors)
+        if len(sightings) > len(sightings.ids):
+            found = _settled_alone(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
+    # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
+    return _settled_alone(found, noise_scales([found.goodness]), false_alarm)
+
+
+def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
+    """Splits and joins until nothing changes."""
+    found = local_map
+    for _ in range(_MOST_SEARCHES):
+        seen = _looked_at(found.graph, found.solution, scales)
+        wanted = _wanted(seen, false_alarm)
+        if _same(wanted, seen.place):
+            break
+        found = _relabelled(found, seen.sightings, wanted)
+    return found
+
+
+def _relabelled(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
+    """The chain solved anew with these places, whose names no other run has."""
+    tag_of = instances(sightings, place, f"{local_map.chain.name} ")
+    return solve_local_map(with_instances([local_map.chain], sightings, tag_of)[0])
+
+
+def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
+    """The maps with tags told apart that sure alignments found elsewhere in one map than in another."""
+    names: dict[tuple[int, TagKey], TagKey] = {}
+    sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_sure]
+    outliers = {tag for pair in sure for tag in (pair.alignment.outliers if pair.alignment else ())}
+    for tag in sorted(outliers):
+        group = {m: m for m, each in enumerate(maps) if tag in each.graph.tags}
+        for pair in sure:
+            if pair.alignment is not None and tag in pair.alignment.inliers:
+                one, other = group[pair.a], group[pair.b]
+                group = {m: one if g == other else g for m, g in group.items()}
+        for m, g in group.items():
+            names[m, tag] = tag._replace(instance=f"like {maps[g].chain.name}")
+    return [_renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
+
+
+def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+    """Splits and joins the tags of a component until nothing changes.
+
+    What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault.
+
+    Args:
+        graph: of the component.
+        solution: of it.
+        maps: of the graph's chains.
+    """
+    if len(graph.problem.measured):
+        loose = replace(graph, problem=replace(graph.problem, measured=_loosened(graph.problem.measured)))
+        seen = _split(loose, solve(loose.problem, solution.state), maps)
+        problem = replace(seen.graph.problem, measured=_measured_again(graph, seen.graph))
+        return replace(seen, graph=replace(seen.graph, problem=problem), solution=solve(problem, seen.solution.state))
+    return _split(graph, solution, maps)
+
+
+def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+    scales = noise_scales([each.goodness for each in maps])
+    seen = _looked_at(graph, solution, scales)
+    for _ in range(_MOST_SEARCHES):
+        wanted = _wanted(seen, FALSE_ALARM)
+        if instances(seen.sightings, wanted) == seen.tags:
+            break
+        seen = _looked_at(*_solved_again(seen, wanted), scales)
+    return seen
+
+
+def _sightings(graph: Graph, state: State, scales: FloatArray) -> Sightings:
+    """Cut also where a tag moved in sight."""
+    whole = sightings_of(graph.chains)
+    cut = contradicted(graph, state, whole, scales)
+    return sightings_of(graph.chains, cut) if cut.any() else whole
+
+
+def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
+    sightings = _sightings(graph, solution.state, scales)
+    place = places_told_apart(graph.chains, sightings)
+    evidence = gathered(graph, solution.state, sightings, scales)
+    return Searched(graph, solution, sightings, place, evidence, settled(evidence, place[evidence.which]))
+
+
+def _wanted(seen: Searched, false_alarm: float) -> IntArray:
+    """(S,) the places that the evidence asks for."""
+    which = seen.evidence.which
+    found = seen.place.copy()
+    if len(which):
+        least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm)
+        found[which] = seen.place.max() + 1 + search(seen.evidence, seen.sightings, seen.place[which], least_gain)
+    return found
+
+
+def _same(place: IntArray, other: IntArray) -> bool:
+    """Whether two ways (S,) to number places gather the same sightings."""
+    pairs = len(np.unique(np.column_stack([place, other]), axis=0))
+    return pairs == len(np.unique(place)) == len(np.unique(other))
+
+
+def _solved_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
+    """The same chains with these places, from the poses as they are."""
+    graph, state = seen.graph, seen.solution.state
+    again = build_graph(with_instances(graph.chains, seen.sightings, instances(seen.sightings, place)))
+    again = replace(again, problem=replace(again.problem, measured=_measured_again(graph, again)))
+    start = again.start(state.poses, _unchanged(graph, again, state.tags), graph.calibration_of(state))
+    return again, solve(again.problem, start)
+
+
+def _loosened(measured: Measured) -> Measured:
+    """With sigmas so wide that it contradicts nothing."""
+    starts, distances = measured.starts, measured.distances
+    return Measured(
+        replace(starts, whitening=starts.whitening / _LOOSER),
+        replace(distances, sigma_m=distances.sigma_m * _LOOSER),
+    )
+
+
+def _measured_again(before: Graph, after: Graph) -> Measured:
+    """What was measured, now to the first instance of each tag."""
+    measured = before.problem.measured
+    first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
+    index = np.array([first[tag.whole] for tag in before.tags], dtype=np.int64)
+    distances = measured.distances
+    ends = {
+        name: np.where(tag >= 0, index[tag], -1)
+        for name, tag in (("tag_a", distances.tag_a), ("tag_b", distances.tag_b))
+    }
+    return replace(measured, distances=replace(distances, **ends))
+
+
+def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
+    """Places of the tags that have the readings they had."""
+    n_before = dict(zip(before.tags, before.n_readings().tolist(), strict=True))
+    n_after = dict(zip(after.tags, after.n_readings().tolist(), strict=True))
+    places = dict(zip(before.tags, tags_m, strict=True))
+    return {tag: places[tag] for tag, n in n_after.items() if n_before.get(tag) == n}
+
+
+def _renamed(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
+    """The same map with some of its tags under other names."""
+    if not names:
+        return local_map
+    chain = local_map.chain
+    renamed = replace(chain, tags=tuple(names.get(tag, tag) for tag in chain.tags))
+    graph = replace(local_map.graph, chains=(renamed,), tags=tuple(names.get(tag, tag) for tag in local_map.graph.tags))
+    return replace(local_map, chain=renamed, graph=graph)
