@@ -63,7 +63,7 @@ def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
     said: list[str] = []
 
     def listen() -> None:
-        with suppress(ValueError):  # closed by a caller who had enough
+        with suppress(ValueError, OSError):  # closed by a caller who had enough
             said.append(process.communicate(timeout=_PATIENCE_S)[0])
 
     reader = threading.Thread(target=listen, daemon=True)
