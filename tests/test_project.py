@@ -15,6 +15,8 @@ COMMANDS = [
     ("calib.cli",),
     ("calib.cli", "board"),
     ("calib.cli", "tags"),
+    ("calib.cli", "camera"),
+    ("calib.cli", "check"),
     ("onboard.cli",),
     ("onboard.cli", "record"),
     ("onboard.cli", "check"),
