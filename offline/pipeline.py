@@ -30,7 +30,7 @@ from offline.result import (
 from offline.run import RobotFile, Run, load_run
 from offline.solver import Solution
 from offline.stages import Stages
-from offline.suspects import split_alone, split_together, with_outliers_apart
+from offline.suspects import explained_by_tags, joined, split_alone, split_together, with_outliers_apart
 from offline.suspects_report import suspect_tags
 from offline.weak_parts import weak_parts
 
@@ -108,12 +108,13 @@ def build_map(
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()
+    with stages.stage("tags that do not belong"):
+        maps = [explained_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps)
     chains = [each.chain for each in maps]
-    whole = maps
     with stages.stage("tags that do not belong"):
-        maps = [split_alone(each) for each in whole]
+        maps = [split_alone(each) for each in maps]
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
         maps = with_outliers_apart(maps, merged)
@@ -132,7 +133,7 @@ def build_map(
         suspects += found
         graph, solution = searched.graph, searched.solution
         if keep_suspects and found:
-            graph, solution = solve_global_map(whole, members, stages, measurements)
+            graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
         with stages.stage("covariances"):
             components.append(component_of(graph, solution))
             calibration.extend(calibration_of(graph, solution, i))

@@ -75,6 +75,27 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     return _settled_alone(found, noise_scales([found.goodness]), false_alarm)
 
 
+def explained_by_tags(before: LocalMap) -> LocalMap:
+    """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
+
+    Where wheels did not tell how the robot moved, most tags seem to have been moved.
+    """
+    after = split_alone(before)
+    sightings = sightings_of([before.chain])
+    n_again = int((np.bincount(sightings.id) > 1).sum())
+    n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
+    return after if after.goodness.fits and 2 * n_split < max(n_again, 3) else before
+
+
+def joined(local_map: LocalMap) -> LocalMap:
+    """With one place for each id again."""
+    if not any(tag.instance for tag in local_map.chain.tags):
+        return local_map
+    sightings = sightings_of([local_map.chain])
+    ids = [sightings.ids[i] for i in sightings.id]
+    return solve_local_map(with_instances([local_map.chain], sightings, ids)[0])
+
+
 def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
     """Splits and joins until nothing changes."""
     found = local_map
