@@ -30,6 +30,8 @@ ODOMETRY_NOISE: Final = (
 GAP_NS: Final = 500_000_000
 _GAP_SIGMA_PER_M: Final = 0.1
 _WHILE_NS: Final = 25_000_000
+# Over so many one more or less counts for a percent.
+_MANY_TICKS: Final = 100.0
 
 # Below what any encoder resolves; keeps the information of a step that measured no motion finite.
 _SMALLEST_QUANTUM_M: Final = 1e-4
@@ -141,8 +143,10 @@ def compose_odometry(
     to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
 
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
-    net_turn_rad = _net_turn(right_m - left_m, duration_s, step_of_piece) / track_m
-    unit, in_gap = _piece_covariances(0.5 * (left_m + right_m), net_turn_rad, duration_s)
+    while_of_piece = _whiles(step_of_piece, 0.5 * (np.abs(left_m) + np.abs(right_m)), track.quantum_m)
+    net_forward_m = _net(0.5 * (left_m + right_m), duration_s, while_of_piece)
+    net_turn_rad = np.abs(_net(right_m - left_m, duration_s, while_of_piece)) / track_m
+    unit, in_gap = _piece_covariances(net_forward_m, net_turn_rad, duration_s)
     known = _given(track, grid_ns)
     is_given = np.isfinite(known).all((-1, -2))
     unit[:, is_given] = 0.0
@@ -187,15 +191,24 @@ def _given(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
     return np.asarray(share[:, None, None] * track.covariance[reading])
 
 
-def _net_turn(difference_m: FloatArray, duration_s: FloatArray, step_of_piece: IntArray) -> FloatArray:
-    """(N,) the turn of a whole step, spread over its pieces by duration, as a difference of the wheels.
+def _whiles(step_of_piece: IntArray, rolled_m: FloatArray, quantum_m: float) -> IntArray:
+    """(N,) rising numbers: pieces that follow each other within a step and some ticks have the same."""
+    rolled = np.cumsum(rolled_m)
+    rolled -= rolled[np.searchsorted(step_of_piece, step_of_piece)]
+    part = np.floor(rolled / max(_MANY_TICKS * quantum_m, _SMALLEST_QUANTUM_M))
+    begins = (np.diff(step_of_piece, prepend=-1) != 0) | (np.diff(part, prepend=0.0) != 0.0)
+    return np.asarray(np.cumsum(begins) - 1)
 
-    Quantised readings taken one by one would add up a turn that never was.
+
+def _net(moved: FloatArray, duration_s: FloatArray, while_of_piece: IntArray) -> FloatArray:
+    """(N,) what came of each while in the end, spread over its pieces by duration.
+
+    Quantised readings taken one by one would add up ways and turns that never were, as would many of them together lose
+    what was driven there and back.
     """
-    n_steps = int(step_of_piece[-1]) + 1
-    turned = np.abs(np.bincount(step_of_piece, difference_m, n_steps))
-    duration = np.bincount(step_of_piece, duration_s, n_steps)
-    return np.asarray(turned[step_of_piece] * duration_s / duration[step_of_piece])
+    whole = np.bincount(while_of_piece, moved)
+    duration = np.bincount(while_of_piece, duration_s)
+    return np.asarray(whole[while_of_piece] * duration_s / duration[while_of_piece])
 
 
 def _piece_covariances(
