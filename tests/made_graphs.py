@@ -68,8 +68,10 @@ def with_measured(problem: Problem, truth: State, seed: int, n: int) -> Problem:
     ends = np.array([rng.permutation(len(firsts) + n_tags)[:2] for _ in range(n)], dtype=np.int64).reshape(-1, 2).T
     pose = np.where(ends < len(firsts), firsts[np.minimum(ends, len(firsts) - 1)], -1)
     tag = np.where(ends < len(firsts), -1, ends - len(firsts))
-    distance_m = rng.uniform(1.0, 5.0, n)
-    distances = DistanceFactors(pose[0], tag[0], pose[1], tag[1], distance_m, np.full(n, 0.02))
+    # Near the truth: where lengths go together nowhere, the best fit lies where triangles are flat.
+    place = np.where((pose >= 0)[..., None], truth.poses[pose, :2], truth.tags[tag])
+    distance_m = np.linalg.norm(place[1] - place[0], axis=-1) + 0.02 * rng.standard_normal(n)
+    distances = DistanceFactors(pose[0], tag[0], pose[1], tag[1], np.maximum(distance_m, 0.01), np.full(n, 0.02))
     return replace(problem, measured=Measured(starts, distances))
 
 
