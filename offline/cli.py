@@ -8,6 +8,7 @@ import typer
 from calib.command_line import EXIT_WITH_LOSSES, new_app
 from calib.command_line import run as run_program
 from calib.errors import GroundsbotError
+from offline.export_options import ExportFormat, ExportOptions
 
 app = new_app("Turns run logs into one map of tags and trajectories, and tells what is in them.")
 
@@ -264,6 +265,50 @@ def compare(
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return
     for line in errors.lines():
+        typer.echo(line)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")],
+    form: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
+    ],
+    component: Annotated[
+        int | None, typer.Option(min=0, help="Which one, where the map has several: each has a frame of its own.")
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            help="geojson: where the map's frame lies, LAT_DEG,LON_DEG,HEADING_DEG (WGS 84; of its x axis, clockwise "
+            "from north)."
+        ),
+    ] = None,
+    tag_poses: Annotated[
+        Path | None,
+        typer.Option(help="frc, limelight: copy of tags.csv in which z_m and yaw_rad are filled in, as measured."),
+    ] = None,
+    tag_height_m: Annotated[
+        float | None, typer.Option(help="frc, limelight: taken for the height of tags that --tag-poses does not tell.")
+    ] = None,
+    face_viewers: Annotated[
+        bool,
+        typer.Option(
+            "--face-viewers", help="frc, limelight: take tags to face where they were seen from, by tens of degrees."
+        ),
+    ] = False,
+    field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
+    family: Annotated[str | None, typer.Option(help="frc: the family to write, which a layout cannot tell.")] = None,
+) -> None:
+    """Writes a finished map in the form of other tools: a graph for g2o, trajectories, places, layouts of tags.
+
+    Nothing is written over, and nothing made up: what a form needs and a map does not hold is an option.
+    """
+    from offline.export import export_map
+
+    options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
+    for line in export_map(folder, options):
         typer.echo(line)
 
 

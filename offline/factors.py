@@ -81,12 +81,12 @@ class OdometryFactors:
     def residual(self, state: State) -> FloatArray:
         """(M, 3), whitened."""
         error, _, _ = self._error(state)
-        return _times(self._scaled_whitening(state), error)
+        return _times(self.scaled_whitening(state), error)
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
         """Residuals (M, 3) and blocks for both poses and the wheel parameters."""
         error, moved, twist = self._error(state)
-        outer = self._scaled_whitening(state)
+        outer = self.scaled_whitening(state)
         by_second = outer @ se2.right_jacobian_inverse(error)
         by_first = -by_second @ se2.adjoint(se2.inverse(moved))
         # log(exp(-(t + dt)) o G) with t = jacobian c: the change enters on the left.
@@ -103,17 +103,22 @@ class OdometryFactors:
             ),
         )
 
-    def _scaled_whitening(self, state: State) -> FloatArray:
+    def expected(self, state: State) -> FloatArray:
+        """M(c), (M, 3): the motions by the wheels as the calibration has them."""
+        return se2.compose(self.motion, se2.exp(self._twist(state)))
+
+    def scaled_whitening(self, state: State) -> FloatArray:
         """W S(c), (M, 3, 3)."""
         scaled = self.whitening.copy()
         scaled[..., :2] /= (1.0 + state.calibration[self.parameters[:, 0]])[:, None, None]
         return scaled
 
     def _error(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        twist = _times(self.jacobian, state.calibration[self.parameters])
         moved = se2.between(state.poses[self.first], state.poses[self.first + 1])
-        expected = se2.compose(self.motion, se2.exp(twist))
-        return se2.log(se2.between(expected, moved)), moved, twist
+        return se2.log(se2.between(self.expected(state), moved)), moved, self._twist(state)
+
+    def _twist(self, state: State) -> FloatArray:
+        return _times(self.jacobian, state.calibration[self.parameters])
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray
+from calib.robot import Mount
+from offline.edges import edges_of
 from offline.factors import State
 from offline.graph import Graph, Parameter, build_graph
 from offline.local_map import LocalMap
@@ -60,6 +62,7 @@ def component_of(graph: Graph, solution: Solution) -> Component:
         cost=solution.cost,
         n_residuals=graph.problem.n_residuals,
         start_to_start=_start_to_start(runs, joint),
+        edges=edges_of(graph, solution),
     )
 
 
@@ -107,6 +110,7 @@ def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArra
 def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray) -> RunResult:
     chain = graph.chains[index]
     poses = graph.poses_of(state, index)
+    mount = graph.mount_of(state, index)
     return RunResult(
         name=chain.name,
         run=chain.run.name,
@@ -118,7 +122,14 @@ def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray) 
         stamps_ns=chain.stamps_ns,
         T_map_base=poses,
         distance_m=float(chain.odometry.distance_m.sum()),
+        T_base_camera=None if mount is None else _components(mount),
     )
+
+
+def _components(mount: Mount) -> FloatArray:
+    """(7,) place and quaternion x, y, z, w."""
+    place_m, turn = mount.T_base_camera.as_components()
+    return np.concatenate([place_m, turn.as_quat(canonical=True)])
 
 
 def _tag_results(graph: Graph, state: State, covariances: Sequence[FloatArray]) -> tuple[TagResult, ...]:

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.robot import RELATIVE_TAG_SIZE_SIGMA, Robot
+from calib.robot import RELATIVE_TAG_SIZE_SIGMA, Mount, Robot
 from offline.chain import Chain
 from offline.factors import (
     MOUNT_PARAMETERS,
@@ -24,6 +24,7 @@ from offline.run import TagKey
 from offline.solver import Problem
 
 TAG_SCALE: Final = "tag_scale"
+_MOUNT: Final = "mount_"
 
 
 class Parameter(NamedTuple):
@@ -68,6 +69,20 @@ class Graph:
     def wheel_parameters(self, chain: int) -> IntArray:
         """(3,) indices of one chain's WHEEL_PARAMETERS."""
         return _indices(self.parameters, _wheel_parameters(self.chains[chain].run.robot))
+
+    def mount_of(self, state: State, chain: int) -> Mount | None:
+        """Where one chain's camera sits, as corrected; None for a log without a camera."""
+        run = self.chains[chain].run
+        if run.camera is None:
+            return None
+        parameters = [*_mount_parameters(run.robot), *_camera_parameters(self.chains[chain])]
+        found = state.calibration[_indices(self.parameters, parameters)].tolist()
+        corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
+        mount = run.robot.mount.model_dump()
+        for name, value in corrections:
+            if name.startswith(_MOUNT):
+                mount[name.removeprefix(_MOUNT)] += value
+        return Mount.model_validate(mount)
 
     def tag_scales(self, chain: int) -> IntArray:
         """Indices of the scales of all batches of tags that one chain read."""

@@ -14,6 +14,7 @@ from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, map_as_json, write_map
+from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
 from offline.picture import write_picture
 from offline.pipeline import map_logs
@@ -39,7 +40,7 @@ class MapOptions:
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
-    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories and map.png.
+    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories, map.mcap and map.png.
 
     Returns:
         The map, and what each stage of making it took.
@@ -64,6 +65,7 @@ def _write_files(result: MapResult, folder: Path, output: Path, stages: Stages) 
     try:
         with stages.stage("writing files"):
             write_map(result, folder)
+            write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
     except OSError as error:

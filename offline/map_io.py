@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ from offline.result import (
     CalibrationResult,
     CheckResult,
     Component,
+    GraphEdges,
     MapResult,
     MeasurementResult,
     MetreResult,
@@ -66,7 +67,7 @@ def write_map(result: MapResult, folder: Path) -> None:
     with written_whole(folder / ARRAYS_FILE) as partial, partial.open("wb") as stream:
         np.savez(stream, **_arrays(result))
     with written_whole(folder / TAGS_FILE) as partial:
-        partial.write_text(_tags_csv(result), encoding="utf-8")
+        partial.write_text(tags_csv(result.components), encoding="utf-8")
     for run in result.runs:
         write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
 
@@ -161,6 +162,7 @@ def _run_json(run: RunResult, component: int) -> dict[str, Any]:
         "run_id": run.run_id,
         "stretch_of": None if run.run == run.name else run.run,
         "component": component,
+        "T_base_camera": None if run.T_base_camera is None else _plain(run.T_base_camera),
     }
 
 
@@ -230,14 +232,17 @@ def _arrays(result: MapResult) -> dict[str, Any]:
             f"{key}tag_positions_m": np.array([tag.position_m for tag in tags]).reshape(-1, 2),
             f"{key}joint_covariance": component.joint_covariance,
         }
+        if component.edges is not None:
+            arrays |= {f"{key}edges_{name}": value for name, value in vars(component.edges).items()}
     return arrays
 
 
-def _tags_csv(result: MapResult) -> str:
+def tags_csv(components: Sequence[Component]) -> str:
+    """The table of tags, as tags.csv has it."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(TAG_COLUMNS)
-    for component in result.components:
+    for component in components:
         for tag in component.tags:
             writer.writerow(_tag_row(tag))
     return stream.getvalue()
@@ -300,7 +305,15 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
             for pair in data["start_to_start"]
             if pair["a"] in names
         ),
+        edges=_edges(f"{key}edges_", arrays),
     )
+
+
+def _edges(key: str, arrays: Mapping[str, Any]) -> GraphEdges | None:
+    names = [each.name for each in fields(GraphEdges)]
+    if f"{key}{names[0]}" not in arrays:
+        return None
+    return GraphEdges(**{name: arrays[f"{key}{name}"] for name in names})
 
 
 def _run(entry: dict[str, Any], T_map_start: FloatArray, folder: Path) -> RunResult:
@@ -316,6 +329,7 @@ def _run(entry: dict[str, Any], T_map_start: FloatArray, folder: Path) -> RunRes
         stamps_ns=stamps_ns,
         T_map_base=T_map_base,
         distance_m=_number(entry["distance_m"]),
+        T_base_camera=None if entry["T_base_camera"] is None else _array(entry["T_base_camera"]),
     )
 
 

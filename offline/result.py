@@ -31,6 +31,8 @@ class RunResult:
     stamps_ns: IntArray  # (K,)
     T_map_base: FloatArray  # (K, 3)
     distance_m: float  # driven, by the wheels
+    # (7,) x, y, z in m and quaternion x, y, z, w: the camera as the solve corrected its mount; None: it has none.
+    T_base_camera: FloatArray | None = None
 
     @property
     def n_keyframes(self) -> int:
@@ -100,6 +102,32 @@ class StartToStart:
 
 
 @dataclass(frozen=True)
+class GraphEdges:
+    """What a component's poses and tags were solved from, with the calibration that the solve found put in.
+
+    With the calibration held at that, the poses and tags of the map are the least squares of these edges. What
+    somebody measured by hand is not among them.
+
+    Attributes:
+        first: (M,) keyframe that a motion starts from, counted through all of the component's runs; the next ends it.
+        motion: (M, 3) T_first_next by the wheels.
+        motion_information: (M, 3, 3) of its right tangent (x, y, theta).
+        pose: (N,) keyframe that a tag was read from, counted likewise.
+        tag: (N,) index into the component's tags.
+        place_m: (N, 2) of the tag in base.
+        place_information: (N, 2, 2).
+    """
+
+    first: IntArray
+    motion: FloatArray
+    motion_information: FloatArray
+    pose: IntArray
+    tag: IntArray
+    place_m: FloatArray
+    place_information: FloatArray
+
+
+@dataclass(frozen=True)
 class Component:
     """Runs and tags in one frame: the start of `frame_run`, which has no uncertainty."""
 
@@ -111,6 +139,7 @@ class Component:
     cost: float  # half the sum of squared whitened residuals
     n_residuals: int
     start_to_start: tuple[StartToStart, ...] = ()
+    edges: GraphEdges | None = None
 
     @property
     def tag_covariance(self) -> FloatArray:

@@ -29,6 +29,7 @@ COMMANDS = [
     ("offline.cli", "salvage"),
     ("offline.cli", "detect"),
     ("offline.cli", "compare"),
+    ("offline.cli", "export"),
     ("fixtures.__main__",),
     ("fixtures.__main__", "simulate"),
     ("fixtures.__main__", "demo"),

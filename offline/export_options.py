@@ -1,0 +1,73 @@
+"""What `export` is asked for; light, since the help shows it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from offline.errors import OfflineError
+
+
+class ExportFormat(StrEnum):
+    """What `export` can write."""
+
+    G2O = "g2o"
+    TUM = "tum"
+    CSV = "csv"
+    GEOJSON = "geojson"
+    FRC = "frc"
+    LIMELIGHT = "limelight"
+
+
+LAYOUTS: Final = (ExportFormat.FRC, ExportFormat.LIMELIGHT)
+_ONLY_FOR: Final = {
+    "origin": (ExportFormat.GEOJSON,),
+    "tag_poses": LAYOUTS,
+    "tag_height_m": LAYOUTS,
+    "face_viewers": LAYOUTS,
+    "field_m": (ExportFormat.FRC,),
+    "family": (ExportFormat.FRC,),
+}
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What the command line says."""
+
+    form: ExportFormat
+    output: Path
+    component: int | None = None
+    origin: str | None = None
+    tag_poses: Path | None = None
+    tag_height_m: float | None = None
+    face_viewers: bool = False
+    field_m: str | None = None
+    family: str | None = None
+
+    def check(self) -> None:
+        """Refuses options that the format has no use for.
+
+        Raises:
+            OfflineError: one was given.
+        """
+        for name, forms in _ONLY_FOR.items():
+            if getattr(self, name) not in (None, False) and self.form not in forms:
+                raise OfflineError(
+                    f"--{name.replace('_', '-')}: means nothing to --format {self.form} (only to {', '.join(forms)}); "
+                    "leave it out"
+                )
+
+
+def numbers(option: str, text: str, names: str) -> list[float]:
+    """The finite numbers of an option such as `--field-m 16.5,8.2`, as many as there are names.
+
+    Raises:
+        OfflineError: they are not numbers, or not as many.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(names.split(",")) or not all(abs(value) < 1e9 for value in values):
+        raise OfflineError(f"{option} {text}: must be {names}, numbers with commas between")
+    return values

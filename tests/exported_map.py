@@ -1,0 +1,31 @@
+"""A small map of two drives, made once for the tests that write it in other forms."""
+
+from pathlib import Path
+
+import numpy as np
+
+from offline.map_command import MapOptions, make_map
+from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+
+TAGS = (
+    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
+    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
+    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
+    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
+    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
+    MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
+)
+STARTS = {"carl": np.array([1.0, 1.5, 0.3]), "dora": np.array([4.0, 2.5, 2.9])}
+_LEGS = [(0.4, 0.4, 2.0), (-0.3, 0.3, 6.0), (0.4, 0.5, 2.0)]
+
+
+def make_small_map(folder: Path) -> Path:
+    """Two noisy drives past six tags, mapped into `folder/map`, in the frame of carl's start."""
+    logs = []
+    for seed, (robot, start) in enumerate(STARTS.items()):
+        drive = made_drive(start.tolist(), _LEGS, step_ns=20_000_000)
+        logs.append(
+            write_drive(folder / "logs", drive, TAGS, made_robot(robot), run_id="one", corner_sigma_px=0.3, seed=seed)
+        )
+    make_map(MapOptions(logs, folder / "map"))
+    return folder / "map"
