@@ -19,8 +19,9 @@ from offline.measured import TapeOptions
 from offline.picture import write_picture
 from offline.pipeline import map_logs
 from offline.progress import progress_bar
-from offline.result import AlignmentResult, Component, MapResult, MeasurementResult, MetreResult
+from offline.result import AlignmentResult, Component, FittedNoise, MapResult, MeasurementResult, MetreResult
 from offline.run import RobotFile, read_robot_file
+from offline.run_noise import NOT_NEEDED
 from offline.stages import StageCost, Stages
 from onboard.log_reader import find_logs
 
@@ -106,6 +107,8 @@ def summary(result: MapResult, output: Path) -> list[str]:
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
     lines += [_metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
+    if result.noise_fit is not None:
+        lines += _noise_lines(result.noise_fit)
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
@@ -168,6 +171,22 @@ def _metre_line(metre: MetreResult, *, several: bool) -> str:
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)
     held = ", ".join(f"{kind} {100.0 * share:.0f} %" for share, kind in shares)
     return f"scale{of}: known to {100.0 * metre.sigma:.2f} %, held by {held}"
+
+
+def _noise_lines(fit: FittedNoise) -> list[str]:
+    """What was fitted, with its 99 % interval, and what was not."""
+    fitted = [
+        f"{each.name} {each.value:.3g} ({each.low:.3g} to {each.high:.3g})" for each in fit.parameters if not each.kept
+    ]
+    lines = []
+    if fitted:
+        lines.append(f"noise as {counted(len(fit.runs), 'run')} show it (with 99 %): " + ", ".join(fitted))
+    kept: dict[str, list[str]] = {}
+    for each in fit.parameters:
+        if each.kept not in ("", NOT_NEEDED):
+            kept.setdefault(each.kept, []).append(f"{each.name} {each.value:.3g}")
+    lines += [f"noise left as it was, since {why}: " + ", ".join(names) for why, names in kept.items()]
+    return lines
 
 
 def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> None:

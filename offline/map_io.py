@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,8 @@ from offline.result import (
     CalibrationResult,
     CheckResult,
     Component,
+    FittedNoise,
+    FittedParameter,
     GraphEdges,
     MapResult,
     MeasurementResult,
@@ -92,6 +94,7 @@ def read_map(folder: Path) -> MapResult:
             components=components,
             alignments=tuple(_alignment(entry) for entry in data["alignments"]),
             noise=NoiseParameters.model_validate(data["noise"]),
+            noise_fit=_noise_fit(data.get("noise_fit")),
             calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
             measurements=tuple(_measurement(entry) for entry in data["measurements"]),
             checks=tuple(_check(entry) for entry in data["checks"]),
@@ -130,6 +133,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
             for pair in component.start_to_start
         ],
         "noise": result.noise.model_dump(),
+        "noise_fit": None if result.noise_fit is None else asdict(result.noise_fit),
         "calibration": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.calibration],
         "measurements": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.measurements],
         "checks": [{"sigmas": _plain(entry.sigmas)} | vars(entry) for entry in result.checks],
@@ -368,6 +372,19 @@ def _measurement(entry: dict[str, Any]) -> MeasurementResult:
 
 def _check(entry: dict[str, Any]) -> CheckResult:
     return CheckResult(**{name: value for name, value in entry.items() if name != "sigmas"})
+
+
+def _noise_fit(entry: dict[str, Any] | None) -> FittedNoise | None:
+    if entry is None:
+        return None
+    parameters = tuple(FittedParameter(**parameter) for parameter in entry["parameters"])
+    return FittedNoise(
+        parameters,
+        shared_range=_number(entry["shared_range"]),
+        shared_bearing=_number(entry["shared_bearing"]),
+        runs=tuple(entry["runs"]),
+        contradicting=tuple(entry["contradicting"]),
+    )
 
 
 def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:

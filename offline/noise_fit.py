@@ -7,17 +7,21 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
+from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
+from offline.covariance_parts import CovarianceParts
 from offline.graph import build_graph
 from offline.local_map import LocalMap
 from offline.solver import solve
-from offline.variance_components import Components, FittedVariances, Part, fit_variances
+from offline.variance_components import LEAST_REDUNDANCY, Components, FittedVariances, Part, fit_variances
 
 # What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals.
-_MAX_KEYFRAMES: Final = 20_000
+_MAX_KEYFRAMES: Final = 6_000
 _QUANTILE: Final = float(ndtri(0.995))
-# No wheel and no detector is so many times better than the defaults: smaller residuals are made up, or too few.
-_BEST: Final = 20.0
+# No wheel and no detector is so many times better or worse than the defaults: smaller residuals are made up, and larger
+# ones are no noise.
+PLAUSIBLE: Final = 20.0
+_ROUNDING: Final = 1e-6
 
 
 @dataclass(frozen=True)
@@ -25,10 +29,10 @@ class FittedSigma:
     """One noise parameter, as the drives have it.
 
     Attributes:
-        low, high: where it lies with 99 %.
+        value: fitted, or where the fit began.
+        low, high: where it lies with 99 %, as far as the drives tell.
         redundancy: of how many squared residuals of its own it is the mean.
-        told: False where the drives say next to nothing of it; then it stands where it began, or where they are more
-            content with if that is more, unless they speak against that.
+        kept: why it stands where it began; empty where it was fitted.
     """
 
     name: str
@@ -36,38 +40,45 @@ class FittedSigma:
     low: float
     high: float
     redundancy: float
-    told: bool
+    kept: str = ""
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """All noise parameters; those that no measurement depends on stand as they were."""
+    """All noise parameters; `sigmas` are those that some measurement depends on."""
 
     noise: NoiseParameters
     sigmas: tuple[FittedSigma, ...]
-    converged: bool
 
 
 def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
     """Fits the noise of all runs at once.
 
+    What the drives tell too little of stays where it began, or where they are more content with if that is more; what
+    comes out as nothing a robot has stays, and the others are fitted without it; all stay if the fit finds no end.
+
     Args:
         maps: solved under any noise.
         noise: where to begin, and what stays where the drives say nothing.
     """
-    names = _names(maps)
-    if not names:
-        return NoiseFit(noise, (), converged=True)
-    share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
-    parts = [_part(each, names, share) for each in maps]
-    best = NoiseParameters()
-    fitted = fit_variances(
-        parts,
-        np.array([getattr(noise, name) for name in names]),
-        least=np.array([getattr(best, name) / _BEST for name in names]),
-    )
-    values = dict(zip(names, fitted.sigma.tolist(), strict=True))
-    return NoiseFit(noise.model_copy(update=values), _sigmas(names, fitted), fitted.converged)
+    free = _names(maps)
+    kept: dict[str, FittedSigma] = {}
+    while free:
+        fitted = _fitted(maps, noise, free)
+        if not fitted.converged:
+            why = "the fit came to no end"
+            found = _sigmas(free, fitted, noise)
+            kept |= {each.name: replace(each, value=getattr(noise, each.name), kept=why) for each in found}
+            break
+        found = _sigmas(free, fitted, noise)
+        odd = {each.name: each for each in found if "times the default" in each.kept}
+        if not odd:
+            told = {each.name: each for each in found}
+            values = dict(zip(free, fitted.sigma.tolist(), strict=True))
+            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept))
+        kept |= odd
+        free = tuple(name for name in free if name not in odd)
+    return NoiseFit(noise, _in_order(kept))
 
 
 def weighed(local_map: LocalMap, noise: NoiseParameters) -> LocalMap:
@@ -86,7 +97,21 @@ def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
     return tuple(name for name in NoiseParameters.model_fields if name in found)
 
 
-def _part(local_map: LocalMap, names: tuple[str, ...], share: float) -> Part:
+def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
+    return tuple(sigmas[name] for name in NoiseParameters.model_fields if name in sigmas)
+
+
+def _fitted(maps: Sequence[LocalMap], noise: NoiseParameters, names: tuple[str, ...]) -> FittedVariances:
+    share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
+    default = NoiseParameters()
+    return fit_variances(
+        [_part(each, noise, names, share) for each in maps],
+        np.array([getattr(noise, name) for name in names]),
+        least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
+    )
+
+
+def _part(local_map: LocalMap, noise: NoiseParameters, names: tuple[str, ...], share: float) -> Part:
     """The first share of a run."""
     chain, state = local_map.chain, local_map.solution.state
     graph, start = local_map.graph, state
@@ -96,20 +121,32 @@ def _part(local_map: LocalMap, names: tuple[str, ...], share: float) -> Part:
         graph = build_graph([chain])
         start = graph.start(state.poses[:n_keyframes], local_map.tags_m, local_map.calibration)
     odometry, readings = chain.odometry.parts, chain.readings.parts
-    components = Components(odometry.of(names), odometry.rest, readings.of(names), readings.rest)
+    components = Components(
+        odometry.of(names), _rest(odometry, noise, names), readings.of(names), _rest(readings, noise, names)
+    )
     return Part(graph.problem, start, components)
 
 
-def _sigmas(names: Sequence[str], fitted: FittedVariances) -> tuple[FittedSigma, ...]:
-    low, high = fitted.interval(_QUANTILE)
-    return tuple(
-        FittedSigma(
-            name=name,
-            value=float(fitted.sigma[i]),
-            low=float(low[i]),
-            high=float(high[i]),
-            redundancy=float(fitted.redundancy[i]),
-            told=bool(fitted.told[i]),
-        )
-        for i, name in enumerate(names)
+def _rest(parts: CovarianceParts, noise: NoiseParameters, names: tuple[str, ...]) -> FloatArray:
+    """(M, n, n) what does not depend on the parameters looked for."""
+    return parts.under(noise) - sum(
+        (getattr(noise, name) ** 2 * unit for name, unit in zip(names, parts.of(names), strict=True)),
+        start=np.zeros_like(parts.rest),
     )
+
+
+def _sigmas(names: Sequence[str], fitted: FittedVariances, noise: NoiseParameters) -> list[FittedSigma]:
+    low, high = fitted.interval(_QUANTILE)
+    found = []
+    for i, name in enumerate(names):
+        value, default = float(fitted.sigma[i]), getattr(NoiseParameters(), name)
+        kept = ""
+        if not fitted.told[i]:
+            kept = (
+                f"the drives tell too little of it (redundancy {fitted.redundancy[i]:.1f}, {LEAST_REDUNDANCY:g} needed)"
+            )
+        elif not (1.0 + _ROUNDING) / PLAUSIBLE < value / default < PLAUSIBLE:
+            kept = f"it came out at {value / default:.3g} times the default, which no robot has"
+            value = getattr(noise, name)
+        found.append(FittedSigma(name, value, float(low[i]), float(high[i]), float(fitted.redundancy[i]), kept))
+    return found

@@ -93,6 +93,14 @@ class Readings:
         """The same readings under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
+    def spread(self, sigmas: FloatArray) -> "Readings":
+        """The same readings with the sigmas of their whitened components (M, 2) so many times as large."""
+        root = np.linalg.cholesky(self.covariance)
+        turn = root @ (sigmas[..., None] * np.linalg.inv(root))
+        back = turn.swapaxes(-1, -2)
+        parts = replace(self.parts, unit=turn @ self.parts.unit @ back, rest=turn @ self.parts.rest @ back)
+        return replace(self, covariance=turn @ self.covariance @ back, parts=parts)
+
 
 def read_detections(
     run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters

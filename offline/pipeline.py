@@ -28,6 +28,7 @@ from offline.result import (
     SuspectTag,
 )
 from offline.run import RobotFile, Run, load_run
+from offline.run_noise import fit_and_weigh
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import explained_by_tags, joined, split_alone, split_together, with_outliers_apart
@@ -41,6 +42,7 @@ def map_logs(
     noise: NoiseParameters | None = None,
     stages: Stages | None = None,
     tape: TapeOptions | None = None,
+    prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
 ) -> MapResult:
@@ -49,9 +51,10 @@ def map_logs(
     Args:
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
-        noise: sigmas of wheels and readings; defaults where None.
+        noise: sigmas of wheels and readings; None: they are fitted to the runs.
         stages: told what is being done, and keeps what it took.
         tape: what somebody measured.
+        prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
 
     Raises:
@@ -70,7 +73,7 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return build_map(runs, noise, stages, tape, keep_suspects=keep_suspects)
+    return build_map(runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects)
 
 
 def build_map(
@@ -78,6 +81,7 @@ def build_map(
     noise: NoiseParameters | None = None,
     stages: Stages | None = None,
     tape: TapeOptions | None = None,
+    prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
 ) -> MapResult:
@@ -85,24 +89,25 @@ def build_map(
 
     Args:
         runs: of `load_run`; the frame is the start of the first.
-        noise: sigmas of wheels and readings; defaults where None.
+        noise: sigmas of wheels and readings; None: they are fitted to the runs.
         stages: told what is being done, and keeps what it took.
         tape: what somebody measured.
+        prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
     """
-    noise, stages, tape = noise or NoiseParameters(), stages or Stages(), tape or TapeOptions()
+    stages, tape = stages or Stages(), tape or TapeOptions()
     _check_distinct(runs)
     check_tag_sizes(runs)
     chains: list[Chain] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
-            chains += chains_of(run, noise)
+            chains += chains_of(run, noise or prior_noise)
             done()
     measurements = _measurements(tape, runs, chains)
-    maps = []
+    maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
         efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
         for chain in chains:
@@ -115,6 +120,10 @@ def build_map(
     chains = [each.chain for each in maps]
     with stages.stage("tags that do not belong"):
         maps = [split_alone(each) for each in maps]
+    noise_fit = None
+    if noise is None:
+        with stages.stage("fitting the noise"):
+            maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
         maps = with_outliers_apart(maps, merged)
@@ -158,6 +167,7 @@ def build_map(
         warnings=tuple(dict.fromkeys(warnings)),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
         suspects=tuple(suspects),
+        noise_fit=noise_fit,
     )
 
 

@@ -235,6 +235,29 @@ class MetreResult:
 
 
 @dataclass(frozen=True)
+class FittedParameter:
+    """One noise parameter, and what the runs told of it."""
+
+    name: str  # as in NoiseParameters
+    value: float
+    low: float | None  # where it lies with 99 %; None where it was not fitted
+    high: float | None
+    redundancy: float  # of how many squared residuals of its own it is the mean
+    kept: str = ""  # why it stands at its prior; empty where it was fitted
+
+
+@dataclass(frozen=True)
+class FittedNoise:
+    """Where the noise comes from when nobody gave it."""
+
+    parameters: tuple[FittedParameter, ...]
+    shared_range: float  # variance that readings of a tag within 2.5 m of the way share, as a multiple of their own
+    shared_bearing: float
+    runs: tuple[str, ...]  # names of those that it was fitted to
+    contradicting: tuple[str, ...]  # of those that contradict themselves: under the prior, or this where it is larger
+
+
+@dataclass(frozen=True)
 class MapResult:
     """Everything that one `map` command found."""
 
@@ -248,6 +271,7 @@ class MapResult:
     warnings: tuple[str, ...] = field(default=())
     losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
     suspects: tuple[SuspectTag, ...] = ()
+    noise_fit: FittedNoise | None = None  # None: the noise was given
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

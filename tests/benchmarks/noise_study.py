@@ -1,9 +1,10 @@
-"""Fitted noise parameters against those that drives were simulated with, seed by seed.
+"""Fitted noise against the noise that drives were simulated with, and maps made under it, seed by seed.
 
-    python -m tests.benchmarks.noise_study --world nsh --seeds 0-9 --factor 10
+    python -m tests.benchmarks.noise_study --worlds nsh,nsh_flat --seeds 0-99 --factors 0.1,10
 
-The fit begins at so many times the true sigmas. A row a seed, found by true; then, for each parameter, how often its
-99 % interval holds the truth and, where its redundancy is 100 or more, how often it lies within 20 % of it.
+The calibration is drawn from its priors, and the fit begins at so many times the true sigmas. A row a map: found by
+true, then NEES of tags and of starts. Then, for each world and all: how often a 99 % interval holds the truth, how
+often a sigma lies within 20 % of it where its redundancy is 100 or more, and mean NEES. Exit 1 where a bound is missed.
 """
 
 import argparse
@@ -16,69 +17,135 @@ from pathlib import Path
 import numpy as np
 
 from calib.noise import NoiseParameters
-from fixtures.simulate import simulate
-from offline.chain import chains_of
-from offline.local_map import solve_local_map
-from offline.noise_fit import FittedSigma, fit_noise
-from offline.run import load_run
+from fixtures.simulate import TRUTH_FILE, simulate
+from offline.evaluation import evaluate
+from offline.pipeline import map_logs
+from offline.result import FittedParameter
+from offline.run_noise import NOT_NEEDED
+from offline.truth import read_truth
 from onboard.log_reader import find_logs
 
 ENOUGH_REDUNDANCY = 100.0
 CLOSE = 0.2
+LEAST_INSIDE = 0.97
+TAGS_NEES = (0.85, 1.15)
 
 
 @dataclass(frozen=True)
 class Found:
-    """One fitted parameter beside the truth."""
+    """One noise parameter beside the truth."""
 
-    fitted: FittedSigma
+    found: FittedParameter
     true: float
 
     @property
     def ratio(self) -> float:
         """Found by true."""
-        return self.fitted.value / self.true
+        return self.found.value / self.true
 
     @property
-    def inside(self) -> bool:
-        """Whether its own 99 % interval holds the truth."""
-        return self.fitted.low < self.true < self.fitted.high
+    def inside(self) -> bool | None:
+        """Whether its own 99 % interval holds the truth; None where it states none."""
+        if self.found.low is None or self.found.high is None:
+            return None
+        return self.found.low < self.true < self.found.high
+
+    @property
+    def close(self) -> bool | None:
+        """Whether it is within 20 % of the truth; None where there is too little redundancy."""
+        return None if self.found.redundancy < ENOUGH_REDUNDANCY else abs(self.ratio - 1.0) <= CLOSE
 
 
-def study_seed(seed: int, world: str | Path, factor: float) -> list[Found]:
-    """Simulates drives with the default noise, and fits from so many times that."""
+@dataclass(frozen=True)
+class Mapped:
+    """One map."""
+
+    world: str
+    seed: int
+    factor: float
+    parameters: tuple[Found, ...]
+    nees_tags: float
+    nees_start: float
+
+
+def study_seed(world: str, seed: int, factors: Sequence[float]) -> list[Mapped]:
+    """Simulates drives with the default noise, and maps them once for each factor.
+
+    Raises:
+        ValueError: the runs were not joined.
+    """
     true = NoiseParameters()
-    start = NoiseParameters(**{name: factor * getattr(true, name) for name in NoiseParameters.model_fields})
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "drives"
         simulate(world, seed, output, render=False)
-        runs = [load_run(log) for log in find_logs([output])]
-    maps = [solve_local_map(chain) for run in runs for chain in chains_of(run, start)]
-    return [Found(each, getattr(true, each.name)) for each in fit_noise(maps, start).sigmas]
+        truth = read_truth(output / TRUTH_FILE)
+        for factor in factors:
+            prior = NoiseParameters(**{name: factor * getattr(true, name) for name in NoiseParameters.model_fields})
+            result = map_logs(find_logs([output]), prior_noise=prior)
+            if len(result.components) > 1 or result.noise_fit is None:
+                raise ValueError(f"{world}, seed {seed}: {'; '.join(result.warnings)}")
+            errors = evaluate(result, truth).components[0]
+            found = tuple(
+                Found(each, getattr(true, each.name)) for each in result.noise_fit.parameters if each.kept != NOT_NEEDED
+            )
+            rows.append(
+                Mapped(world, seed, factor, found, _known(errors.nees_tags_per_dim), _known(errors.nees_start_per_dim))
+            )
+    return rows
+
+
+def summary(rows: Sequence[Mapped]) -> tuple[list[str], bool]:
+    """A line for each parameter and one for NEES; and whether all bounds hold."""
+    lines, good = [], True
+    for name in dict.fromkeys(each.found.name for row in rows for each in row.parameters):
+        of_name = [each for row in rows for each in row.parameters if each.found.name == name]
+        inside = [each.inside for each in of_name if each.inside is not None]
+        close = [each.close for each in of_name if each.close is not None]
+        fitted = [each.ratio for each in of_name if not each.found.kept]
+        good &= not inside or float(np.mean(inside)) >= LEAST_INSIDE
+        good &= all(close)
+        lines.append(
+            f"{name:32s} fitted {len(fitted):4d} of {len(of_name)}"
+            + (f", median ratio {np.median(fitted):6.3f}, inside {np.mean(inside):6.1%}" if fitted else "")
+            + (f", within 20 % where redundant {np.mean(close):6.1%} of {len(close)}" if close else "")
+        )
+    tags = float(np.mean([row.nees_tags for row in rows]))
+    start = float(np.mean([row.nees_start for row in rows]))
+    good &= TAGS_NEES[0] <= tags <= TAGS_NEES[1]
+    lines.append(f"{len(rows)} maps: mean tags NEES {tags:.3f}, mean start NEES {start:.3f}")
+    return lines, good
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The script; 0."""
+    """The script: 0 where all bounds hold, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--world", default="nsh", help="name or file of a world [nsh]")
+    parser.add_argument("--worlds", default="nsh,nsh_flat", help="names of worlds [nsh,nsh_flat]")
     parser.add_argument("--seeds", default="0-9", help="FIRST-LAST [0-9]")
-    parser.add_argument("--factor", type=float, default=10.0, help="the fit begins at so many times the truth [10]")
+    parser.add_argument("--factors", default="0.1,10", help="the fit begins at so many times the truth [0.1,10]")
     given = parser.parse_args(arguments)
     first, _, last = given.seeds.partition("-")
-    table: dict[str, list[Found]] = {}
+    worlds, factors = given.worlds.split(","), [float(each) for each in given.factors.split(",")]
+    rows: list[Mapped] = []
     for seed in range(int(first), int(last or first) + 1):
-        found = study_seed(seed, given.world, given.factor)
-        for each in found:
-            table.setdefault(each.fitted.name, []).append(each)
-        _tell(f"seed {seed:4d}  " + "  ".join(f"{each.ratio:7.3f}" for each in found))
-    for name, rows in table.items():
-        close = [abs(row.ratio - 1.0) <= CLOSE for row in rows if row.fitted.redundancy >= ENOUGH_REDUNDANCY]
-        _tell(
-            f"{name:32s} median ratio {np.median([row.ratio for row in rows]):6.3f}  "
-            f"inside its interval {np.mean([row.inside for row in rows]):6.1%}  "
-            f"within 20 % where redundant {np.mean(close) if close else np.nan:6.1%} of {len(close)}"
-        )
-    return 0
+        for world in worlds:
+            for row in study_seed(world, seed, factors):
+                rows.append(row)
+                ratios = " ".join(f"{each.ratio:7.3f}{'*' if each.found.kept else ' '}" for each in row.parameters)
+                _tell(f"{world:9s} {seed:4d} {row.factor:5g}  {ratios}  {row.nees_tags:6.2f} {row.nees_start:6.2f}")
+    all_good = True
+    for world in worlds:
+        for factor in factors:
+            lines, good = summary([row for row in rows if (row.world, row.factor) == (world, factor)])
+            all_good &= good
+            _tell(f"{world}, from {factor:g} times the truth (* not fitted):")
+            for line in lines:
+                _tell("  " + line)
+    return 0 if all_good else 1
+
+
+def _known(value: float | None) -> float:
+    return float("nan") if value is None else value
 
 
 def _tell(line: str) -> None:

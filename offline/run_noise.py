@@ -1,0 +1,127 @@
+"""Under which noise the runs of one map are solved together: what they tell themselves, where they may be believed.
+
+One set of sigmas serves all runs: names, `--noise` and map.json have one, and robots of one make differ less in their
+wheels than a single drive can tell. It is fitted to the runs whose readings fit together. A run that contradicts itself
+says nothing of noise, and is believed no more than before, nor more than the others: of each sigma it gets the larger.
+
+A detector's bias repeats from picture to picture. One by one such readings look good, so what neighbouring readings of
+a tag share is fitted too (`shared_errors`), and a reading that has many neighbours counts for less.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from calib.noise import NoiseParameters
+from offline.chain import Chain
+from offline.graph import build_graph
+from offline.local_map import LocalMap
+from offline.noise_fit import FittedSigma, fit_noise, weighed
+from offline.odometry import ODOMETRY_NOISE
+from offline.result import FittedNoise, FittedParameter
+from offline.shared_errors import SharedErrors, fit_shared_errors
+from offline.solver import solve
+
+NOT_NEEDED: Final = "no measurement depends on it"
+_NO_RUN: Final = "no run has tag readings that fit together"
+_NOT_APART: Final = "too few readings tell how much of their errors they share"
+# Over so much of the way readings of a tag are taken to share an error; as in `goodness`.
+_SHARED_OVER_M: Final = 2.5
+# Cells that tell what is shared, as many as leave a variance uncertain by a half.
+_LEAST_CELLS: Final = 8.0
+
+
+class WeighedMaps(NamedTuple):
+    """Local maps under the noise that is used from here on, and where that comes from."""
+
+    maps: list[LocalMap]
+    noise: NoiseParameters
+    fitted: FittedNoise
+
+
+def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMaps:
+    """Fits the noise and solves each map again under it.
+
+    Args:
+        maps: solved under the prior.
+        prior: what stays where the runs tell nothing.
+    """
+    sound = [each for each in maps if _is_sound(each)]
+    fit = fit_noise(sound, prior)
+    found, noise = {each.name: each for each in fit.sigmas}, fit.noise
+    shared = np.zeros(2)
+    if noise != prior:
+        shared, is_told = _shared([weighed(each, noise) for each in sound])
+        if not is_told:
+            found = {name: _at_least(each, getattr(prior, name)) for name, each in found.items()}
+            noise = noise.model_copy(update={name: each.value for name, each in found.items()})
+    kept = NOT_NEEDED if sound else _NO_RUN
+    parameters = (
+        _parameter(found.get(name) or FittedSigma(name, getattr(prior, name), 0.0, 0.0, 0.0, kept))
+        for name in NoiseParameters.model_fields
+    )
+    doubted = _larger(prior, noise)
+    return WeighedMaps(
+        [_under(each, noise if each.goodness.fits else doubted, shared, prior) for each in maps],
+        noise,
+        FittedNoise(
+            tuple(parameters),
+            shared_range=float(shared[0]),
+            shared_bearing=float(shared[1]),
+            runs=tuple(each.chain.name for each in sound),
+            contradicting=tuple(each.chain.name for each in maps if not each.goodness.fits),
+        ),
+    )
+
+
+def _is_sound(local_map: LocalMap) -> bool:
+    """Whether what a map leaves over is noise."""
+    return len(local_map.chain.tags) > 0 and local_map.goodness.fits
+
+
+def _shared(maps: Sequence[LocalMap]) -> tuple[FloatArray, bool]:
+    """(2,) variance that readings of a tag share within a cell, as a multiple of their own; and whether enough tell."""
+    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in maps]
+    weight = np.array([each.shared_redundancy for each in errors])
+    shared = (weight * np.array([each.shared for each in errors])).sum(axis=0) / weight.sum(axis=0)
+    return shared, bool(weight.sum(axis=0)[0] >= _LEAST_CELLS)
+
+
+def _cells(chain: Chain) -> IntArray:
+    """(M,) of each reading: a number for each tag in each part of the way, from 0 without gaps."""
+    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))[chain.readings.keyframe]
+    part = (along_m / _SHARED_OVER_M).astype(np.int64)
+    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    return np.asarray(cell, dtype=np.int64)
+
+
+def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
+    """The map solved under other noise and with readings that share errors."""
+    if noise == prior and not shared.any():
+        return local_map
+    chain = local_map.chain.weighed(noise)
+    if len(chain.readings):
+        cell = _cells(chain)
+        sigmas = np.sqrt(1.0 + np.bincount(cell)[cell][:, None] * shared)
+        chain = replace(chain, readings=chain.readings.spread(sigmas))
+    graph = build_graph([chain])
+    return replace(local_map, chain=chain, graph=graph, solution=solve(graph.problem, local_map.solution.state))
+
+
+def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:
+    """A sigma of readings of which nobody knows what they share is believed where it is the larger one only."""
+    if sigma.name in ODOMETRY_NOISE or sigma.kept or sigma.value >= prior:
+        return sigma
+    return replace(sigma, value=prior, kept=_NOT_APART)
+
+
+def _larger(a: NoiseParameters, b: NoiseParameters) -> NoiseParameters:
+    return NoiseParameters(**{name: max(getattr(a, name), getattr(b, name)) for name in NoiseParameters.model_fields})
+
+
+def _parameter(sigma: FittedSigma) -> FittedParameter:
+    low, high = (None, None) if sigma.kept else (sigma.low, sigma.high)
+    return FittedParameter(sigma.name, sigma.value, low, high, sigma.redundancy, sigma.kept)
