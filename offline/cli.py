@@ -108,7 +108,9 @@ def map_command(
         list[Path] | None,
         typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
     ] = None,
-    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters; the others keep defaults.")] = None,
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them; the others keep defaults.")
+    ] = None,
     start: Annotated[
         list[str] | None,
         typer.Option(
