@@ -108,7 +108,11 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
         sigmas = np.sqrt(1.0 + np.bincount(cell)[cell][:, None] * shared)
         chain = replace(chain, readings=chain.readings.spread(sigmas))
     graph = build_graph([chain])
-    return replace(local_map, chain=chain, graph=graph, solution=solve(graph.problem, local_map.solution.state))
+    goodness = local_map.goodness
+    if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
+        goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
+    solution = solve(graph.problem, local_map.solution.state)
+    return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness)
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:
