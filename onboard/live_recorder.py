@@ -25,9 +25,10 @@ from onboard.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from onboard.disk_room import DiskRoom, one_recorder, space_policy
 from onboard.encoder_port import EncoderPort
 from onboard.log_keeper import LogKeeper
+from onboard.log_segments import segment_limits
 from onboard.log_thread import LogThread
 from onboard.messages import Event, EventKind
-from onboard.recorder import RecorderCore, Run, segment_limits
+from onboard.recorder import RecorderCore, Run
 from onboard.robot_files import RobotFiles
 from onboard.storage import Disk
 

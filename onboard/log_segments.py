@@ -10,6 +10,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from calib.robot import Robot
 from onboard.log_file import ACTIVE_SUFFIX, LogFile, Record
 from onboard.messages import TOPICS
 from onboard.storage import Storage
@@ -28,6 +29,11 @@ class SegmentLimits(NamedTuple):
 
     duration_ns: int = 600 * _NS_PER_S  # of log time
     size_bytes: int = 512 << 20  # of one file
+
+
+def segment_limits(robot: Robot) -> SegmentLimits:
+    """What a robot's robot.yaml says about it."""
+    return SegmentLimits(round(robot.recorder.segment_s * _NS_PER_S), robot.recorder.segment_mb * 1_000_000)
 
 
 class LogSegments:

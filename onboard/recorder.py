@@ -4,7 +4,6 @@ It reads no clock and no device, so that a live recording and a simulated one ru
 calls give the same log to the byte.
 """
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -17,7 +16,7 @@ from calib.robot import Robot
 from onboard.counted_log import CountedLog
 from onboard.errors import LogError
 from onboard.log_head import CAMERA_FRAME, log_head
-from onboard.log_segments import SegmentLimits
+from onboard.log_segments import segment_limits
 from onboard.log_writer import LogOpener, LogWriter, RunLog
 from onboard.measurements import detections_message, wheel_message
 from onboard.messages import (
@@ -27,22 +26,20 @@ from onboard.messages import (
     EventKind,
     Severity,
     StampSource,
-    TagDetections,
     timestamp,
 )
 from onboard.picture import encode_jpeg
+from onboard.picture_checks import PictureChecks
 from onboard.picture_schedule import PictureSchedule
 from onboard.tag_detector import Detection, TagDetector
-from onboard.watches import ClockWatch, SilenceWatch, Tallies
+from onboard.tallies import Tallies
+from onboard.waiting_detections import WAIT_FOR_WHEELS_NS, WaitingDetections
+from onboard.watches import Watches
 from onboard.wheel_intake import StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S
 _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
-_WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s
-_CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
-_WAIT_FOR_WHEELS_NS: Final = 500_000_000
-_WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
 
 class Run(NamedTuple):
@@ -54,13 +51,6 @@ class Run(NamedTuple):
     run_id: str
     start_ns: int  # on the run's clock
     run_epoch_ns: int  # realtime minus monotonic, frozen at the start
-
-
-class _Waiting(NamedTuple):
-    """Detections that wait for the wheel reading after them, so that they can name the one before."""
-
-    message: TagDetections
-    receive_ns: int
 
 
 class RecorderCore:
@@ -108,16 +98,11 @@ class RecorderCore:
         self._options = run.robot.recorder
         self._detector = detector
         self._intake = WheelIntake()
-        self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
-        self._wheels = SilenceWatch(_WHEEL_SILENCE_NS, run.start_ns if expect_wheels else None)
-        self._camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
-        self._wall_clock = ClockWatch()
+        self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None)
         self._tallies = Tallies()
-        self._waiting: deque[_Waiting] = deque()
-        self._source: StampSource | int = StampSource.STAMP_SOURCE_UNSPECIFIED
-        self._odd_sizes: set[tuple[int, int]] = set()
+        self._waiting = WaitingDetections()
+        self._checks = PictureChecks(run.camera)
         self._next_anchor_ns = 0
-        self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines told of so far
         head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
         keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
         if open_log is None:
@@ -152,20 +137,20 @@ class RecorderCore:
         self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
 
     def _write_reading(self, each: StampedReading) -> None:
-        reading = each.reading
         self._note_gaps(each)
         self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
-        self._recent.append((each.stamp_ns, reading.sequence))
-        self._wheels.heard(each.host_ns)
+        self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)
+        self._watches.wheels.heard(each.host_ns)
 
     def _note_gaps(self, each: StampedReading) -> None:
         reading = each.reading
         if reading.lost:
             self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
             self.losses["wheel lines"] += reading.lost
-        if not self._recent:
+        before_ns = self._waiting.newest_wheels_ns
+        if before_ns is None:
             return
-        gap_ns = each.stamp_ns - self._recent[-1][0]
+        gap_ns = each.stamp_ns - before_ns
         if reading.new_epoch:
             self.losses["wheel controller resets"] += 1
             text = f"boot {reading.boot_id} after {gap_ns / _NS_PER_S:.3f} s: the motion in between is unknown"
@@ -178,7 +163,7 @@ class RecorderCore:
 
     def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
         """The camera is open, for the first time or again; `refused` says what it would not be set to."""
-        self._camera.heard(host_ns)
+        self._watches.camera.heard(host_ns)
         self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
         if refused:
             text = f"{name} would not be set: {'; '.join(refused)}"
@@ -186,7 +171,7 @@ class RecorderCore:
 
     def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
         """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
-        self._camera.gone()
+        self._watches.camera.gone()
         severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
         self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
 
@@ -238,16 +223,20 @@ class RecorderCore:
         detector_settings: str = "",
     ) -> None:
         """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
-        self._camera.heard(receive_ns)
-        self._check_size(size_px, receive_ns)
-        self._note_source(source)
+        self._watches.camera.heard(receive_ns)
+        odd_size = self._checks.odd_size(size_px)
+        if odd_size is not None:
+            self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, odd_size, receive_ns)
+        if self._checks.lost_its_stamps(source):
+            text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
+            self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
         try:
             message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         except ValueError as error:  # protobuf's word for a number that does not fit its field
             self._log.refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
             return
-        self._waiting.append(_Waiting(message, receive_ns))
+        self._waiting.add(message, receive_ns)
         self._write_waiting(receive_ns)
 
     def wants_picture(self, stamp_ns: int) -> bool:
@@ -262,44 +251,13 @@ class RecorderCore:
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
         """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
-        self._camera.heard(host_ns)
+        self._watches.camera.heard(host_ns)
         self.losses["pictures"] += count
         self._tallies.add(kind, count, reason)
 
-    def _note_source(self, source: "StampSource | int") -> None:
-        if source != self._source and source == StampSource.STAMP_SOURCE_ARRIVAL:
-            text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
-            self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
-        self._source = source
-
-    def _check_size(self, size_px: tuple[int, int], host_ns: int) -> None:
-        camera = self._run.camera
-        if camera is None or size_px == (camera.width_px, camera.height_px) or size_px in self._odd_sizes:
-            return
-        self._odd_sizes.add(size_px)
-        text = (
-            f"pictures are {size_px[0]}x{size_px[1]} px, the calibration is for {camera.width_px}x{camera.height_px}: "
-            "set the camera to that size or calibrate at this one"
-        )
-        self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, text, host_ns)
-
     def _write_waiting(self, now_ns: int) -> None:
-        newest_ns = self._recent[-1][0] if self._recent else None
-        while self._waiting:
-            message, receive_ns = self._waiting[0]
-            wheels_are_past = newest_ns is not None and newest_ns > message.stamp_ns
-            too_late = now_ns - receive_ns >= _WAIT_FOR_WHEELS_NS and not self._intake.warming_up
-            if not (wheels_are_past or too_late):
-                return
-            self._waiting.popleft()
-            self._write_detections(message, receive_ns)
-
-    def _write_detections(self, message: TagDetections, receive_ns: int) -> None:
-        before = next((sequence for at_ns, sequence in reversed(self._recent) if at_ns <= message.stamp_ns), None)
-        if before is not None:
-            message.has_wheel_sequence = True
-            message.wheel_sequence = before
-        self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
+        for message, receive_ns in self._waiting.take_ready(now_ns, more_to_come=self._intake.warming_up):
+            self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
 
     # --- time
 
@@ -314,7 +272,8 @@ class RecorderCore:
         for each in self._intake.release_due(now_ns):
             self._write_reading(each)
         self._write_waiting(now_ns)
-        self._watch(now_ns, now_ns if realtime_ns is None else realtime_ns)
+        for alarm in self._watches.alarms(now_ns, now_ns if realtime_ns is None else realtime_ns):
+            self.event(alarm.kind, Severity.SEVERITY_WARNING, alarm.text, now_ns)
         self._log.tell_notes(now_ns)
         if now_ns < self._next_anchor_ns:
             return
@@ -328,28 +287,8 @@ class RecorderCore:
         self._log.write("/clock", anchor, now_ns, now_ns)
         self._tell_tallies(now_ns)
 
-    def _watch(self, now_ns: int, realtime_ns: int) -> None:
-        if self._wheels.fell_silent(now_ns):
-            text = "no valid data from the wheels for 3 s: check cable, port and baud rate"
-            self.event(EventKind.NO_WHEEL_DATA, Severity.SEVERITY_WARNING, text, now_ns)
-        if self._camera.fell_silent(now_ns):
-            text = "no picture for 3 s: check cable and driver"
-            self.event(EventKind.NO_PICTURES, Severity.SEVERITY_WARNING, text, now_ns)
-        step_ns = self._wall_clock.step_ns(now_ns - self._run.run_epoch_ns, realtime_ns)
-        if step_ns is not None:
-            text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock goes on evenly"
-            self.event(EventKind.CLOCK_STEP, Severity.SEVERITY_WARNING, text, now_ns)
-
     def _tell_tallies(self, now_ns: int) -> None:
-        parser, unwrapper = self._intake.parser, self._intake.unwrapper
-        left_out = (parser.rejected, unwrapper.repeated, unwrapper.overtaken)
-        rejected, repeated, overtaken = np.subtract(left_out, self._left_out).tolist()
-        self._left_out = left_out
-        self._tallies.add(
-            EventKind.WHEEL_LINE_REJECTED, rejected, f"pieces that are no line, the last {list(parser.last_rejected)}"
-        )
-        text = f"lines left out: {repeated} repeated, {overtaken} overtaken by newer ones"
-        self._tallies.add(EventKind.WHEEL_SEQUENCE, repeated + overtaken, text)
+        self._tallies.add_left_out(self._intake)
         for each in self._tallies.take():
             self.event(each.kind, Severity.SEVERITY_WARNING, f"{each.times} {each.text}", now_ns, each.times)
 
@@ -364,16 +303,11 @@ class RecorderCore:
         self._closed = True
         for each in self._intake.release_all():
             self._write_reading(each)
-        self._write_waiting(now_ns + _WAIT_FOR_WHEELS_NS)
+        self._write_waiting(now_ns + WAIT_FOR_WHEELS_NS)
         self._tell_tallies(now_ns)
-        if self._wheels.is_silent and not self.counts["/wheels"]:
+        if self._watches.wheels.is_silent and not self.counts["/wheels"]:
             self.losses["recording without a single wheel reading"] += 1
         self._log.tell_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._log.close()
-
-
-def segment_limits(robot: Robot) -> SegmentLimits:
-    """When a robot's logs begin new files."""
-    return SegmentLimits(round(robot.recorder.segment_s * _NS_PER_S), robot.recorder.segment_mb * 1_000_000)

@@ -1,10 +1,13 @@
-"""What the recorder watches for: silence, steps of the wall clock, and things that come in numbers."""
+"""What the recorder watches for: silence of a device, and steps of the wall clock."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from onboard.messages import EventKind
 
+_NS_PER_S: Final = 1_000_000_000
+_WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s
+_CAMERA_SILENCE_NS: Final = 3 * _NS_PER_S
 # A clock that is being brought back in line without a step runs wrong by less than a tenth (chrony: 8.3 %).
 _SLEWING: Final = 0.1
 _STEP_NS: Final = 50_000_000
@@ -52,27 +55,41 @@ class ClockWatch:
         return step_ns if abs(step_ns) > allowed_ns else None
 
 
-class Tally(NamedTuple):
-    """What happened several times."""
+class Alarm(NamedTuple):
+    """What is wrong now."""
 
     kind: EventKind
-    times: int
-    text: str  # of the last time
+    text: str
 
 
-class Tallies:
-    """Counts what comes in numbers, so that it is told of now and then and not each time."""
+class Watches:
+    """Silent devices and a wall clock that steps, each told of once.
 
-    def __init__(self) -> None:
-        self._counted: dict[EventKind, Tally] = {}
+    Attributes:
+        wheels: told of each reading.
+        camera: told of each picture; nothing is expected before the first.
+    """
 
-    def add(self, kind: EventKind, count: int, text: str) -> None:
-        """Counts; nothing if `count` is 0."""
-        if count:
-            before = self._counted.get(kind)
-            self._counted[kind] = Tally(kind, count + (before.times if before else 0), text)
+    def __init__(self, run_epoch_ns: int, wheels_since_ns: int | None) -> None:
+        """Begins to watch.
 
-    def take(self) -> Iterator[Tally]:
-        """What has been counted since the last time."""
-        counted, self._counted = self._counted, {}
-        yield from counted.values()
+        Args:
+            run_epoch_ns: realtime minus monotonic, as frozen for the run's clock.
+            wheels_since_ns: from when on wheel readings are expected; None: not before the first.
+        """
+        self.wheels = SilenceWatch(_WHEEL_SILENCE_NS, wheels_since_ns)
+        self.camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
+        self._wall_clock = ClockWatch()
+        self._run_epoch_ns = run_epoch_ns
+
+    def alarms(self, now_ns: int, realtime_ns: int) -> Iterator[Alarm]:
+        """What to tell of at this moment of the run's clock and of the wall clock."""
+        if self.wheels.fell_silent(now_ns):
+            text = "no valid data from the wheels for 3 s: check cable, port and baud rate"
+            yield Alarm(EventKind.NO_WHEEL_DATA, text)
+        if self.camera.fell_silent(now_ns):
+            yield Alarm(EventKind.NO_PICTURES, "no picture for 3 s: check cable and driver")
+        step_ns = self._wall_clock.step_ns(now_ns - self._run_epoch_ns, realtime_ns)
+        if step_ns is not None:
+            text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock goes on evenly"
+            yield Alarm(EventKind.CLOCK_STEP, text)

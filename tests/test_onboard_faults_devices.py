@@ -103,7 +103,7 @@ def test_row_22_a_replug_under_another_name_is_found_by_the_link(tmp_path: Path,
 def test_row_32_a_camera_absent_unplugged_and_frozen_leaves_the_wheels_alone(
     tmp_path: Path, both: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("onboard.recorder._CAMERA_SILENCE_NS", 300_000_000)
+    monkeypatch.setattr("onboard.watches._CAMERA_SILENCE_NS", 300_000_000)
     picture, folder = tag_jpeg(), tmp_path / "pictures"
     with Driver(tmp_path / "wheels") as driver:
         driver.plug_in()
