@@ -9,11 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from calib import se2
 from offline.map_io import read_map, write_map
 from offline.result import Component, SuspectTag
+from onboard.log_reader import read_log
+from onboard.messages import nanoseconds
 from tests.exported_map import make_small_map
+from tests.made_drives import made_robot
 from tests.made_maps import made_component, made_map
 from tests.programs import Outcome, Run
 
@@ -175,8 +180,42 @@ def test_geojson_puts_the_map_on_the_earth(exported: Callable[..., tuple[Path, O
     assert said["sigma_north_m"] == pytest.approx(np.sqrt(tag.covariance[1, 1]))
 
 
-def test_the_map_folder_has_an_mcap_of_it(folder: Path) -> None:
-    assert (folder / "map.mcap").read_bytes().startswith(b"\x89MCAP0\r\n")
+def test_geojson_turns_the_map_as_it_looks(exported: Callable[..., tuple[Path, Outcome]], folder: Path) -> None:
+    output, _ = exported("geojson", "--origin", "48.2,11.6,0")
+    tags = component_of(folder).tags
+    for feature, tag in zip(json.loads(output.read_text())["features"], tags, strict=False):
+        lon, lat = feature["geometry"]["coordinates"]
+        # x to the north, so y, which is to its left, to the west
+        assert (lat > 48.2, lon < 11.6) == (tag.position_m[0] > 0.0, tag.position_m[1] > 0.0)
+
+
+def test_the_maps_mcap_runs_on_the_time_line_of_the_logs(folder: Path) -> None:
+    with (folder / "map.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        found = [each.decoded_message for each in reader.iter_decoded_messages(topics=["/map/tf"])]
+    transforms = [each for message in found for each in message.transforms]
+    for run in component_of(folder).runs:
+        wheels = [each.message.stamp_ns for each in read_log(run.log, topics=["/wheels"])]
+        pictures = [each.message.stamp_ns for each in read_log(run.log, topics=["/tags/detections"])]
+        stamps = [nanoseconds(each.timestamp) for each in transforms if each.child_frame_id == f"{run.name}/base"]
+        assert stamps[0] == wheels[0]
+        assert set(stamps[1:]) <= set(pictures)
+
+
+def test_cameras_sit_where_the_solve_found_them(folder: Path) -> None:
+    result = read_map(folder)
+    for run in result.components[0].runs:
+        found = {each.name: each.value for each in result.calibration if each.owner == run.robot_id}
+        mount = made_robot(run.robot_id).mount
+        corrected = mount.model_copy(
+            update={
+                name: getattr(mount, name) + found[f"mount_{name}"]
+                for name in ("x_m", "y_m", "yaw_rad", "pitch_rad", "roll_rad")
+            }
+        )
+        place, turn = corrected.T_base_camera.as_components()
+        assert run.T_base_camera is not None
+        np.testing.assert_allclose(run.T_base_camera, [*place, *turn.as_quat(canonical=True)], atol=1e-12)
 
 
 @pytest.mark.parametrize(

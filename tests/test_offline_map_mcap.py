@@ -47,6 +47,8 @@ def test_the_drive_plays_over_the_map_on_the_logs_time_line(tmp_path: Path) -> N
 
     times = [at for _, _, at, _ in found]
     assert times == sorted(times)
+    for _, _, at, message in (each for each in found if each[0] == "/map/tf"):
+        assert {nanoseconds(each.timestamp) for each in message.transforms} == {at}
     transforms = [each for message in of_topic(found, "/map/tf") for each in message.transforms]
     for run in (first, second):
         moved = [each for each in transforms if each.child_frame_id == f"{run.name}/base"]
