@@ -144,7 +144,7 @@ def _fits(local_map: LocalMap) -> bool:
     motion from one reading to the next: chi-square with 3 degrees of freedom at most.
     """
     problem, state = local_map.graph.problem, local_map.solution.state
-    if len(local_map.chain.tags) < 2:
+    if len(local_map.chain.tags) < 2 or not len(problem.odometry.first):
         return True
     reads = np.zeros(len(problem.columns.poses), dtype=np.bool_)
     reads[problem.readings.pose] = True
