@@ -4,8 +4,10 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from math import degrees
 from pathlib import Path
+from typing import Final
 
 from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from calib.files import folder_written_whole
@@ -23,7 +25,10 @@ from offline.result import AlignmentResult, Component, FittedNoise, MapResult, M
 from offline.run import RobotFile, read_robot_file
 from offline.run_noise import NOT_NEEDED
 from offline.stages import StageCost, Stages
+from offline.workings import Workings
 from onboard.log_reader import find_logs
+
+REPORT_FILE: Final = "report.html"
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class MapOptions:
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
-    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories, map.mcap and map.png.
+    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories, map.mcap, map.png and report.html.
 
     Returns:
         The map, and what each stage of making it took.
@@ -54,21 +59,28 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     robot_files = _read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     with compilation_announced(_say), progress_bar() as show:
-        stages = Stages(show)
+        stages, workings = Stages(show), Workings()
         tape = TapeOptions(options.starts, options.distances)
-        result = map_logs(logs, robot_files, noise, stages, tape, keep_suspects=options.keep_suspects)
+        result = map_logs(
+            logs, robot_files, noise, stages, tape, keep_suspects=options.keep_suspects, workings=workings
+        )
         with folder_written_whole(options.output) as folder:
-            _write_files(result, folder, options.output, stages)
+            _write_files(result, workings, folder, options.output, stages)
     return result, stages.costs
 
 
-def _write_files(result: MapResult, folder: Path, output: Path, stages: Stages) -> None:
+def _write_files(result: MapResult, workings: Workings, folder: Path, output: Path, stages: Stages) -> None:
     try:
         with stages.stage("writing files"):
             write_map(result, folder)
             write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
+        if find_spec("plotly") is not None:  # a map is worth having where only the report's script is missing
+            from offline.report import write_report
+
+            with stages.stage("writing the report"):
+                write_report(result, workings, folder / REPORT_FILE)
     except OSError as error:
         raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
 
@@ -111,7 +123,12 @@ def summary(result: MapResult, output: Path) -> list[str]:
         lines += _noise_lines(result.noise_fit)
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
-    return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}"]
+    return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
+
+
+def _report_line(output: Path) -> str:
+    path = output / REPORT_FILE
+    return f"report: {path}" if path.is_file() else "report: none without plotly; pip install 'groundsbot[laptop]'"
 
 
 def stage_lines(costs: Sequence[StageCost]) -> list[str]:

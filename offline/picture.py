@@ -25,7 +25,7 @@ from offline.result import Component, MapResult, RunResult, TagResult
 
 Dashes = Literal["-", "--", "-.", ":"]
 # Okabe and Ito, "Color universal design" (2008), without those too pale for lines; then again with other dashes.
-_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+RUN_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES: Final[tuple[Dashes, ...]] = ("-", "--", "-.", ":")
 _SHARED: Final = "#222222"
 _DPI: Final = 100
@@ -112,7 +112,7 @@ def _title(result: MapResult) -> str:
 
 def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
     """Colour and dashes of each run; a run's stretches look alike."""
-    looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in _COLOURS)
+    looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
     return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
 
 

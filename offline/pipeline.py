@@ -34,6 +34,7 @@ from offline.stages import Stages
 from offline.suspects import explained_by_tags, joined, split_alone, split_together, with_outliers_apart
 from offline.suspects_report import suspect_tags
 from offline.weak_parts import weak_parts
+from offline.workings import Solved, Workings
 
 
 def map_logs(
@@ -45,6 +46,7 @@ def map_logs(
     prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
+    workings: Workings | None = None,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
 
@@ -56,6 +58,7 @@ def map_logs(
         tape: what somebody measured.
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
+        workings: takes what the map was made from.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -73,7 +76,7 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return build_map(runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects)
+    return build_map(runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects, workings=workings)
 
 
 def build_map(
@@ -84,6 +87,7 @@ def build_map(
     prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
+    workings: Workings | None = None,
 ) -> MapResult:
     """As `map_logs`, from runs already read.
 
@@ -94,6 +98,7 @@ def build_map(
         tape: what somebody measured.
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
+        workings: takes what the map was made from.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -128,6 +133,8 @@ def build_map(
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
         maps = with_outliers_apart(maps, merged)
     suspects: list[SuspectTag] = []
+    workings = workings or Workings()
+    workings.maps += maps
     components: list[Component] = []
     calibration: list[CalibrationResult] = []
     measured: list[MeasurementResult] = []
@@ -143,6 +150,7 @@ def build_map(
         graph, solution = searched.graph, searched.solution
         if keep_suspects and found:
             graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
+        workings.solved.append(Solved(members, graph, solution))
         with stages.stage("covariances"):
             components.append(component_of(graph, solution))
             calibration.extend(calibration_of(graph, solution, i))

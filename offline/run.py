@@ -20,7 +20,16 @@ from offline.stretches import WheelRow, stretches_of
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
-from onboard.messages import CameraCalibration, PlanarOdometry, RunInfo, TagDetections, TagObservations, WheelEncoders
+from onboard.messages import (
+    CameraCalibration,
+    Event,
+    PlanarOdometry,
+    RunInfo,
+    Severity,
+    TagDetections,
+    TagObservations,
+    WheelEncoders,
+)
 
 
 class TagKey(NamedTuple):
@@ -72,6 +81,14 @@ class Positions:
     in_camera: BoolArray
 
 
+class RunEvent(NamedTuple):
+    """What the recorder told of the drive: a gap, a loss, a reconnection."""
+
+    stamp_ns: int
+    is_loss: bool
+    text: str
+
+
 @dataclass(frozen=True)
 class Run:
     """The measurements of one log.
@@ -85,6 +102,7 @@ class Run:
         warnings: what a person should know.
         log_bytes: of the log; how much work it is worth.
         lost: what of the log cannot be read, in words; empty where all can.
+        events: what the recorder told, in order of their stamps.
     """
 
     name: str
@@ -101,6 +119,7 @@ class Run:
     warnings: tuple[str, ...]
     log_bytes: int = 0
     lost: str = ""
+    events: tuple[RunEvent, ...] = ()
 
 
 # Readings with corrected bits are the ones that turn out to be phantoms.
@@ -111,6 +130,7 @@ _MOST_TAGS = 652
 # A reading that was measured takes twelve bytes at least: noise cannot be compressed.
 _FREE_READINGS = 60_000
 _LEAST_BYTES_A_READING = 10
+_MOST_EVENTS = 500  # a recorder gathers what happens often into one event
 
 
 @dataclass
@@ -125,6 +145,7 @@ class _Collected:
     picture_size: tuple[int, int] | None = None
     sightings: list[tuple[int, TagKey, Sequence[float]]] = field(default_factory=list)
     observations: list[TagObservations] = field(default_factory=list)
+    events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
     n_corrected: int = 0
     n_readings: int = 0
@@ -145,6 +166,9 @@ class _Collected:
             self.info = self.info or message
         elif isinstance(message, CameraCalibration):
             self.calibration = self.calibration or message
+        elif isinstance(message, Event) and len(self.events) < _MOST_EVENTS:
+            is_loss = message.severity in (Severity.SEVERITY_WARNING, Severity.SEVERITY_ERROR)
+            self.events.append(RunEvent(message.stamp_ns, is_loss, message.text or message.kind))
 
     def _add_detections(self, message: TagDetections) -> None:
         size = (message.width_px, message.height_px)
@@ -162,7 +186,7 @@ class _Collected:
             self.sightings.append((message.stamp_ns, key, detection.corners_px))
 
 
-_TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations")
+_TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations", "/events")
 
 
 @dataclass(frozen=True)
@@ -236,6 +260,7 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,
         lost=losses.in_words,
+        events=tuple(sorted(collected.events)),
     )
 
 

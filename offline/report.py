@@ -1,0 +1,38 @@
+"""report.html: a map to look at, in one file that opens from disk without a network."""
+
+from pathlib import Path
+
+from calib.files import written_whole
+from calib.words import counted
+from offline.map_io import map_as_json
+from offline.report_data import figures
+from offline.report_page import page
+from offline.report_tables import tables
+from offline.report_words import sentences
+from offline.result import MapResult
+from offline.workings import Workings
+
+
+def write_report(result: MapResult, workings: Workings, path: Path) -> None:
+    """Writes the report of a map.
+
+    Args:
+        result: the map.
+        workings: what it was made from.
+        path: of the file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    document = map_as_json(result)
+    n_runs = len({run.run for run in result.runs})
+    title = f"Map of {counted(n_runs, 'run')} and {counted(len(document['tags']), 'tag')}"
+    text = page(
+        title,
+        sentences(document),
+        [*document["losses"], *document["warnings"]],
+        tables(document),
+        figures(document, workings),
+    )
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -1,0 +1,232 @@
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const CHI2_95 = Math.sqrt(5.991464547107979); // of two degrees of freedom
+  const STEPS = 36;
+  // No button may send a map anywhere.
+  const CONFIG = { responsive: true, displaylogo: false, scrollZoom: true, showSendToCloud: false, plotlyServerURL: "",
+    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+  const STILL = { ...CONFIG, scrollZoom: false };
+  const PAPER_PX = 690; // between the margins of A4 and of Letter
+  let apart = false;
+  let printing = false;
+
+  // Plotly takes some markup in labels; names are names.
+  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const known = (value, digits) => value === null ? "unknown" : value.toFixed(digits);
+
+  function axis(extra) {
+    return { gridcolor: colour("--grid"), zerolinecolor: colour("--grid"), linecolor: colour("--rule"),
+      tickcolor: colour("--rule"), ...extra };
+  }
+
+  function layout(extra) {
+    return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { color: colour("--front"), family: "system-ui, sans-serif", size: 12 }, width: printing ? PAPER_PX : undefined,
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--quiet"), activecolor: colour("--front") },
+      hoverlabel: { align: "left", bgcolor: colour("--panel"), bordercolor: colour("--rule"),
+        font: { color: colour("--front") } },
+      margin: { l: 50, r: 12, t: 12, b: 44 }, ...extra };
+  }
+
+  function extent(traces) {
+    let [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]];
+    for (const { x, y } of traces) {
+      for (let i = 0; i < x.length; i++) {
+        if (x[i] === null) continue;
+        low = [Math.min(low[0], x[i]), Math.min(low[1], y[i])];
+        high = [Math.max(high[0], x[i]), Math.max(high[1], y[i])];
+      }
+    }
+    return { wide: Math.max(high[0] - low[0], 1), high: Math.max(high[1] - low[1], 1) };
+  }
+
+  // So that metres are as long along both axes without much empty room.
+  function plan(element, traces) {
+    const { wide, high } = extent(traces);
+    const width = printing ? PAPER_PX : element.clientWidth;
+    const entries = traces.filter((trace) => trace.showlegend !== false).map((trace) => 60 + 7 * trace.name.length);
+    const legend = Math.ceil(1.25 * entries.reduce((sum, entry) => sum + entry, 0) / width);
+    const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
+    return layout({ height, dragmode: "pan", hovermode: "closest",
+      legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0 },
+      margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
+      xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
+      yaxis: axis({ title: { text: "y (m)", standoff: 4 }, scaleanchor: "x", scaleratio: 1 }) });
+  }
+
+  function start(run, shift) {
+    return { type: "scatter", mode: "markers", x: [run.x[0]], y: [run.y[0] + shift], hoverinfo: "text",
+      hovertext: [`start of ${plain(run.run)}`], legendgroup: run.run, showlegend: false,
+      marker: { symbol: "triangle-up", angle: 90 - run.heading_rad * 180 / Math.PI, size: 15, color: run.colour,
+        line: { color: colour("--back"), width: 1 } } };
+  }
+
+  function way(run, shift, dash) {
+    return { type: "scatter", mode: "lines", name: plain(run.run), x: run.x, y: run.y.map((y) => y + shift),
+      hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: 1.6, dash } };
+  }
+
+  function ellipses(tags) {
+    const [x, y] = [[], []];
+    for (const { position_m: [px, py], covariance: [xx, xy, yy] } of tags) {
+      if (xx === null || xy === null || yy === null) continue;
+      const a = Math.sqrt(Math.max(xx, 0));
+      const b = a > 0 ? xy / a : 0;
+      const c = Math.sqrt(Math.max(yy - b * b, 0));
+      for (let i = 0; i <= STEPS; i++) {
+        const [cos, sin] = [Math.cos(2 * Math.PI * i / STEPS), Math.sin(2 * Math.PI * i / STEPS)];
+        x.push(px + CHI2_95 * a * cos);
+        y.push(py + CHI2_95 * (b * cos + c * sin));
+      }
+      x.push(null);
+      y.push(null);
+    }
+    return { type: "scatter", mode: "lines", name: "95 % ellipses", x, y, hoverinfo: "skip",
+      line: { color: colour("--quiet"), width: 0.8 }, fill: "toself", fillcolor: "rgba(128,140,150,0.16)" };
+  }
+
+  function told(tag) {
+    const [xx, , yy] = tag.covariance;
+    const lines = [`<b>tag ${plain(tag.label)}</b> (${plain(tag.family)})`,
+      `x ${known(tag.position_m[0], 3)} m, y ${known(tag.position_m[1], 3)} m`,
+      xx === null || yy === null ? "sigma unknown"
+        : `sigma x ${Math.sqrt(xx).toFixed(3)} m, sigma y ${Math.sqrt(yy).toFixed(3)} m`,
+      `read ${tag.n} times`];
+    for (const run of tag.readings.slice(0, 12)) {
+      lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
+    }
+    if (tag.readings.length > 12) lines.push(`and ${tag.readings.length - 12} more runs`);
+    return lines.join("<br>");
+  }
+
+  function tagTrace(tags, name, fill, colours) {
+    const many = tags.length > 150;
+    return { type: "scatter", mode: many ? "markers" : "markers+text", name, x: tags.map((tag) => tag.position_m[0]),
+      y: tags.map((tag) => tag.position_m[1]), text: tags.map((tag) => plain(tag.label)), textposition: "top center",
+      textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map(told),
+      hoverlabel: { font: { family: "system-ui, sans-serif" } },
+      marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
+  }
+
+  function drawMap(element) {
+    const component = data.components[element.dataset.index];
+    const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
+    const single = component.tags.filter((tag) => tag.readings.length < 2);
+    const shared = component.tags.filter((tag) => tag.readings.length > 1);
+    const traces = component.runs.flatMap((run) => [way(run, 0, "solid"), start(run, 0)]);
+    if (component.is_merged) {
+      component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
+        visible: "legendonly", legendgroup: "before", showlegend: i === 0 }));
+    }
+    if (component.tags.length) traces.unshift(ellipses(component.tags));
+    if (single.length) {
+      traces.push(tagTrace(single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
+        component.runs.length > 1
+          ? single.map((tag) => tag.readings.length ? own[tag.readings[0].run] : colour("--quiet")) : null));
+    }
+    if (shared.length) traces.push(tagTrace(shared, "tags of several runs", colour("--shared")));
+    return Plotly.react(element, traces, plan(element, traces), CONFIG);
+  }
+
+  function links(layers, shifts) {
+    const places = new Map();
+    layers.forEach((layer, i) => layer.tags.label.forEach((label, j) => {
+      if (!places.has(label)) places.set(label, []);
+      places.get(label).push([layer.tags.x[j], layer.tags.y[j] + shifts[i]]);
+    }));
+    const [x, y] = [[], []];
+    for (const seen of places.values()) {
+      for (let i = 1; i < seen.length; i++) {
+        x.push(seen[i - 1][0], seen[i][0], null);
+        y.push(seen[i - 1][1], seen[i][1], null);
+      }
+    }
+    return { type: "scatter", mode: "lines", name: "same tag", x, y, hoverinfo: "skip",
+      line: { color: colour("--front"), width: 1 } };
+  }
+
+  function drawBefore(element) {
+    const layers = data.components[element.dataset.index].before;
+    let above = 0;
+    const shifts = layers.map((layer, i) => {
+      if (!apart) return 0;
+      const ys = [...layer.y, ...layer.tags.y];
+      const [low, high] = ys.reduce(([a, b], y) => [Math.min(a, y), Math.max(b, y)], [Infinity, -Infinity]);
+      const shift = i ? above - low : 0;
+      above = high + shift + 0.25 * (high - low) + 1;
+      return shift;
+    });
+    const traces = layers.flatMap((layer, i) => [way(layer, shifts[i], "solid"), start(layer, shifts[i]), {
+      type: "scatter", mode: "markers", x: layer.tags.x, y: layer.tags.y.map((y) => y + shifts[i]), hoverinfo: "text",
+      hovertext: layer.tags.label.map((label) => `tag ${plain(label)} by ${plain(layer.run)}`), legendgroup: layer.run,
+      showlegend: false, marker: { symbol: "square-open", size: 8, color: layer.colour, line: { width: 1.6 } } }]);
+    traces.push(links(layers, shifts));
+    return Plotly.react(element, traces, plan(element, traces), CONFIG);
+  }
+
+  function drawTimeline(element) {
+    const line = data.timelines[element.dataset.index];
+    const common = { type: "scatter", x: line.t_s, hovertemplate: "%{y} at %{x} s<extra></extra>" };
+    const traces = [
+      { ...common, mode: "lines", y: line.speed_m_s, yaxis: "y3", line: { color: line.colour, width: 1.4 } },
+      { ...common, mode: "lines", y: line.tags, yaxis: "y2", fill: "tozeroy",
+        line: { color: line.colour, width: 1, shape: "hv" } },
+      { ...common, mode: "markers", y: line.worst, yaxis: "y", name: "largest",
+        marker: { size: 3, color: colour("--quiet") } },
+      { ...common, mode: "markers", y: line.rms, yaxis: "y", name: "RMS", marker: { size: 4, color: line.colour } },
+    ];
+    if (line.events.length) {
+      const top = Math.max(0.1, ...line.speed_m_s.filter((value) => value !== null)) * 1.15;
+      traces.push({ type: "scatter", mode: "markers", x: line.events.map((event) => event.t_s),
+        y: line.events.map(() => top), yaxis: "y3", hoverinfo: "text",
+        hovertext: line.events.map((event) => plain(event.text)),
+        marker: { symbol: "triangle-down", size: 10,
+          color: line.events.map((event) => event.loss ? colour("--alarm") : colour("--quiet")) } });
+    }
+    const gaps = line.gaps.map(([x0, x1]) => ({ type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1,
+      fillcolor: colour("--quiet"), opacity: 0.3, line: { width: 0 }, layer: "below" }));
+    return Plotly.react(element, traces, layout({ height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
+      dragmode: "zoom",
+      xaxis: axis({ title: { text: "seconds since the run's start", standoff: 4 }, anchor: "y" }),
+      yaxis: axis({ title: { text: "sigmas" }, domain: [0, 0.3], rangemode: "tozero" }),
+      yaxis2: axis({ title: { text: "tags" }, domain: [0.37, 0.63], rangemode: "tozero" }),
+      yaxis3: axis({ title: { text: "m/s" }, domain: [0.7, 1] }) }), STILL);
+  }
+
+  function draw(element) {
+    if (element.classList.contains("map")) return drawMap(element);
+    return element.classList.contains("before") ? drawBefore(element) : drawTimeline(element);
+  }
+
+  // The first figure at once, the others when there is time, so that the page is there soon.
+  async function drawAll() {
+    for (const element of document.querySelectorAll(".plot")) {
+      await draw(element);
+      await new Promise((resolve) => setTimeout(resolve, 0));
+    }
+    document.documentElement.dataset.drawn = "yes";
+  }
+
+  for (const button of document.querySelectorAll("button[data-apart]")) {
+    button.addEventListener("click", () => {
+      apart = button.dataset.apart === "1";
+      for (const other of document.querySelectorAll("button[data-apart]")) {
+        other.setAttribute("aria-pressed", String(other === button));
+      }
+      for (const element of document.querySelectorAll(".plot.before")) drawBefore(element);
+    });
+  }
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+  addEventListener("beforeprint", () => {
+    printing = true;
+    for (const details of document.querySelectorAll("details")) details.open = true;
+    for (const element of document.querySelectorAll(".plot")) draw(element);
+  });
+  addEventListener("afterprint", () => {
+    printing = false;
+    drawAll();
+  });
+  drawAll();
+})();

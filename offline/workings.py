@@ -1,0 +1,36 @@
+"""What a map was made from, kept for those who want to look inside: the report and the advice."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from offline.graph import Graph
+from offline.local_map import LocalMap
+from offline.merge import Group
+from offline.solver import Solution
+
+
+class Solved(NamedTuple):
+    """One component, as it was solved.
+
+    Attributes:
+        group: indices into `Workings.maps`, and where the alignments put their starts.
+        graph: its chains are the group's members in order, its tags those of the component in order.
+        solution: of that graph.
+    """
+
+    group: Group
+    graph: Graph
+    solution: Solution
+
+
+@dataclass
+class Workings:
+    """Filled by `build_map`.
+
+    Attributes:
+        maps: the local maps as they were aligned.
+        solved: the components, largest first.
+    """
+
+    maps: list[LocalMap] = field(default_factory=list)
+    solved: list[Solved] = field(default_factory=list)
