@@ -16,7 +16,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.chain import Chain
-from offline.coarse_chain import coarse_keyframes, coarsened, reading_keyframes, refined
+from offline.coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
 from offline.effort import Effort
 from offline.goodness import Goodness, Windows, fitted_windows
 from offline.graph import Graph, Parameter, build_graph
@@ -114,11 +114,11 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
 
 
 class _Check:
-    """Whether solutions of a chain fit together; from poses that read tags, since the others have nothing to say."""
+    """Whether solutions of a chain fit together; without most of the poses that read no tag and have little to say."""
 
     def __init__(self, graph: Graph, effort: Effort) -> None:
         (chain,) = graph.chains
-        self._keyframes = reading_keyframes(chain)
+        self._keyframes = telling_keyframes(chain)
         if len(self._keyframes) < len(chain.stamps_ns):
             graph = build_graph([coarsened(chain, self._keyframes)])
         self._windows: Windows = fitted_windows(graph.problem, effort=effort, share=_WINDOWS_SHARE)

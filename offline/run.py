@@ -265,8 +265,9 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
 
 
 def _size_bytes(log: Path) -> int:
-    files = [log] if log.is_file() else [path for path in log.iterdir() if path.is_file()]
-    return sum(path.stat().st_size for path in files)
+    """Of all its files; of none where there is no such log, which reading it says."""
+    files = log.iterdir() if log.is_dir() else [log]
+    return sum(path.stat().st_size for path in files if path.is_file())
 
 
 def _tag_readings(collected: _Collected, log: Path) -> tuple[tuple[TagKey, ...], Detections, Positions]:
