@@ -153,10 +153,7 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
 
 
 def _next(document: dict[str, Any]) -> list[str]:
-    """What would help most, as map.json has it."""
-    advice = document.get("advice") or []
-    if advice:
-        return [advice[0]["words"]]
+    """What would help."""
     if len(document["components"]) > 1:
         return ["To join the components, drive one more run past two or more tags of each of them."]
     return []

@@ -288,6 +288,7 @@ def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     assert "3 runs" in read.words[0]
     assert "fall into 2 components" in read.words[0]
     assert "the largest holds 2 runs and 4 tags" in read.words[0]
+    assert read.words[-1].startswith("To join the components, drive one more run past two or more tags of each")
     assert [row["component"] for row in read.rows("runs")] == ["1", "1", "2"]
     plots = [attributes["class"] for _, attributes in read.elements if "plot" in (attributes.get("class") or "")]
     assert plots == ["plot map"] * 2 + ["plot before"] + ["plot timeline"] * 3
