@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from onboard.clock import wall_clock_synchronised
+from onboard.disk_hours import hours_until_full
 from onboard.live_recorder import LiveRecorder
 from onboard.log_keeper import LogStatus
 from onboard.messages import Event, Severity
@@ -23,7 +24,6 @@ _PERIOD_S: Final = 1.0
 _EVENTS_SHOWN: Final = 6
 _SILENT_S: Final = 3.0
 _STALLED_S: Final = 5.0
-_S_PER_H: Final = 3600
 
 
 class Housekeeper(threading.Thread):
@@ -126,10 +126,11 @@ class Housekeeper(threading.Thread):
         except OSError:
             self._free_bytes = 0
         per_s = self._rates.bytes_per_s()
+        hours = hours_until_full(self._free_bytes, per_s)
         return DiskStatus(
             free_bytes=self._free_bytes,
             bytes_per_s=per_s,
-            hours_left=round(self._free_bytes / per_s / _S_PER_H, 1) if per_s else None,
+            hours_left=None if hours is None else round(hours, 1),
             waiting_bytes=log.waiting_bytes,
             problem=log.problem,
         )
