@@ -15,6 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from calib import se2
 from offline.map_io import read_map, write_map
 from offline.result import Component, SuspectTag
+from onboard.groundsbot_pb2 import TagDetections, WheelEncoders
 from onboard.log_reader import read_log
 from onboard.messages import nanoseconds
 from tests.exported_map import make_small_map
@@ -195,8 +196,9 @@ def test_the_maps_mcap_runs_on_the_time_line_of_the_logs(folder: Path) -> None:
         found = [each.decoded_message for each in reader.iter_decoded_messages(topics=["/map/tf"])]
     transforms = [each for message in found for each in message.transforms]
     for run in component_of(folder).runs:
-        wheels = [each.message.stamp_ns for each in read_log(run.log, topics=["/wheels"])]
-        pictures = [each.message.stamp_ns for each in read_log(run.log, topics=["/tags/detections"])]
+        messages = [each.message for each in read_log(run.log, topics=["/wheels", "/tags/detections"])]
+        wheels = [each.stamp_ns for each in messages if isinstance(each, WheelEncoders)]
+        pictures = [each.stamp_ns for each in messages if isinstance(each, TagDetections)]
         stamps = [nanoseconds(each.timestamp) for each in transforms if each.child_frame_id == f"{run.name}/base"]
         assert stamps[0] == wheels[0]
         assert set(stamps[1:]) <= set(pictures)
