@@ -15,9 +15,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from calib import se2
 from offline.map_io import read_map, write_map
 from offline.result import Component, SuspectTag
-from onboard.groundsbot_pb2 import TagDetections, WheelEncoders
 from onboard.log_reader import read_log
-from onboard.messages import nanoseconds
+from onboard.messages import TagDetections, WheelEncoders, nanoseconds
 from tests.exported_map import make_small_map
 from tests.made_drives import made_robot
 from tests.made_maps import made_component, made_map
