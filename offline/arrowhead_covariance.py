@@ -5,7 +5,7 @@ from its node to the top: so a tag in the border costs one triangular solve ther
 """
 
 import heapq
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -14,6 +14,8 @@ from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_substitution
 from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_tree import Tree
+
+_AT_ONCE: Final = 1024
 
 
 def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: IntArray) -> FloatArray:
@@ -87,8 +89,12 @@ def quadratic_form(
         else:
             Z, left = _through_front(tree, rows, node, values)
             send(int(tree.parent[node]), who, left)
-        square[np.ix_(who, who)] += Z.T @ Z
-    return 0.5 * (square + square.T)
+        for begin in range(0, len(who), _AT_ONCE):  # of thousands of columns k by k is large, and a product another
+            some = slice(begin, begin + _AT_ONCE)
+            square[np.ix_(who[some], who)] += Z[:, some].T @ Z
+    square += square.T
+    square *= 0.5
+    return square
 
 
 def _together(arrived: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:

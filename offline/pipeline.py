@@ -31,7 +31,7 @@ from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh
 from offline.solver import Solution
 from offline.stages import Stages
-from offline.suspects import explained_by_tags, joined, split_alone, split_together, with_outliers_apart
+from offline.suspects import RunsAlone, joined, split_together, with_outliers_apart
 from offline.suspects_report import suspect_tags
 from offline.weak_parts import weak_parts
 from offline.workings import Solved, Workings
@@ -113,18 +113,19 @@ def build_map(
             done()
     measurements = _measurements(tape, runs, chains)
     maps: list[LocalMap] = []
+    alone = RunsAlone()
     with stages.stage("local maps", len(chains)) as done:
         efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()
     with stages.stage("tags that do not belong"):
-        maps = [explained_by_tags(each) for each in maps]
+        maps = [alone.explained_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps)
     chains = [each.chain for each in maps]
     with stages.stage("tags that do not belong"):
-        maps = [split_alone(each) for each in maps]
+        maps = [alone.split(each) for each in maps]
     noise_fit = None
     if noise is None:
         with stages.stage("fitting the noise"):

@@ -58,6 +58,33 @@ class Searched:
         return [self.graph.chains[c].tags[t] for c, t in of]
 
 
+class RunsAlone:
+    """Local maps with their tags told apart, each looked at once though two steps ask for it."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[LocalMap, LocalMap]] = []
+
+    def split(self, local_map: LocalMap) -> LocalMap:
+        """As `split_alone`."""
+        for before, after in self._seen:
+            if before is local_map:
+                return after
+        after = split_alone(local_map)
+        self._seen.append((local_map, after))
+        return after
+
+    def explained_by_tags(self, before: LocalMap) -> LocalMap:
+        """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
+
+        Where wheels did not tell how the robot moved, most tags seem to have been moved.
+        """
+        after = self.split(before)
+        sightings = sightings_of([before.chain])
+        n_again = int((np.bincount(sightings.id) > 1).sum())
+        n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
+        return after if after.goodness.fits and 2 * n_split < max(n_again, 3) else before
+
+
 def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalMap:
     """A local map in which tags that were not in one place all along have several; the same where there are none.
 
@@ -73,18 +100,6 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
             found = _settled_alone(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
     return _settled_alone(found, noise_scales([found.goodness]), false_alarm)
-
-
-def explained_by_tags(before: LocalMap) -> LocalMap:
-    """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
-
-    Where wheels did not tell how the robot moved, most tags seem to have been moved.
-    """
-    after = split_alone(before)
-    sightings = sightings_of([before.chain])
-    n_again = int((np.bincount(sightings.id) > 1).sum())
-    n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
-    return after if after.goodness.fits and 2 * n_split < max(n_again, 3) else before
 
 
 def joined(local_map: LocalMap) -> LocalMap:
@@ -179,7 +194,7 @@ def _wanted(seen: Searched, false_alarm: float) -> IntArray:
     found = seen.place.copy()
     if len(which):
         least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm)
-        found[which] = seen.place.max() + 1 + search(seen.evidence, seen.sightings, seen.place[which], least_gain)
+        found[which] = seen.place.max() + 1 + search(seen.evidence, seen.sightings, seen.places, least_gain)
     return found
 
 

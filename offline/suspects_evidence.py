@@ -109,9 +109,10 @@ def gathered(
     solution = Solution(state, (0.0,), "", converged=True, problem=eliminated, losses=PLAIN_SQUARES)
     gradient = by_others.T @ residual
     factorisation = solution.factorisation
-    information = (by_places.T @ by_places).toarray() - factorisation.quadratic_form(coupling)
+    information = factorisation.quadratic_form(coupling)
+    np.subtract((by_places.T @ by_places).toarray(), information, out=information)
     score = by_places.T @ read - coupling.T @ factorisation.solve(gradient)
-    return _with_slack(Evidence(which, 0.5 * (information + information.T), score, places_m), unmodelled_sigma_m)
+    return Evidence(which, *_with_slack(information, score, unmodelled_sigma_m), places_m)
 
 
 def _columns_of(place: IntArray) -> IntArray:
@@ -125,14 +126,28 @@ def _sighted_again(sightings: Sightings) -> BoolArray:
     return np.asarray(np.bincount(sightings.id, minlength=len(sightings.ids)) > 1)
 
 
-def _with_slack(evidence: Evidence, sigma_m: float) -> Evidence:
-    """Each place may be off by this sigma: (L^-1 + s^2)^-1, which L need not have an inverse for."""
-    n = len(evidence.score)
-    if not n:
-        return evidence
-    widened = np.eye(n) + sigma_m**2 * evidence.information
-    solved = linalg.solve(widened, np.column_stack([evidence.information, evidence.score]), check_finite=False)
-    return replace(evidence, information=0.5 * (solved[:, :-1] + solved[:, :-1].T), score=solved[:, -1])
+def _with_slack(information: FloatArray, score: FloatArray, sigma_m: float) -> tuple[FloatArray, FloatArray]:
+    """Each place may be off by this sigma: (L^-1 + s^2)^-1, which L need not have an inverse for.
+
+    That is (I - (I + s^2 L)^-1) / s^2. It takes the place of L, since of many tags one such matrix is large.
+    """
+    n = len(score)
+    if not n or not sigma_m:
+        return information, score
+    information *= sigma_m**2
+    information[np.diag_indices(n)] += 1.0
+    # Symmetric, so that its transpose is the same in the order of columns that LAPACK works on in place.
+    root, failed = linalg.lapack.dpotrf(information.T, lower=1, overwrite_a=1)
+    if failed:
+        raise ValueError(f"the information of {n} coordinates of sightings is not positive")
+    widened_score = linalg.cho_solve((root, True), score, check_finite=False)
+    inverse, _ = linalg.lapack.dpotri(root, lower=1, overwrite_c=1)
+    found: FloatArray = inverse.T
+    for i in range(n):
+        found[i + 1 :, i] = found[i, i + 1 :]
+    found *= -(sigma_m**-2)
+    found[np.diag_indices(n)] += sigma_m**-2
+    return found, widened_score
 
 
 def contradicted(graph: Graph, state: State, sightings: Sightings, scales: FloatArray) -> BoolArray:

@@ -13,7 +13,7 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, sparse
 from scipy.special import chdtri
 from scipy.stats import chi2
 
@@ -33,20 +33,54 @@ _MANY: Final = 5
 
 
 @dataclass(frozen=True)
+class Stiffness:
+    """L less what places give way, L - U V' (2 K, 2 K), of which only small parts are ever asked for.
+
+    Attributes:
+        information: (2 K, 2 K) L, of the evidence.
+        given: (2 K, m) U; way: (2 K, m) V.
+    """
+
+    information: FloatArray
+    given: FloatArray
+    way: FloatArray
+
+    def among(self, members: IntArray) -> FloatArray:
+        """(2 m, 2 m) between some sightings."""
+        rows = (2 * members[:, None] + np.arange(2)).reshape(-1)
+        return np.asarray(self.information[np.ix_(rows, rows)] - self.given[rows] @ self.way[rows].T)
+
+    def together(self, members: IntArray) -> FloatArray:
+        """(2, 2) of some sightings moved as one."""
+        return np.asarray(self.among(members).reshape(len(members), 2, -1, 2).sum(axis=(0, 2)))
+
+    def against(self, members: IntArray) -> FloatArray:
+        """(2 K, 2) what all feel of some sightings moved as one."""
+        rows = 2 * members[:, None] + np.arange(2)
+        whole = self.information[:, rows].sum(axis=1)
+        return np.asarray(whole - self.given @ self.way[rows].sum(axis=0).T)
+
+    def freed(self, against: FloatArray, inner: FloatArray) -> "Stiffness":
+        """Once these are free: less A inner^-1 A'."""
+        way = np.hstack([self.way, np.linalg.solve(inner, against.T).T])
+        return Stiffness(self.information, np.hstack([self.given, against]), way)
+
+
+@dataclass(frozen=True)
 class Places:
     """Sightings gathered into places, and where these are.
 
     Attributes:
         place: (K,) of each sighting of the evidence, 0 to P - 1.
         offset: (2 P,) of the places from the middle of their sightings' in the evidence; covariance: (2 P, 2 P).
-        pull: (2 K,) by which each sighting would rather be elsewhere; stiffness: (2 K, 2 K) against that.
+        pull: (2 K,) by which each sighting would rather be elsewhere; stiffness: against that.
     """
 
     place: IntArray
     offset: FloatArray
     covariance: FloatArray
     pull: FloatArray
-    stiffness: FloatArray
+    stiffness: Stiffness
 
     def apart(self, evidence: Evidence, p: int, q: int) -> tuple[FloatArray, FloatArray]:
         """Place q as seen from place p (2,), and its covariance (2, 2)."""
@@ -70,14 +104,14 @@ def settled(evidence: Evidence, place: IntArray) -> Places:
     np.add.at(sums, place, evidence.places_m)
     middle = sums / np.bincount(place, minlength=n)[:, None]
     score = evidence.score + evidence.information @ (middle[place] - evidence.places_m).reshape(-1)
-    gather = np.zeros((2 * len(place), 2 * n))
-    for axis in (0, 1):
-        gather[2 * np.arange(len(place)) + axis, 2 * place + axis] = 1.0
-    of_places = evidence.information @ gather
-    square = gather.T @ of_places + _NOWHERE * np.eye(2 * n)
+    to_place = (2 * place[:, None] + np.arange(2)).reshape(-1)
+    ones = np.ones(len(to_place))
+    gather = sparse.csr_array((ones, (to_place, np.arange(len(to_place)))), shape=(2 * n, len(to_place)))
+    of_places: FloatArray = np.asarray(gather @ evidence.information).T  # which is symmetric
+    square = gather @ of_places + _NOWHERE * np.eye(2 * n)
     covariance = linalg.inv(square, check_finite=False)
-    offset = -covariance @ (gather.T @ score)
-    stiffness = evidence.information - of_places @ covariance @ of_places.T
+    offset: FloatArray = -covariance @ np.asarray(gather @ score)
+    stiffness = Stiffness(evidence.information, of_places, of_places @ covariance)
     return Places(place, offset, covariance, score + of_places @ offset, stiffness)
 
 
@@ -95,29 +129,26 @@ def excess(places: Places) -> float:
     that no covariance knows, and a tag must stand out from that.
     """
     ratios = []
-    blocks = places.stiffness.reshape(len(places.place), 2, -1, 2)
     for label in range(int(places.place.max(initial=-1)) + 1):
         members = np.flatnonzero(places.place == label)[1:]  # the first follows from the others
         if len(members):
             n = 2 * len(members)
-            inner = blocks[members][:, :, members].reshape(n, n) + _NOWHERE * np.eye(n)
+            inner = places.stiffness.among(members) + _NOWHERE * np.eye(n)
             pull = places.pull.reshape(-1, 2)[members].reshape(-1)
             ratios.append(float(pull @ np.linalg.solve(inner, pull)) / chdtri(n, 0.5))
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _MANY else 1.0
 
 
-def search(evidence: Evidence, sightings: Sightings, place: IntArray, least_gain: float) -> IntArray:
+def search(evidence: Evidence, sightings: Sightings, begin: Places, least_gain: float) -> IntArray:
     """(K,) the places that the evidence asks for.
 
     Args:
         evidence: of K sightings.
         sightings: they are of these.
-        place: (K,) where to begin.
+        begin: see `settled`.
         least_gain: see `bound`.
     """
-    found = settled(evidence, place)
-    labels = found.place.copy()
-    pull, stiffness = found.pull.copy(), found.stiffness.copy()
+    labels, pull, stiffness = begin.place.copy(), begin.pull, begin.stiffness
     candidates: dict[int, list[IntArray]] = {}
     for _ in range(_MOST_SPLITS):
         best_gain, best = least_gain, None
@@ -132,24 +163,22 @@ def search(evidence: Evidence, sightings: Sightings, place: IntArray, least_gain
         label, members = best
         labels[members] = labels.max() + 1
         candidates.pop(label)
-        freed = stiffness.reshape(len(pull), -1, 2)[:, members].sum(axis=1)
+        freed = stiffness.against(members)
         inner = freed.reshape(-1, 2, 2)[members].sum(axis=0) + _NOWHERE * np.eye(2)
         own = pull.reshape(-1, 2)[members].sum(axis=0)
         pull = pull - freed @ np.linalg.solve(inner, own)
-        stiffness = stiffness - freed @ np.linalg.solve(inner, freed.T)
+        stiffness = stiffness.freed(freed, inner)
     return _simplest(evidence, sightings, _joined_again(evidence, sightings, labels, least_gain), least_gain)
 
 
 def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:
     """What it brings to give some sightings (indices) a place of their own, in squared sigmas; and its information."""
-    inner = places.stiffness.reshape(len(places.place), 2, -1, 2)[members][:, :, members].sum(axis=(0, 2))
-    return _gain(places.pull, places.stiffness, members), inner
+    return _gain(places.pull, places.stiffness, members), places.stiffness.together(members)
 
 
-def _gain(pull: FloatArray, stiffness: FloatArray, members: IntArray) -> float:
+def _gain(pull: FloatArray, stiffness: Stiffness, members: IntArray) -> float:
     own = pull.reshape(-1, 2)[members].sum(axis=0)
-    columns = stiffness.reshape(len(pull) // 2, 2, len(pull) // 2, 2)
-    inner = columns[members[:, None], :, members[None, :]].sum(axis=(0, 1)) + _NOWHERE * np.eye(2)
+    inner = stiffness.together(members) + _NOWHERE * np.eye(2)
     return float(own @ np.linalg.solve(inner, own))
 
 
