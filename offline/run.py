@@ -236,7 +236,7 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
     check_file_name(info.run_id, f"{log}: /run: run_id")
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
-    stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log)
+    stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     tags, detections, positions = _tag_readings(collected, log)
     camera = _camera(collected, given.camera if given else None, log)

@@ -17,12 +17,14 @@ from onboard.messages import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
-# Each begins a chain of its own that only tags can join; pairs of them grow with the square.
-_MOST_RESETS = 100
+# Each begins a chain of its own that only tags can join. Pairs of them grow with the square, so that with the root of a
+# log's size the time grows with the size: 30 at 1 MiB, which is a minute and a half of driving, and 130 in an hour.
+_FREE_RESETS = 10
+_RESETS_AT_A_MIB = 20
 
 
 def stretches_of(
-    wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path
+    wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path, log_bytes: int
 ) -> tuple[list[WheelTrack], list[str]]:
     """The stretches of one log, and what a person should know of them.
 
@@ -31,12 +33,14 @@ def stretches_of(
         odometry: of `/odometry`, in order; used where there is no `/wheels`.
         robot: whose wheels they are.
         log: named in errors.
+        log_bytes: its size.
 
     Raises:
-        OfflineError: there are no wheel readings, or none that a robot can have given.
+        OfflineError: there are no wheel readings, or none that a robot can have given, or a log of this size has too
+            many restarts of the controller.
     """
     if wheels:
-        return _encoder_stretches(wheels, robot, log)
+        return _encoder_stretches(wheels, robot, log, log_bytes)
     if odometry:
         return _imported_stretch(odometry, robot, log)
     raise OfflineError(
@@ -45,13 +49,17 @@ def stretches_of(
     )
 
 
-def _encoder_stretches(readings: Sequence[WheelRow], robot: Robot, log: Path) -> tuple[list[WheelTrack], list[str]]:
+def _encoder_stretches(
+    readings: Sequence[WheelRow], robot: Robot, log: Path, log_bytes: int
+) -> tuple[list[WheelTrack], list[str]]:
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
-    if len(cuts) > _MOST_RESETS:
+    most = _FREE_RESETS + int(_RESETS_AT_A_MIB * (log_bytes / 2**20) ** 0.5)
+    if len(cuts) > most:
         raise OfflineError(
-            f"{log}: /wheels: the controller restarted {len(cuts)} times, limit {_MOST_RESETS}; see to its power supply"
+            f"{log}: /wheels: the controller restarted {len(cuts)} times, limit {most} for a log of {log_bytes} bytes; "
+            "see to its power supply"
         )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
     stretches: list[WheelTrack] = []

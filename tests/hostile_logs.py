@@ -74,10 +74,11 @@ def log(*chunks: bytes) -> bytes:
 Content = tuple[str, Message | bytes, int]
 
 
-def of_messages(*contents: Content, robot_yaml: str = ROBOT_YAML) -> bytes:
+def of_messages(*contents: Content, robot_yaml: str = ROBOT_YAML, size_bytes: int = 0) -> bytes:
+    """A log of these messages, padded to a little more than `size_bytes`, and as far as readers want it to be."""
     first, rest = run(), b"".join(message(*each) for each in contents)
     hidden = chunk(first + rest)
-    padding = random_bytes(len(first + rest) // 23 - len(hidden))
+    padding = random_bytes(max(len(first + rest) // 23, size_bytes) - len(hidden))
     private = struct.pack("<BQ", 0x80, len(padding)) + padding  # readers pass over it
     return log(chunk(run(robot_yaml)), chunk(private, compressed=False), hidden)
 
@@ -203,8 +204,8 @@ def observed(
     return of_messages(*contents)
 
 
-def resets(stretches: int, n_tags: int, looks: int = 2) -> bytes:
-    """A controller that restarts, and some looks at all tags in between."""
+def resets(stretches: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
+    """A controller that restarts, and some looks at all tags in between; padded to `size_bytes`."""
     corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
     lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
     camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
@@ -219,7 +220,7 @@ def resets(stretches: int, n_tags: int, looks: int = 2) -> bytes:
         contents.append(("/wheels", wheels, at_ns))
         found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
         contents.append(("/tags/detections", found, at_ns))
-    return of_messages(*contents)
+    return of_messages(*contents, size_bytes=size_bytes)
 
 
 def driven(count: int) -> bytes:
@@ -283,8 +284,9 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "tags a look, far apart": lambda: observed(2000, 600, 100, step_m=2.0),
     "few tags, far apart": lambda: full(lambda n: observed(n, 50, step_m=10.0)),
     "few tags that fit": lambda: full(lambda n: observed(n, 50, step_m=0.041, agree=True)),
-    "a reset each look": lambda: resets(100, 400),
-    "resets": lambda: resets(100, 10, 80),
+    "a reset each look": lambda: resets(30, 400, size_bytes=1_010_000),
+    "resets": lambda: resets(30, 10, 80, size_bytes=1_010_000),
+    "resets, much seen": lambda: resets(30, 10, 530, size_bytes=1_010_000),
     "keyframes": lambda: full(driven),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),

@@ -84,6 +84,17 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
     assert messages[START_NS + 205 * MS].frame_sequence == 2
 
 
+def test_a_file_that_holds_nothing_is_told_of(tmp_path: Path, run: Run) -> None:
+    entries = [wheel_entry(0, START_NS), picture_entry(START_NS + MS, jpeg(3))]
+    log = write_log(tmp_path / "run1", entries)
+    assert run("detect", log, "-o", tmp_path / "whole", "--processes", 1).code == 0
+    (log / "0001.core.mcap").touch()
+    outcome = run("detect", log, "-o", tmp_path / "again", "--processes", 1)
+    assert outcome.code == 3
+    assert "0001.core.mcap: not usable: is empty" in outcome.out
+    assert found_in(tmp_path / "again") == {0: [3]}
+
+
 def test_without_the_detections_of_pictures_that_were_not_kept(recorded: Path, tmp_path: Path, run: Run) -> None:
     output = tmp_path / "again.mcap"
     assert run("detect", recorded, "-o", output, "--processes", 1, "--drop-others", "--decimate", 2).code == 3

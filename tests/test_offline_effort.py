@@ -42,12 +42,15 @@ def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
     assert len(load_run(written(observed(651), tmp_path)).tags) == 652
 
 
-def test_more_than_a_hundred_restarts_of_the_controller_are_refused(tmp_path: Path) -> None:
-    line = refusal(written(resets(102, 1), tmp_path))
+@pytest.mark.parametrize(("size_bytes", "most"), [(1 << 18, 20), (1 << 20, 30), (1 << 22, 50)])
+def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_refused(
+    tmp_path: Path, size_bytes: int, most: int
+) -> None:
+    log = written(resets(most + 2, 1, size_bytes=size_bytes), tmp_path)
+    line = refusal(log)
     assert "made.mcap" in line
-    assert "101" in line
-    assert "100" in line
-    assert len(load_run(written(resets(101, 1), tmp_path)).stretches) == 101
+    assert f"restarted {most + 1} times, limit {most} for a log of {log.stat().st_size} bytes" in line
+    assert len(load_run(written(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).stretches) == most + 1
 
 
 def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
