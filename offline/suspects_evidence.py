@@ -78,6 +78,9 @@ def gathered(
         weighed: whether readings count by how well they fit the others of their sighting, or all alike.
     """
     held = _sighted_again(sightings)
+    if not held.any():
+        none = np.zeros((0, 2))
+        return Evidence(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), none.reshape(-1), none)
     problem = _scaled(graph, scales)
     if weighed:
         problem = _weighed(problem, state, sightings)
@@ -91,10 +94,8 @@ def gathered(
     tag_of_sighting[of_reading] = problem.readings.tag
     places_m = state.tags[tag_of_sighting[which]]
     eliminated = replace(problem, columns=_without_tags(problem.columns, tag_held))
-    starts, distances = problem.measured.linearise(state, eliminated.columns)
-    odometry = problem.odometry.linearise(state, eliminated.columns)
+    _, distances = problem.measured.linearise(state, eliminated.columns)
     readings = problem.readings.linearise(state, eliminated.columns)
-    prior = problem.prior.linearise(state, eliminated.columns)
     by_place = readings._replace(blocks=((_columns_of(place_of[of_reading]), readings.blocks[1][1]),))
     # What was measured to a tag was measured to where it was first.
     first_place = np.full(len(graph.tags), -1, dtype=np.int64)
@@ -103,15 +104,15 @@ def gathered(
         problem.columns, poses=np.full_like(problem.columns.poses, -1), tags=_columns_of(first_place), n=2 * len(which)
     )
     _, to_place = problem.measured.linearise(state, to_places)
-    by_others, residual = stacked((readings, distances, odometry, starts, prior), eliminated.columns.n)
+    by_others, _ = stacked((readings, distances), eliminated.columns.n)
     by_places, read = stacked((by_place, to_place), 2 * len(which))
-    coupling = sparse.csc_array(by_others[: len(read)].T @ by_places)
+    coupling = sparse.csc_array(by_others.T @ by_places)
     solution = Solution(state, (0.0,), "", converged=True, problem=eliminated, losses=PLAIN_SQUARES)
-    gradient = by_others.T @ residual
     factorisation = solution.factorisation
+    others_step = factorisation.solve_in_order(factorisation.system.gradient)[eliminated.arrowhead.tangent]
     information = factorisation.quadratic_form(coupling)
     np.subtract((by_places.T @ by_places).toarray(), information, out=information)
-    score = by_places.T @ read - coupling.T @ factorisation.solve(gradient)
+    score = by_places.T @ read - coupling.T @ others_step
     return Evidence(which, *_with_slack(information, score, unmodelled_sigma_m), places_m)
 
 
