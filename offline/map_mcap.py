@@ -5,6 +5,7 @@ log, since one topic has one schema.
 """
 
 import heapq
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -89,21 +90,18 @@ def write_mcap(result: MapResult, path: Path) -> None:
 def _entries(result: MapResult) -> Iterator[_Entry]:
     """All messages in order of time."""
     first_ns = min(int(run.stamps_ns[0]) for run in result.runs)
-    scene: list[_Entry] = []
-    moving: list[Iterator[_Entry]] = []
-    number = 0
+    colors = itertools.cycle(_RUN_COLORS)
     for index, component in enumerate(result.components):
         frame = frame_of(index)
         suffix = "" if index == 0 else f"/{frame}"
-        scene.append(_Entry(first_ns, TAGS_TOPIC + suffix, _tags_scene(component, frame, first_ns)))
-        lines = []
+        yield _Entry(first_ns, TAGS_TOPIC + suffix, _tags_scene(component, frame, first_ns))
         for run in component.runs:
-            scene.append(_Entry(first_ns, f"/map/{run.name}/keyframes", _keyframes(run, frame, first_ns)))
-            lines.append(_line(run, frame, first_ns, _RUN_COLORS[number % len(_RUN_COLORS)]))
-            moving.append(_transforms(run, frame))
-            number += 1
-        scene.append(_Entry(first_ns, RUNS_TOPIC + suffix, SceneUpdate(entities=lines)))
-    yield from scene
+            yield _Entry(first_ns, f"/map/{run.name}/keyframes", _keyframes(run, frame, first_ns))
+        lines = [_line(run, frame, first_ns, color) for run, color in zip(component.runs, colors, strict=False)]
+        yield _Entry(first_ns, RUNS_TOPIC + suffix, SceneUpdate(entities=lines))
+    moving = [
+        _transforms(run, frame_of(index)) for index, component in enumerate(result.components) for run in component.runs
+    ]
     yield from heapq.merge(*moving, key=lambda entry: entry.stamp_ns)
 
 

@@ -18,9 +18,9 @@ from onboard.messages import PlanarOdometry
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
 # Each begins a chain of its own that only tags can join. Pairs of them grow with the square, so that with the root of a
-# log's size the time grows with the size: 30 at 1 MiB, which is a minute and a half of driving, and 130 in an hour.
+# log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
 _FREE_RESETS = 10
-_RESETS_AT_A_MIB = 20
+_RESETS_AT_A_MIB = 15
 
 
 def stretches_of(

@@ -42,7 +42,7 @@ def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
     assert len(load_run(written(observed(651), tmp_path)).tags) == 652
 
 
-@pytest.mark.parametrize(("size_bytes", "most"), [(1 << 18, 20), (1 << 20, 30), (1 << 22, 50)])
+@pytest.mark.parametrize(("size_bytes", "most"), [(1 << 18, 17), (1 << 20, 25), (1 << 22, 40)])
 def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_refused(
     tmp_path: Path, size_bytes: int, most: int
 ) -> None:
