@@ -133,20 +133,20 @@ def _transforms(run: RunResult, frame: str) -> Iterator[_Entry]:
 
 
 def _keyframes(run: RunResult, frame: str, stamp_ns: int) -> PosesInFrame:
-    poses = [_pose(x, y, theta_rad) for x, y, theta_rad in run.T_map_base.tolist()]
-    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame, poses=poses)
+    message = PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame)
+    message.poses.extend(_pose(*T_map_base) for T_map_base in run.T_map_base.tolist())
+    return message
 
 
 def _line(run: RunResult, frame: str, stamp_ns: int, color: Color) -> SceneEntity:
-    points = [Point3(x=x, y=y, z=0.0) for x, y in run.T_map_base[:, :2].tolist()]
     line = LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=_pose(0.0, 0.0, 0.0),
         thickness=_LINE_PX,
         scale_invariant=True,
-        points=points,
         color=color,
     )
+    line.points.extend(Point3(x=x, y=y, z=0.0) for x, y in run.T_map_base[:, :2].tolist())
     said = {"run": run.name, "robot": run.robot_id, "distance_m": f"{run.distance_m:.3f}"}
     entity = _entity(run.name, frame, stamp_ns, said)
     entity.lines.append(line)
