@@ -15,13 +15,16 @@ ALL = [
     "reading logs",
     "keyframes and readings",
     "local maps",
+    "tags that do not belong",
     "breaks of odometry",
+    "fitting the noise",
     "aligning local maps",
     "building the graph",
     "solving all runs together",
     "covariances",
     "writing files",
     "drawing the picture",
+    "writing the report",
 ]
 
 

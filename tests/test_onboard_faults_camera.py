@@ -175,6 +175,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
         with recording(both, tmp_path / "logs") as made:
             camera.show(picture)
             made.wait_for_messages("/tags/detections", 1)
+            made.wait_for_messages("/wheels", 1)
             detector = made.recorder._detector
             assert detector is not None
             first = detector._process.pid or 0
