@@ -1,6 +1,7 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.noise import NoiseParameters
@@ -112,20 +113,8 @@ def build_map(
             chains += chains_of(run, noise or prior_noise)
             done()
     measurements = _measurements(tape, runs, chains)
-    maps: list[LocalMap] = []
-    alone = RunsAlone()
-    with stages.stage("local maps", len(chains)) as done:
-        efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
-        for chain in chains:
-            maps.append(solve_local_map(chain, efforts[chain.run.name]))
-            done()
-    with stages.stage("tags that do not belong"):
-        maps = [alone.explained_by_tags(each) for each in maps]
-    with stages.stage("breaks of odometry"):
-        maps, broken = split_where_broken(maps)
+    maps, broken = _local_maps(runs, chains, stages)
     chains = [each.chain for each in maps]
-    with stages.stage("tags that do not belong"):
-        maps = [alone.split(each) for each in maps]
     noise_fit = None
     if noise is None:
         with stages.stage("fitting the noise"):
@@ -133,51 +122,92 @@ def build_map(
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
         maps = with_outliers_apart(maps, merged)
-    suspects: list[SuspectTag] = []
     workings = workings or Workings()
     workings.maps += maps
-    components: list[Component] = []
-    calibration: list[CalibrationResult] = []
-    measured: list[MeasurementResult] = []
-    checks: list[CheckResult] = []
-    metres: list[MetreResult] = []
+    found = _Found()
+    for members in merged.groups:
+        workings.solved.append(found.add(maps, members, measurements, stages, keep_suspects=keep_suspects))
+    named = {(each.family, each.tag_id) for each in found.suspects}
+    measured = found.measured + unused(measurements, found.measured)
     warnings = [w for run in runs for w in run.warnings] + broken + [w for chain in chains for w in chain.warnings]
-    for i, members in enumerate(merged.groups):
+    warnings += found.warnings + measurement_warnings(measured) + check_warnings(found.checks)
+    warnings += _calibration_warnings(found.calibration, found.checks)
+    warnings += _chain_warnings(chains) + merge_warnings(maps, merged, named)
+    return MapResult(
+        components=tuple(found.components),
+        alignments=alignment_results(maps, merged),
+        noise=noise,
+        calibration=tuple(found.calibration),
+        measurements=tuple(measured),
+        checks=tuple(found.checks),
+        metres=tuple(found.metres),
+        warnings=tuple(dict.fromkeys(warnings)),
+        losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
+        suspects=tuple(found.suspects),
+        noise_fit=noise_fit,
+    )
+
+
+def _local_maps(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) -> tuple[list[LocalMap], list[str]]:
+    """Each chain solved alone, parted where its wheels lost the way, and what to say of that."""
+    maps: list[LocalMap] = []
+    with stages.stage("local maps", len(chains)) as done:
+        efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
+        for chain in chains:
+            maps.append(solve_local_map(chain, efforts[chain.run.name]))
+            done()
+    alone = RunsAlone()
+    with stages.stage("tags that do not belong"):
+        maps = [alone.explained_by_tags(each) for each in maps]
+    with stages.stage("breaks of odometry"):
+        maps, broken = split_where_broken(maps)
+    with stages.stage("tags that do not belong"):
+        return [alone.split(each) for each in maps], broken
+
+
+@dataclass
+class _Found:
+    """What the components gave, one after the other."""
+
+    components: list[Component] = field(default_factory=list)
+    suspects: list[SuspectTag] = field(default_factory=list)
+    calibration: list[CalibrationResult] = field(default_factory=list)
+    measured: list[MeasurementResult] = field(default_factory=list)
+    checks: list[CheckResult] = field(default_factory=list)
+    metres: list[MetreResult] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def add(
+        self,
+        maps: Sequence[LocalMap],
+        members: Group,
+        measurements: Measurements,
+        stages: Stages,
+        *,
+        keep_suspects: bool,
+    ) -> Solved:
+        """Solves one more component, tags that do not belong apart unless they are kept, and takes what it says."""
+        index = len(self.components)
         graph, solution = solve_global_map(maps, members, stages, measurements)
         with stages.stage("tags that do not belong"):
             searched = split_together(graph, solution, [maps[m] for m in members.members])
-            found = suspect_tags(searched)
-        suspects += found
+            suspects = suspect_tags(searched)
+        self.suspects += suspects
         graph, solution = searched.graph, searched.solution
-        if keep_suspects and found:
+        if keep_suspects and suspects:
             graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
-        workings.solved.append(Solved(members, graph, solution))
         with stages.stage("covariances"):
-            components.append(component_of(graph, solution))
-            calibration.extend(calibration_of(graph, solution, i))
-            measured += judged(graph, solution, measurements, i)
-            checks += checks_of(graph, solution, i)
-            metres.append(metre_of(graph, i))
+            self.components.append(component_of(graph, solution))
+            self.calibration += calibration_of(graph, solution, index)
+            self.measured += judged(graph, solution, measurements, index)
+            self.checks += checks_of(graph, solution, index)
+            self.metres.append(metre_of(graph, index))
         if not solution.converged:
-            warnings.append(f"component {i}: the solve did not converge ({solution.reason}); do not trust this map")
-        warnings += weak_parts(graph, solution) + _contradictions(maps, members, i, solution)
-    named = {(each.family, each.tag_id) for each in suspects}
-    measured += unused(measurements, measured)
-    warnings += measurement_warnings(measured) + check_warnings(checks) + _calibration_warnings(calibration, checks)
-    warnings += _chain_warnings(chains) + merge_warnings(maps, merged, named)
-    return MapResult(
-        components=tuple(components),
-        alignments=alignment_results(maps, merged),
-        noise=noise,
-        calibration=tuple(calibration),
-        measurements=tuple(measured),
-        checks=tuple(checks),
-        metres=tuple(metres),
-        warnings=tuple(dict.fromkeys(warnings)),
-        losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
-        suspects=tuple(suspects),
-        noise_fit=noise_fit,
-    )
+            self.warnings.append(
+                f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
+            )
+        self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
+        return Solved(members, graph, solution)
 
 
 def _measurements(tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain]) -> Measurements:

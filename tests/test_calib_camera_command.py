@@ -1,6 +1,5 @@
 """`groundsbot-calib camera` and `check` as a person meets them: good pictures, and all that can be wrong with them."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import cli
 from calib.board import DEFAULT_BOARD
 from calib.camera_file import read_camera_yaml, read_estimate, write_camera_yaml
 from calib.camera_model import CameraModel
@@ -17,21 +15,7 @@ from calib.projection_uncertainty import PictureGrid, difference_px, rms_px
 from fixtures.board_picture import BoardPainter, View, drawn_views
 from fixtures.textures import ByteArray
 from tests.board_cases import FISHEYE, NARROW, WIDE
-from tests.programs import Outcome, Run
-
-
-@pytest.fixture
-def calib(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """`groundsbot-calib ARGUMENTS`, as the program."""
-
-    def call(*arguments: object) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["groundsbot-calib", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        captured = capsys.readouterr()
-        return Outcome(int(caught.value.code or 0), captured.out, captured.err)
-
-    return call
+from tests.programs import Run
 
 
 def pictures(
