@@ -2,14 +2,18 @@
 
 import hashlib
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from calib import se2
+from calib.arrays import FloatArray
 from calib.robot import read_robot_yaml
 from calib.wheels import advance
 from fixtures.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
@@ -146,6 +150,47 @@ def test_detections_are_projections_of_the_true_corners(tmp_path: Path) -> None:
             np.testing.assert_allclose(np.array(found.corners_px).reshape(4, 2), expected, atol=1e-3)
             seen += 1
     assert seen > 100
+
+
+def test_a_floor_tilts_whole_pictures_and_a_rolling_shutter_takes_each_row_at_its_time(tmp_path: Path) -> None:
+    """Three numbers a picture explain all its corners, each where the robot was when its row was read."""
+    world, sigma_rad, sigma_m, readout_s = exact_world(), math.radians(0.3), 0.004, 0.02
+    noise = world.noise.model_copy(update={"sigma_tilt_rad": sigma_rad, "sigma_height_m": sigma_m})
+    robots = [each.model_copy(update={"robot": {**each.robot, "readout_s": readout_s}}) for each in world.robots]
+    truth = simulate(
+        world.model_copy(update={"noise": noise, "robots": robots}), 6, tmp_path / "out", ["b"], render=False
+    )
+    run, camera = truth.runs["b_seed6"], world.robot("b").camera
+    assert camera is not None
+    model, mount = camera_model(camera, "b"), run.robot.mount.T_base_camera
+    corner_of = dict(zip(truth.tags.tag_id.tolist(), truth.tags.corners_m, strict=True))
+    found = []
+    for message in [each for each in detections_in(tmp_path / "out" / "b" / "seed6") if len(each.detections) > 1]:
+        pixels = np.array([each.corners_px for each in message.detections]).reshape(-1, 2)
+        points = np.concatenate([corner_of[each.tag_id] for each in message.detections])
+        late_s = readout_s * (pixels[:, 1] / (model.height_px - 1) - 0.5) - run.robot.time_offset_s
+        T_world_base = run.at(message.stamp_ns + np.rint(late_s * 1e9).astype(np.int64))
+        turn = Rotation.from_euler("z", T_world_base[:, 2:])
+        level = turn.inv().apply(points - np.column_stack([T_world_base[:, :2], np.zeros(len(points))]))
+
+        def missed_px(sway: FloatArray, level: FloatArray = level, pixels: FloatArray = pixels) -> FloatArray:
+            in_base = Rotation.from_rotvec([*sway[:2], 0.0]).inv().apply(level - [0.0, 0.0, sway[2]])
+            return np.asarray((model.project(mount.inv().apply(in_base)) - pixels).ravel())
+
+        solved = least_squares(missed_px, np.zeros(3))
+        assert np.abs(solved.fun).max() < 5e-3
+        found.append(solved.x)
+    assert len(found) > 30
+    spread = np.std(found, axis=0) / [sigma_rad, sigma_rad, sigma_m]
+    np.testing.assert_allclose(spread, 1.0, atol=4.0 / np.sqrt(2 * len(found)))
+
+
+def test_a_floor_that_tilts_is_not_rendered(tmp_path: Path) -> None:
+    room = load_world("room")
+    tilted = room.model_copy(update={"noise": room.noise.model_copy(update={"sigma_tilt_rad": 0.005})})
+    with pytest.raises(FixturesError, match=r"sigma_tilt_rad is 0\.005 .* give --no-render"):
+        simulate(tilted, 0, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_truth_holds_every_picture_and_twenty_poses_a_second(tmp_path: Path) -> None:
