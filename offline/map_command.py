@@ -15,12 +15,13 @@ from calib.noise import read_noise_yaml
 from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
-from offline.map_io import JSON_FILE, map_as_json, write_map
+from offline.map_io import JSON_FILE, advice_as_json, map_as_json, write_map
 from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
 from offline.picture import write_picture
 from offline.pipeline import map_logs
 from offline.progress import progress_bar
+from offline.report_words import advice_sentence
 from offline.result import AlignmentResult, Component, FittedNoise, MapResult, MeasurementResult, MetreResult
 from offline.run import RobotFile, read_robot_file
 from offline.run_noise import NOT_NEEDED
@@ -121,6 +122,7 @@ def summary(result: MapResult, output: Path) -> list[str]:
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     if result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
+    lines += _advice_lines(result)
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
@@ -204,6 +206,13 @@ def _noise_lines(fit: FittedNoise) -> list[str]:
             kept.setdefault(each.kept, []).append(f"{each.name} {each.value:.3g}")
     lines += [f"noise left as it was, since {why}: " + ", ".join(names) for why, names in kept.items()]
     return lines
+
+
+def _advice_lines(result: MapResult) -> list[str]:
+    """The best that could be done for the worst tag; runs that do not hang together need other things first."""
+    several = len({tag.family for component in result.components for tag in component.tags}) > 1
+    told = result.advice[:1] if len(result.components) == 1 else ()
+    return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]
 
 
 def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> None:

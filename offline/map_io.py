@@ -19,6 +19,7 @@ from calib.files import written_whole
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
 from offline.result import (
+    AdviceResult,
     AlignmentResult,
     CalibrationResult,
     CheckResult,
@@ -102,6 +103,7 @@ def read_map(folder: Path) -> MapResult:
             warnings=tuple(data["warnings"]),
             losses=tuple(data.get("losses", ())),
             suspects=tuple(SuspectTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
+            advice=tuple(_advice(entry) for entry in data.get("advice", ())),
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
@@ -139,6 +141,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "checks": [{"sigmas": _plain(entry.sigmas)} | vars(entry) for entry in result.checks],
         "metres": [vars(entry) for entry in result.metres],
         "suspect_tags": [_suspect_json(suspect) for suspect in result.suspects],
+        "advice": [advice_as_json(advice) for advice in result.advice],
         "warnings": list(result.warnings),
         "losses": list(result.losses),
     }
@@ -206,6 +209,16 @@ def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
     entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence")}
     other = {} if suspect.swapped_with is None else {"swapped_with": suspect.swapped_with}
     return entry | {"runs": list(suspect.runs)} | other
+
+
+def advice_as_json(advice: AdviceResult) -> dict[str, Any]:
+    """An entry of `advice` in map.json."""
+    entry = {name: _plain(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
+    return entry | {"tags": [_tag_key_json(tag) for tag in advice.tags], "worst_tag": _tag_key_json(advice.worst_tag)}
+
+
+def _tag_key_json(tag: tuple[str, int, str]) -> dict[str, Any]:
+    return dict(zip(("family", "tag_id", "instance"), tag, strict=True))
 
 
 def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
@@ -385,6 +398,12 @@ def _noise_fit(entry: dict[str, Any] | None) -> FittedNoise | None:
         runs=tuple(entry["runs"]),
         contradicting=tuple(entry["contradicting"]),
     )
+
+
+def _advice(entry: dict[str, Any]) -> AdviceResult:
+    tags = [(each["family"], each["tag_id"], each["instance"]) for each in (*entry["tags"], entry["worst_tag"])]
+    named = {"tags": tuple(tags[:-1]), "worst_tag": tags[-1], "way_m": _array(entry["way_m"]).reshape(-1, 2)}
+    return AdviceResult(**entry | named)
 
 
 def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.noise import NoiseParameters
+from offline.advice import advise
 from offline.chain import Chain, chains_of
 from offline.checks import COMPARED, check_warnings, checks_of, metre_of
 from offline.effort import Effort
@@ -20,6 +21,7 @@ from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
 from offline.result import (
     MAX_SIGMAS,
+    AdviceResult,
     CalibrationResult,
     CheckResult,
     Component,
@@ -145,6 +147,7 @@ def build_map(
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
         suspects=tuple(found.suspects),
         noise_fit=noise_fit,
+        advice=tuple(found.advice),
     )
 
 
@@ -176,6 +179,7 @@ class _Found:
     checks: list[CheckResult] = field(default_factory=list)
     metres: list[MetreResult] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    advice: list[AdviceResult] = field(default_factory=list)
 
     def add(
         self,
@@ -202,6 +206,8 @@ class _Found:
             self.measured += judged(graph, solution, measurements, index)
             self.checks += checks_of(graph, solution, index)
             self.metres.append(metre_of(graph, index))
+        with stages.stage("advice"):
+            self.advice += advise(graph, solution, index)
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"

@@ -12,6 +12,7 @@ from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.picture import RUN_COLOURS
 from offline.report_timeline import events_of, timeline
+from offline.report_words import advice_sentence, has_several_families, tag_label
 from offline.workings import Solved, Workings
 
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
@@ -84,17 +85,6 @@ def tag_readings(solved: Solved) -> list[list[dict[str, Any]]]:
     ]
 
 
-def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
-    """Number and instance, and the family where that is needed to tell tags apart."""
-    label = f"{tag['tag_id']}{tag['instance']}"
-    return f"{tag['family']}:{label}" if several_families else label
-
-
-def has_several_families(document: dict[str, Any]) -> bool:
-    """Whether a tag's number alone does not name it."""
-    return len({tag["family"] for tag in document["tags"]}) > 1
-
-
 def _component(
     document: dict[str, Any], index: int, solved: Solved, workings: Workings, colours: dict[str, str]
 ) -> dict[str, Any]:
@@ -113,6 +103,12 @@ def _component(
         ],
         "is_merged": len(runs) > 1,
         "before": _before(solved, workings, colours, several_families=several),
+        "advice": [
+            {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
+            | dict(zip("xy", _rounded(np.array(each["way_m"])), strict=True))
+            for each in document["advice"]
+            if each["component"] == index
+        ],
     }
 
 

@@ -17,7 +17,7 @@ _ASSETS: Final = "offline.report_assets"
 # Longer tables are folded away.
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)
-_MIDDLE: Final = ("alignments", "holding", "starts", "checks", "metres", "measurements")
+_MIDDLE: Final = ("advice", "alignments", "holding", "starts", "checks", "metres", "measurements")
 _BELOW: Final = ("runs", "tags", "noise", "calibration")
 
 

@@ -5,8 +5,14 @@ from itertools import combinations
 from math import degrees
 from typing import Any, Final, NamedTuple
 
-from offline.report_data import has_several_families, tag_label
-from offline.report_words import check_contradicts, largest_sigma_m, linking_tags
+from offline.report_words import (
+    advice_sentence,
+    check_contradicts,
+    has_several_families,
+    largest_sigma_m,
+    linking_tags,
+    tag_label,
+)
 
 _MOST_ROWS: Final = 1000
 _UNKNOWN: Final = "\N{EN DASH}"
@@ -29,6 +35,7 @@ def tables(document: dict[str, Any]) -> list[Table]:
     """Those that hold something."""
     made = [
         _suspects(document),
+        _advice(document),
         _alignments(document),
         _holding(document),
         _start_to_start(document),
@@ -77,6 +84,22 @@ def _suspects(document: dict[str, Any]) -> Table:
     ]
     note = "Tags that do not belong, each with what speaks against it."
     return _table("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows)
+
+
+def _advice(document: dict[str, Any]) -> Table:
+    several = has_several_families(document)
+    rows = [
+        (
+            str(each["component"] + 1),
+            advice_sentence(each, several_families=several),
+            _number(each["sigma_m"], 3),
+            _number(each["sigma_then_m"], 3),
+        )
+        for each in document["advice"]
+    ]
+    note = "What would lower the largest sigma of a tag most, foretold from the covariances; drawn into the map."
+    columns = ("component", "what", "largest sigma (m)", "and then (m)")
+    return _table("advice", "What to do next", note, columns, rows)
 
 
 def _alignments(document: dict[str, Any]) -> Table:

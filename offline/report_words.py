@@ -156,7 +156,39 @@ def _next(document: dict[str, Any]) -> list[str]:
     """What would help."""
     if len(document["components"]) > 1:
         return ["To join the components, drive one more run past two or more tags of each of them."]
-    return []
+    several = has_several_families(document)
+    return [advice_sentence(each, several_families=several) for each in document["advice"][:1]]
+
+
+def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
+    """What to do, and what that would do to the worst tag; of an entry of `advice` in map.json."""
+    now, then = _metres(advice["sigma_m"]), _metres(advice["sigma_then_m"])
+    worst = f"the largest sigma, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
+    if now == then:
+        return f"One more drive or tag would hardly help: {worst}, would stay at {now}."
+    first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]
+    if advice["kind"] == "pass":
+        what = (
+            f"One more pass from {first} to {others[0]}, {advice['length_m']:.0f} m along the way of {advice['run']},"
+        )
+    else:
+        x_m, y_m = advice["way_m"][0]
+        what = (
+            f"One more tag at x {x_m:.1f} m, y {y_m:.1f} m (beside the way of {advice['run']}; nearest is {first}), "
+            "and the same drives again,"
+        )
+    return f"{what} would bring {worst}, from {now} to about {then}."
+
+
+def has_several_families(document: dict[str, Any]) -> bool:
+    """Whether a tag's number alone does not name it."""
+    return len({tag["family"] for tag in document["tags"]}) > 1
+
+
+def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
+    """Number and instance, and the family where that is needed to tell tags apart."""
+    label = f"{tag['tag_id']}{tag['instance']}"
+    return f"{tag['family']}:{label}" if several_families else label
 
 
 def _do(entries: Sequence[object]) -> str:

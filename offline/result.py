@@ -258,6 +258,32 @@ class FittedNoise:
 
 
 @dataclass(frozen=True)
+class AdviceResult:
+    """One more drive or one more tag that would help the worst tag of a component.
+
+    Attributes:
+        kind: pass (drive that part of a run's way once more) or tag (hang one there and drive all as before).
+        run: whose way it is, or beside whose way it hangs.
+        tags: (family, tag id, instance) where the pass begins and ends; of a tag the one that hangs nearest.
+        way_m: (N, 2) in map, of a tag (1, 2).
+        length_m: of a pass; None for a tag.
+        worst_tag: that has the largest sigma.
+        sigma_m: that one, along its worst direction.
+        sigma_then_m: the largest of any tag that is expected then.
+    """
+
+    kind: str
+    component: int
+    run: str
+    tags: tuple[tuple[str, int, str], ...]
+    way_m: FloatArray
+    length_m: float | None
+    worst_tag: tuple[str, int, str]
+    sigma_m: float
+    sigma_then_m: float
+
+
+@dataclass(frozen=True)
 class MapResult:
     """Everything that one `map` command found."""
 
@@ -272,6 +298,7 @@ class MapResult:
     losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
     suspects: tuple[SuspectTag, ...] = ()
     noise_fit: FittedNoise | None = None  # None: the noise was given
+    advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

@@ -8,6 +8,7 @@ from calib import se2
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline.result import (
+    AdviceResult,
     AlignmentResult,
     CalibrationResult,
     CheckResult,
@@ -78,6 +79,30 @@ def made_map(*components: Component) -> MapResult:
         checks=(CheckResult("turn", 0, "red", None, 0.01, 0.002, 0.01),),
         metres=(MetreResult(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
         warnings=("tag 9 lies elsewhere",),
+        advice=(
+            AdviceResult(
+                "pass",
+                0,
+                "red_one",
+                (("tag36h11", 3, ""), ("tag36h11", 7, "")),
+                np.array([[0.0, 0.0], [2.0, 0.1]]),
+                14.2,
+                ("tag25h9", 3, ""),
+                0.31,
+                0.18,
+            ),
+            AdviceResult(
+                "tag",
+                0,
+                "blue_two",
+                (("tag36h11", 7, ""),),
+                np.array([[6.5, -1.0]]),
+                None,
+                ("tag25h9", 3, ""),
+                0.31,
+                0.2,
+            ),
+        ),
     )
 
 

@@ -64,7 +64,7 @@ def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
     assert list(data) == [
         *("format_version", "frame", "components", "runs", "tags", "alignments", "start_to_start"),
         *("noise", "noise_fit", "calibration", "measurements", "checks", "metres"),
-        *("suspect_tags", "warnings", "losses"),
+        *("suspect_tags", "advice", "warnings", "losses"),
     ]
     assert data["components"][0]["runs"] == ["red_one", "blue_two"]
     wanted = {"run", "log", "robot", "T_map_start", "covariance", "n_keyframes", "distance_m"}

@@ -22,6 +22,7 @@ ALL = [
     "building the graph",
     "solving all runs together",
     "covariances",
+    "advice",
     "writing files",
     "drawing the picture",
     "writing the report",

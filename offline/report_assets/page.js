@@ -110,6 +110,17 @@
       marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
   }
 
+  function advised(advice) {
+    const text = plain(advice.text).replace(" would ", "<br>would ").replace(" (beside ", "<br>(beside ");
+    const trace = { type: "scatter", x: advice.x, y: advice.y, hoverinfo: "text", hovertext: advice.x.map(() => text),
+      name: advice.kind === "pass" ? "advised pass" : "advised tag" };
+    if (advice.kind === "pass") {
+      return { ...trace, mode: "lines", line: { color: colour("--advice"), width: 7 }, opacity: 0.5 };
+    }
+    return { ...trace, mode: "markers", marker: { symbol: "star", size: 15, color: colour("--advice"),
+      line: { color: colour("--back"), width: 1 } } };
+  }
+
   function drawMap(element) {
     const component = data.components[element.dataset.index];
     const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
@@ -127,6 +138,7 @@
           ? single.map((tag) => tag.readings.length ? own[tag.readings[0].run] : colour("--quiet")) : null));
     }
     if (shared.length) traces.push(tagTrace(shared, "tags of several runs", colour("--shared")));
+    traces.push(...component.advice.map(advised));
     return Plotly.react(element, traces, plan(element, traces), CONFIG);
   }
 
