@@ -8,7 +8,7 @@ export OMP_NUM_THREADS := 1
 # The newest picture of the demo and its logs end up here.
 DEMO := build/demo
 
-.PHONY: setup demo test lint format bench lock proto clean
+.PHONY: setup demo test lint format docs pictures bench lock proto clean
 
 setup: $(READY)
 
@@ -34,6 +34,18 @@ lint: $(READY)
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# The site: the commands' page from the programs, then everything, from disk.
+docs: $(READY)
+	$(BIN)/python docs/site/commands.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# Those of README and docs, anew; the second needs Debian's Chromium.
+pictures: demo
+	cp $(DEMO)/map/map.png docs/merged_map.png
+	chromium --headless=new --no-sandbox --disable-gpu --hide-scrollbars --window-size=1100,1100 \
+		--virtual-time-budget=20000 --user-data-dir=build/chromium --screenshot=docs/report.png \
+		file://$(CURDIR)/$(DEMO)/map/report.html
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks

@@ -130,7 +130,7 @@ def place_beside(drives: Drives, view: View, chain: int, keyframe: int, side: fl
     away_m = np.abs(drives.sensors[::step, :2] - position_m).max(axis=1)
     near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example[::step] >= 0))
     seen = near[is_in_view(drives.sensors[near], position_m, sensor[:2] - position_m, view)]
-    sightings = _sightings(drives, seen)
+    sightings = _sightings(drives, seen, least=view.n_a_sighting / step)
     beside = np.array([pose], dtype=np.int64)
     viewers = [part[(_WITHIN_SIGHTING * (len(part) - 1)).round().astype(int)] for part in sightings]
     return Place(chain, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
@@ -205,13 +205,17 @@ def _readings(drives: Drives, view: View, place: Place, tag: IntArray) -> Readin
     )
 
 
-def _sightings(drives: Drives, poses: IntArray) -> list[IntArray]:
-    """Rising poses, parted where a chain ends or drives on before it comes back; not more than a few, from all over."""
+def _sightings(drives: Drives, poses: IntArray, least: float) -> list[IntArray]:
+    """Rising poses, parted where a chain ends or drives on before it comes back; not more than a few, from all over.
+
+    A glimpse is not counted on: a passing by has the tag in view from as many poses as read a tag on average.
+    """
     if not len(poses):
         return []
     along_m = np.concatenate(drives.ways)[poses]
     chain = np.searchsorted(drives.graph.first_pose, poses, side="right")
     parts = np.split(poses, np.flatnonzero((np.diff(chain) != 0) | (np.diff(along_m) > SIGHTING_GAP_M)) + 1)
+    parts = [part for part in parts if len(part) >= least]
     if len(parts) <= _MOST_SIGHTINGS:
         return parts
     return [parts[i] for i in np.linspace(0, len(parts) - 1, _MOST_SIGHTINGS).round().astype(int)]

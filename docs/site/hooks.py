@@ -1,0 +1,36 @@
+"""Makes pages of the site from the files at the top, and ends links that lead out of it in plain words."""
+
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+_LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """README and its like are pages too."""
+    top = Path(config.config_file_path).parent
+    for source, page in PAGES.items():
+        files.append(File.generated(config, page, content=(top / source).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Links as they are right in the repository become right in the site."""
+    return _LINK.sub(lambda link: _in_site(link, is_top=page.file.src_uri in PAGES.values(), files=files), markdown)
+
+
+def _in_site(link: re.Match[str], *, is_top: bool, files: Files) -> str:
+    mark, text, target = link.groups()
+    if re.match(r"[a-z]+:|#", target):
+        return link[0]
+    path, _, anchor = target.partition("#")
+    path = path.removeprefix("docs/") if is_top else path.removeprefix("../docs/")
+    path = PAGES.get(path.removeprefix("../"), path)
+    if path.startswith("../") or (is_top and files.get_file_from_path(path) is None and (Path(path).suffix != ".md")):
+        return text  # source code and the like
+    return f"{mark}[{text}]({path}{'#' + anchor if anchor else ''})"
