@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
+from offline import arrowhead_many, arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
 from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_covariance import Entries, joint_covariance, quadratic_form
 from offline.arrowhead_marginals import pose_marginals
@@ -202,6 +202,19 @@ class Factorisation:
     def solve(self, vector: FloatArray) -> FloatArray:
         """H^-1 vector (n,), in the order of the tangent vector."""
         return self.solve_in_order(self.arrowhead.in_order(vector))[self.arrowhead.tangent]
+
+    def solve_many(self, vectors: FloatArray) -> FloatArray:
+        """H^-1 vectors (n, k), in the order of the tangent vector; as `solve`, but quicker for several."""
+        tree, k = self.arrowhead.tree, vectors.shape[1]
+        solutions = self.arrowhead.in_order(vectors)
+        pieces = arrowhead_many.pieces_of(tree, self.system, self.rows)
+        room = np.empty((3 * len(self.rows.inside), k)), np.empty((self.rows.border.shape[2], k))
+        arrowhead_many.substitute(pieces, solutions, True, *room)
+        columns = tree.front[tree.front_start[-2] :]
+        if len(columns):
+            solutions[columns], _ = linalg.lapack.dpotrs(self.top, solutions[columns], lower=1)
+        arrowhead_many.substitute(pieces, solutions, False, *room)
+        return np.asarray(solutions[self.arrowhead.tangent])
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns of the tangent vector: their block of H^-1; 0 where held (-1)."""

@@ -1,5 +1,7 @@
 """Sets up the arrowhead system of a problem, and that of its skeleton: factors by pose, order of elimination."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.arrays import BoolArray, IntArray
@@ -74,6 +76,17 @@ def build_arrowhead(
         tangent=_tangent_order(columns),
         measured=measured_blocks(measured, tree, free),
     )
+
+
+def reweighed(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFactors) -> Arrowhead:
+    """The same factors with the whitenings that these have."""
+    own = arrowhead.odometry._replace(
+        information=np.empty_like(arrowhead.odometry.information),
+        covariance=np.empty_like(arrowhead.odometry.covariance),
+    )
+    add_moments(own, np.ascontiguousarray(odometry.whitening[np.argsort(odometry.first, kind="stable")]))
+    in_order = readings.whitening[np.argsort(readings.pose, kind="stable")]
+    return replace(arrowhead, odometry=own, readings=arrowhead.readings._replace(whitening=in_order))
 
 
 def build_skeleton(whole: Arrowhead) -> Skeleton:

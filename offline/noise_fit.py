@@ -9,11 +9,13 @@ from scipy.special import ndtri
 
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
+from offline.chain import Chain
 from offline.covariance_parts import CovarianceParts
 from offline.graph import build_graph
 from offline.local_map import LocalMap
-from offline.solver import solve
-from offline.variance_components import LEAST_REDUNDANCY, Components, FittedVariances, Part, fit_variances
+from offline.solver import Solution
+from offline.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
+from offline.variance_look import Components, Part
 
 # What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals.
 _MAX_KEYFRAMES: Final = 6_000
@@ -44,11 +46,26 @@ class FittedSigma:
 
 
 @dataclass(frozen=True)
+class FittedPart:
+    """The beginning of a chain, or all of it, and its solution."""
+
+    chain: Chain
+    solution: Solution
+
+
+@dataclass(frozen=True)
 class NoiseFit:
-    """All noise parameters; `sigmas` are those that some measurement depends on."""
+    """All noise parameters.
+
+    Attributes:
+        noise: fitted.
+        sigmas: those that some measurement depends on.
+        parts: of each map what was looked at, as solved under the fitted noise; none where nothing was fitted.
+    """
 
     noise: NoiseParameters
     sigmas: tuple[FittedSigma, ...]
+    parts: tuple[FittedPart, ...] = ()
 
 
 def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
@@ -75,17 +92,12 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
         if not odd:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
-            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept))
+            parts = zip(_beginnings(maps), fitted.solutions, strict=True)
+            fitted_noise = noise.model_copy(update=values)
+            return NoiseFit(fitted_noise, _in_order(told | kept), tuple(FittedPart(*part) for part in parts))
         kept |= odd
         free = tuple(name for name in free if name not in odd)
     return NoiseFit(noise, _in_order(kept))
-
-
-def weighed(local_map: LocalMap, noise: NoiseParameters) -> LocalMap:
-    """The same map solved again under other noise."""
-    chain = local_map.chain.weighed(noise)
-    graph = build_graph([chain])
-    return replace(local_map, chain=chain, graph=graph, solution=solve(graph.problem, local_map.solution.state))
 
 
 def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
@@ -102,24 +114,29 @@ def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
 
 
 def _fitted(maps: Sequence[LocalMap], noise: NoiseParameters, names: tuple[str, ...]) -> FittedVariances:
-    share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
     default = NoiseParameters()
     return fit_variances(
-        [_part(each, noise, names, share) for each in maps],
+        [_part(each, part, noise, names) for each, part in zip(maps, _beginnings(maps), strict=True)],
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
     )
 
 
-def _part(local_map: LocalMap, noise: NoiseParameters, names: tuple[str, ...], share: float) -> Part:
-    """The first share of a run."""
-    chain, state = local_map.chain, local_map.solution.state
+def _beginnings(maps: Sequence[LocalMap]) -> list[Chain]:
+    """The same share of each run."""
+    share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
+    if share == 1.0:
+        return [each.chain for each in maps]
+    return [each.chain.prefix(max(2, int(share * len(each.chain.stamps_ns)))) for each in maps]
+
+
+def _part(local_map: LocalMap, chain: Chain, noise: NoiseParameters, names: tuple[str, ...]) -> Part:
+    """Of a map, the chain that is all of its own or the beginning of it."""
+    state = local_map.solution.state
     graph, start = local_map.graph, state
-    if share < 1.0:
-        n_keyframes = max(2, int(share * len(chain.stamps_ns)))
-        chain = chain.prefix(n_keyframes)
+    if chain is not local_map.chain:
         graph = build_graph([chain])
-        start = graph.start(state.poses[:n_keyframes], local_map.tags_m, local_map.calibration)
+        start = graph.start(state.poses[: len(chain.stamps_ns)], local_map.tags_m, local_map.calibration)
     odometry, readings = chain.odometry.parts, chain.readings.parts
     components = Components(
         odometry.of(names), _rest(odometry, noise, names), readings.of(names), _rest(readings, noise, names)

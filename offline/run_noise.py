@@ -17,9 +17,9 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.chain import Chain
-from offline.graph import build_graph
+from offline.factors import whitening
 from offline.local_map import LocalMap
-from offline.noise_fit import FittedSigma, fit_noise, weighed
+from offline.noise_fit import FittedPart, FittedSigma, fit_noise
 from offline.odometry import ODOMETRY_NOISE
 from offline.result import FittedNoise, FittedParameter
 from offline.shared_errors import SharedErrors, fit_shared_errors
@@ -54,7 +54,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
     shared = np.zeros(2)
     if noise != prior:
-        shared, is_told = _shared([weighed(each, noise) for each in sound])
+        shared, is_told = _shared(fit.parts)
         if not is_told:
             found = {name: _at_least(each, getattr(prior, name)) for name, each in found.items()}
             noise = noise.model_copy(update={name: each.value for name, each in found.items()})
@@ -82,9 +82,9 @@ def _is_sound(local_map: LocalMap) -> bool:
     return len(local_map.chain.tags) > 0 and local_map.goodness.fits
 
 
-def _shared(maps: Sequence[LocalMap]) -> tuple[FloatArray, bool]:
+def _shared(parts: Sequence[FittedPart]) -> tuple[FloatArray, bool]:
     """(2,) variance that readings of a tag share within a cell, as a multiple of their own; and whether enough tell."""
-    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in maps]
+    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in parts]
     weight = np.array([each.shared_redundancy for each in errors])
     shared = (weight * np.array([each.shared for each in errors])).sum(axis=0) / weight.sum(axis=0)
     return shared, bool(weight.sum(axis=0)[0] >= _LEAST_CELLS)
@@ -107,7 +107,8 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
         cell = _cells(chain)
         sigmas = np.sqrt(1.0 + np.bincount(cell)[cell][:, None] * shared)
         chain = replace(chain, readings=chain.readings.spread(sigmas))
-    graph = build_graph([chain])
+    weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
+    graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 
 from calib.arrays import FloatArray, IntArray
 from offline.factors import stacked
@@ -62,61 +63,59 @@ def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
         solution: its readings weighed as independent.
         cell: (M,) of each reading; numbers from 0 without gaps.
     """
-    left_over = _LeftOver(solution)
-    rng = np.random.default_rng(_SEED)
-    n_rows = len(left_over.residual)
-    traces, rest, length = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
-    for _ in range(_N_SIGNS):
-        for part in range(4):
-            component, by_cell = part % 2, part >= 2
-            signs = (
-                rng.choice([-1.0, 1.0], int(cell.max()) + 1)[cell] if by_cell else rng.choice([-1.0, 1.0], len(cell))
-            )
-            drawn = np.zeros(n_rows)
-            left_over.of_readings(drawn)[:, component] = signs
-            kept = left_over.of(drawn)
-            found = _squares(left_over.of_readings(kept), cell)
-            whole = float(kept @ kept)
-            traces[part] += found / _N_SIGNS
-            rest[part] += (whole - found[:2].sum()) / _N_SIGNS
-            length[part] += whole / _N_SIGNS
-    squares = _squares(left_over.of_readings(left_over.residual), cell) - rest
+    read = _Readings(solution)
+    cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
+    drawn = _drawn(cell)
+    kept, length = read.left_over(drawn.reshape(len(cell) * 2, -1))
+    found = _squares(kept.reshape(drawn.shape), cells).reshape(4, 4, _N_SIGNS)  # by square, part, signs
+    traces, whole = found.mean(axis=2).T, length.reshape(4, _N_SIGNS).mean(axis=1)
+    squares = _squares(read.residual.reshape(-1, 2, 1), cells)[:, 0] - (whole - traces[:, :2].sum(axis=1))
     n_in_cell = np.bincount(cell)
-    return _solved(0.5 * (traces + traces.T), squares, length, float((n_in_cell**2).sum() / n_in_cell.sum()))
+    return _solved(0.5 * (traces + traces.T), squares, whole, float((n_in_cell**2).sum() / n_in_cell.sum()))
 
 
-class _LeftOver:
-    """What remains of measured numbers and priors once the estimate has taken its share: v - J H^-1 J^T v."""
+def _drawn(cell: IntArray) -> FloatArray:
+    """(M, 2, 4 n) random signs in one component: reading by reading in the first 2 n, cell by cell in the others."""
+    rng = np.random.default_rng(_SEED)
+    drawn = np.zeros((len(cell), 2, 4, _N_SIGNS))
+    for part in range(4):
+        component, by_cell = part % 2, part >= 2
+        signs = rng.choice([-1.0, 1.0], (int(cell.max()) + 1 if by_cell else len(cell), _N_SIGNS))
+        drawn[:, component, part] = signs[cell] if by_cell else signs
+    return drawn.reshape(len(cell), 2, -1)
+
+
+class _Readings:
+    """The rows of a solve that are readings, weighted as it weighed them.
+
+    Attributes:
+        residual: (2 M,)
+    """
 
     def __init__(self, solution: Solution) -> None:
-        problem, state = solution.problem, solution.state
-        kinds = tuple(
-            kind.linearise(state, problem.columns) for kind in (problem.odometry, problem.readings, problem.prior)
-        )
-        jacobian, residual = stacked(kinds, problem.columns.n)
-        weights = [
-            np.repeat(losses_and_weights(loss, kind.residual)[1], kind.residual.shape[1])
-            for loss, kind in zip(solution.losses, kinds, strict=False)
-        ]
-        root = np.sqrt(np.concatenate([*weights, np.ones(len(kinds[2].residual))]))
+        problem = solution.problem
+        readings = problem.readings.linearise(solution.state, problem.columns)
+        jacobian, residual = stacked((readings,), problem.columns.n)
+        root = np.repeat(np.sqrt(losses_and_weights(solution.losses.readings, readings.residual)[1]), 2)
         self._jacobian = jacobian * root[:, None]
         self._factorisation = solution.factorisation
-        self._readings = slice(kinds[0].residual.size, kinds[0].residual.size + kinds[1].residual.size)
         self.residual = residual * root
 
-    def of(self, rows: FloatArray) -> FloatArray:
-        taken: FloatArray = self._jacobian @ self._factorisation.solve(self._jacobian.T @ rows)
-        return rows - taken
+    def left_over(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What remains of rows (2 M, k) once the estimate has taken its share, v - J H^-1 J^T v, and (k,) the squares.
 
-    def of_readings(self, rows: FloatArray) -> FloatArray:
-        """(M, 2), a view."""
-        return rows[self._readings].reshape(-1, 2)
+        The squares are those of all that is measured, not of readings alone: as v - J H^-1 J^T v is a projection they
+        are its product with v.
+        """
+        inner = self._jacobian.T @ rows
+        solved = self._factorisation.solve_many(inner)
+        return rows - self._jacobian @ solved, (rows**2).sum(axis=0) - (inner * solved).sum(axis=0)
 
 
-def _squares(readings: FloatArray, cell: IntArray) -> FloatArray:
-    """(4,) sums of squares: of both components reading by reading, then of their sums over cells."""
-    sums = [np.bincount(cell, readings[:, component]) for component in (0, 1)]
-    return np.array([*(readings**2).sum(axis=0), *(float(each @ each) for each in sums)])
+def _squares(readings: FloatArray, cells: sparse.csr_array) -> FloatArray:
+    """(4, k) sums of squares of readings (M, 2, k): of both components one by one, then of their sums over cells."""
+    sums = [cells @ readings[:, component] for component in (0, 1)]
+    return np.stack([*(readings**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
 
 
 def _solved(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:

@@ -5,7 +5,7 @@ Linearise all factors, eliminate the chains, meet in the border, substitute back
 Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -15,7 +15,7 @@ from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
 from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_build import build_arrowhead, build_skeleton
+from offline.arrowhead_build import build_arrowhead, build_skeleton, reweighed
 from offline.damping import Damping
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
 from offline.linearise_kernels import diagonal_square
@@ -82,6 +82,18 @@ class Problem:
     def skeleton(self) -> Skeleton:
         """The smaller problem for starting values."""
         return build_skeleton(self.arrowhead)
+
+    def reweighed(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
+        """The same factors with other whitenings, (M, 3, 3) and (N, 2, 2); the order of elimination is kept."""
+        other = replace(
+            self,
+            odometry=replace(self.odometry, whitening=odometry),
+            readings=replace(self.readings, whitening=readings),
+        )
+        vars(other)["arrowhead"] = reweighed(
+            self.arrowhead, other.odometry, other.readings
+        )  # where the property has it
+        return other
 
     @property
     def n_residuals(self) -> int:

@@ -14,24 +14,17 @@ should be (Helmert's method of 1907, as in Förstner and Wrobel, "Photogrammetri
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from scipy.linalg import hadamard
-from scipy.special import chdtri
 
 from calib.arrays import BoolArray, FloatArray
-from offline.factors import State, stacked, whitening
-from offline.solver import Problem, solve
+from offline.solver import Solution
+from offline.variance_look import Good, Looker, Part
 
 # Of a logarithm of sigma: a factor of ten either way is one such sigma.
 PRIOR_SIGMA: Final = float(np.log(10.0))
-# A residual beyond this is no noise but a fault, and says nothing of the noise; of good ones 0.1 % lie there.
-_FAULT: Final = 1e-3
-_MAX_FAULTS: Final = 0.1
-_N_SIGNS: Final = 16  # a power of two
-_SEED: Final = 11
 _MAX_ITERATIONS: Final = 12
 # As many squares as that leave a sigma uncertain by a third.
 LEAST_REDUNDANCY: Final = 5.0
@@ -39,47 +32,8 @@ _CONTRADICTED: Final = 3.0  # sigmas of the score
 _LONGEST_STEP: Final = 1.2  # of a logarithm of sigma, by the information
 _FAR: Final = 0.4  # of a logarithm of sigma: from there the information shows the way
 _SMALL_STEP: Final = 0.05  # of its own standard deviation
+_ENOUGH: Final = 0.1  # of that as well: what may be left after the last step
 _STEPS_AFRESH: Final = 4
-# Of the solves in between. The cost as a whole is level where a solve ends, but its parts are not: what they are off by
-# is its root.
-_COST_TOLERANCE: Final = 1e-4
-
-_Good = tuple[BoolArray, BoolArray]  # which motions and which readings are no faults
-
-
-@dataclass(frozen=True)
-class Components:
-    """How the covariances of one problem's factors follow from K variances.
-
-    Attributes:
-        odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
-        odometry_rest: (M, 3, 3) what is added whatever the variances.
-        readings: (K, N, 2, 2) and readings_rest: (N, 2, 2) likewise.
-    """
-
-    odometry: FloatArray
-    odometry_rest: FloatArray
-    readings: FloatArray
-    readings_rest: FloatArray
-
-    def weighed(self, problem: Problem, variances: FloatArray) -> Problem:
-        """The problem under variances (K,)."""
-        odometry = np.tensordot(variances, self.odometry, 1) + self.odometry_rest
-        readings = np.tensordot(variances, self.readings, 1) + self.readings_rest
-        return replace(
-            problem,
-            odometry=replace(problem.odometry, whitening=whitening(odometry)),
-            readings=replace(problem.readings, whitening=whitening(readings)),
-        )
-
-
-@dataclass(frozen=True)
-class Part:
-    """A problem, where its solve begins, and what its covariances are made of."""
-
-    problem: Problem
-    start: State
-    components: Components
 
 
 @dataclass(frozen=True)
@@ -93,14 +47,14 @@ class FittedVariances:
             logarithm, the prior's share taken off.
         told: (K,) whether the data say enough of it; else it stands where it began, or where they are more content
             with if that is more, unless they speak against that.
-        states: of the parts, solved under these sigmas.
+        solutions: of the parts under these sigmas.
     """
 
     sigma: FloatArray
     log_covariance: FloatArray
     redundancy: FloatArray
     told: BoolArray
-    states: tuple[State, ...]
+    solutions: tuple[Solution, ...]
     converged: bool
 
     def interval(self, quantile: float) -> tuple[FloatArray, FloatArray]:
@@ -137,7 +91,7 @@ def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | 
             search.look()
         converged &= search.run(told)
     return FittedVariances(
-        np.exp(search.log_sigma), search.covariance(), search.redundancy(), told, tuple(search.states), converged
+        np.exp(search.log_sigma), search.covariance(), search.redundancy(), told, search.solutions, converged
     )
 
 
@@ -152,32 +106,33 @@ class _Search:
     """
 
     def __init__(self, parts: Sequence[Part], log_sigma: FloatArray, least: FloatArray) -> None:
-        self._parts = parts
+        self._parts = [Looker(part) for part in parts]
         self._least = least
         self.middle = log_sigma
         self.log_sigma = np.maximum(log_sigma, least)
-        self.states = [part.start for part in parts]
         self.score = np.zeros(len(log_sigma))
         self.squares = np.zeros(len(log_sigma))
         self.expected = np.zeros(len(log_sigma))
         self.at_most = np.zeros(len(log_sigma))
         self.information = np.zeros((len(log_sigma), len(log_sigma)))
-        self._good: list[_Good] | None = None
+        self._good: list[Good] | None = None
 
     def look(self, *, afresh: bool = True) -> None:
         """Solves all parts under the sigmas as they are; what is a fault is looked at afresh or stays as it was."""
         good = self._good if self._good is not None and not afresh else [None] * len(self._parts)
-        seen = [
-            _look(part, state, np.exp(2.0 * self.log_sigma), each)
-            for part, state, each in zip(self._parts, self.states, good, strict=True)
-        ]
+        variances = np.exp(2.0 * self.log_sigma)
+        seen = [part.look(variances, each) for part, each in zip(self._parts, good, strict=True)]
         self._good = [each.good for each in seen]
-        self.states = [each.state for each in seen]
         self.squares = np.sum([each.squares for each in seen], axis=0)
         self.expected = np.sum([each.expected for each in seen], axis=0)
         self.at_most = np.sum([each.at_most for each in seen], axis=0)
         self.score = self.squares - self.expected
         self.information = np.sum([each.information for each in seen], axis=0)
+
+    @property
+    def solutions(self) -> tuple[Solution, ...]:
+        """Of the parts, where `look` looked last."""
+        return tuple(part.solution for part in self._parts)
 
     def covariance(self) -> FloatArray:
         """(K, K) of the logarithms, prior included."""
@@ -192,7 +147,7 @@ class _Search:
     def run(self, free: BoolArray) -> bool:
         """Moves the sigmas that are free (K,) on from where `look` looked until those stand of which the data tell.
 
-        False where they did not come to stand.
+        The last step is not looked at. False where they did not come to stand.
         """
         longest, before = np.full(len(free), _LONGEST_STEP), np.zeros(len(free))
         for n_steps in range(_MAX_ITERATIONS):
@@ -208,6 +163,9 @@ class _Search:
             # shrink.
             longest = np.where(step * before < 0.0, 0.5 * longest, longest)
             before = np.clip(step, -longest, longest)
+            if (_left_by(before, np.sqrt(np.diag(self.covariance())))[free & told] < _ENOUGH).all():
+                self.log_sigma = np.maximum(self.log_sigma + before, self._least)
+                return True
             # A residual that is a fault at one step and none at the next would keep the search from coming to an end.
             self._move(before, afresh=n_steps < _STEPS_AFRESH)
         return False
@@ -236,105 +194,10 @@ class _Search:
         self.look(afresh=afresh)
 
 
-class _Seen(NamedTuple):
-    """What one part says at given variances, by the logarithms of sigma.
+def _left_by(step: FloatArray, deviation: FloatArray) -> FloatArray:
+    """(K,) how far steps (K,) of a logarithm end from where they should, in its standard deviations.
 
-    Attributes:
-        squares: (K,) weighted squares of residuals that each sigma answers for; expected: (K,) what they should be;
-            at_most: (K,) what they would be if the estimate took nothing.
-        information: (K, K) average information.
-        good: what took part.
+    By their square, as the likelihood is no parabola; and since the average information differs from its curvature by
+    chance, as a share by some two deviations.
     """
-
-    state: State
-    squares: FloatArray
-    expected: FloatArray
-    at_most: FloatArray
-    information: FloatArray
-    good: _Good
-
-
-def _look(part: Part, start: State, variances: FloatArray, good: _Good | None) -> _Seen:
-    """Solves one part under variances (K,); `good` are no faults, where that is settled."""
-    problem = part.components.weighed(part.problem, variances)
-    solution = solve(problem, start, cost_tolerance=_COST_TOLERANCE)
-    odometry = problem.odometry.linearise(solution.state, problem.columns)
-    readings = problem.readings.linearise(solution.state, problem.columns)
-    jacobian, residual = stacked((odometry, readings), problem.columns.n)
-    good = good or (_no_fault(odometry.residual), _no_fault(readings.residual))
-    shares = (
-        _whitened(problem.odometry.whitening, part.components.odometry, variances, good[0]),
-        _whitened(problem.readings.whitening, part.components.readings, variances, good[1]),
-    )
-
-    def taken(vectors: FloatArray) -> FloatArray:
-        """What the estimate explains of whitened residuals (rows, n): J H^-1 J' vectors."""
-        inner = jacobian.T @ vectors
-        solved = np.stack([solution.factorisation.solve(column) for column in inner.T], axis=-1)
-        product: FloatArray = jacobian @ solved
-        return product
-
-    signs = _signs(len(residual))
-    left = _own_blocks_left(signs, taken(signs), odometry.residual.size)
-    expected = np.sum([np.einsum("kmij,mij->k", share, own) for share, own in zip(shares, left, strict=True)], axis=0)
-    force = np.concatenate(
-        [
-            (share @ kind.residual[..., None]).reshape(len(variances), -1)
-            for share, kind in zip(shares, (odometry, readings), strict=True)
-        ],
-        axis=1,
-    )
-    at_most = np.sum([np.einsum("kmii->k", share) for share in shares], axis=0)
-    information = _positive(2.0 * force @ (force.T - taken(force.T)))
-    return _Seen(solution.state, force @ residual, expected, at_most, information, good)
-
-
-def _signs(n: int) -> FloatArray:
-    """(n, _N_SIGNS) random, and such that the products of two rows nearer than _N_SIGNS sum to nothing."""
-    random = np.random.default_rng(_SEED).choice([-1.0, 1.0], (n, 1))
-    signs: FloatArray = random * hadamard(_N_SIGNS)[np.arange(n) % _N_SIGNS]
-    return signs
-
-
-def _own_blocks_left(signs: FloatArray, explained: FloatArray, n_odometry: int) -> tuple[FloatArray, FloatArray]:
-    """Estimates (M, 3, 3) and (N, 2, 2) of what the estimate leaves of each factor's whitened covariance.
-
-    Args:
-        signs: (rows, n) as `_signs` has them.
-        explained: (rows, n) what the estimate explains of them.
-        n_odometry: how many of the rows belong to motions.
-    """
-    blocks = []
-    for rows, size in ((slice(0, n_odometry), 3), (slice(n_odometry, None), 2)):
-        before, after = (each[rows].reshape(-1, size, _N_SIGNS) for each in (signs, explained))
-        blocks.append(np.eye(size) - np.einsum("mid,mjd->mij", before, after) / _N_SIGNS)
-    return blocks[0], blocks[1]
-
-
-def _positive(matrix: FloatArray) -> FloatArray:
-    """The nearest symmetric matrix without negative eigenvalues; faults left out of a few terms can cause them."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    nearest: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return nearest
-
-
-def _whitened(whitening: FloatArray, unit: FloatArray, variances: FloatArray, good: BoolArray) -> FloatArray:
-    """Shares (K, M, n, n) from unit covariances (K, M, n, n); zero for factors that are faults."""
-    matrices = np.where(good[:, None, None], whitening, 0.0)
-    turned = np.ascontiguousarray(matrices.swapaxes(-1, -2))
-    shares = np.zeros_like(unit)
-    for share, each, variance in zip(shares, unit, variances.tolist(), strict=True):
-        if each.any():
-            np.multiply(variance, matrices @ each @ turned, out=share)
-    return shares
-
-
-def _no_fault(residual: FloatArray) -> BoolArray:
-    """(M,) which whitened residuals (M, n) may be noise; all, where the sigmas are so far off that many look bad."""
-    if not len(residual):
-        return np.zeros(0, dtype=np.bool_)
-    n = residual.shape[1]
-    square = (residual**2).sum(axis=1)
-    level = max(1.0, float(np.median(square)) / float(chdtri(n, 0.5)))
-    good: BoolArray = square <= level * chdtri(n, _FAULT)
-    return good if good.mean() > 1.0 - _MAX_FAULTS else np.ones(len(good), dtype=np.bool_)
+    return step**2 / deviation + 2.0 * np.abs(step)

@@ -102,6 +102,10 @@ def test_steps_and_covariances_equal_dense_algebra(
     factorisation = arrowhead_of(problem).factorise(system, damping)
     step, expected = factorisation.solve(g), np.linalg.solve(H, g)
     assert np.linalg.norm(step - expected) <= allowed(condition) * np.linalg.norm(expected)
+    several = factorisation.solve_many(np.column_stack([g, np.roll(g, 1), -g]))
+    for one, column in zip(several.T, (g, np.roll(g, 1), -g), strict=True):
+        alone = factorisation.solve(column)
+        assert np.linalg.norm(one - alone) <= allowed(condition) * np.linalg.norm(alone)
     wanted = np.random.default_rng(seed).permutation(len(g))[:40]
     inverse = np.linalg.inv(H)
     covariance = inverse[np.ix_(wanted, wanted)]

@@ -104,3 +104,19 @@ def test_robust_losses_bound_what_a_wrong_reading_does(loss: Loss) -> None:
     bent = np.abs(solve(wrong, fleet.truth, losses=PLAIN).state.tags - clean).max()
     robust = np.abs(solve(wrong, fleet.truth, losses=Losses(SQUARES, loss)).state.tags - clean).max()
     assert robust < 0.5 * bent
+
+
+def test_other_weights_on_the_same_factors_solve_like_a_new_problem() -> None:
+    problem, truth = made_graph(6, [60, 40], 6, calibrated=True)
+    rng = np.random.default_rng(0)
+    problem = reordered(problem, rng)
+    odometry = problem.odometry.whitening * rng.uniform(0.5, 2.0, (len(problem.odometry.first), 1, 1))
+    readings = problem.readings.whitening * rng.uniform(0.5, 2.0, (len(problem.readings.tag), 1, 1))
+    anew = replace(
+        problem,
+        odometry=replace(problem.odometry, whitening=odometry),
+        readings=replace(problem.readings, whitening=readings),
+    )
+    found, expected = solve(problem.reweighed(odometry, readings), truth), solve(anew, truth)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    np.testing.assert_allclose(found.state.tags, expected.state.tags, atol=1e-9)
