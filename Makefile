@@ -38,7 +38,7 @@ format: $(READY)
 # The site: the commands' page from the programs, then everything, from disk.
 docs: $(READY)
 	$(BIN)/python docs/site/commands.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/mkdocs build --strict --quiet
 
 # Those of README and docs, anew; the second needs Debian's Chromium.
 pictures: demo

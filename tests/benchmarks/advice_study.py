@@ -89,7 +89,10 @@ def with_candidate(scene: Scene, wanted: Pass | Place, seed: int) -> list[LocalM
         return [*scene.maps, solve_local_map(_driven_again(rng, scene.drive(wanted.chain), wanted))]
     true_m = se2.apply(_T_town_map_at(scene, wanted), wanted.position_m)
     face = se2.apply(_T_town_map_at(scene, wanted), _sensor(scene, wanted)[:2]) - true_m
-    return [solve_local_map(_past_new_tag(rng, scene, drive, true_m, face)) for drive in scene.drives]
+    chains = [_past_new_tag(rng, scene, drive, true_m, face) for drive in scene.drives]
+    return [
+        each if chain is each.chain else solve_local_map(chain) for chain, each in zip(chains, scene.maps, strict=True)
+    ]
 
 
 def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pass | Place]:
