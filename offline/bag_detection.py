@@ -37,7 +37,8 @@ def detect_in_bag(
             read, or no detector is installed.
     """
     clock = BagClock(bag.path, options)
-    settings = DetectorSettings(tuple(robot.recorder.families), robot.recorder.detector, quad_decimate=1.0)
+    families = tuple(robot.recorder.families)
+    settings = DetectorSettings(families, robot.recorder.detector, quad_decimate=1.0, camera=camera)
     found: dict[int, Entry] = {}
     unusable, n_processes = [], os.cpu_count() or 1
     with detectors(settings, n_processes) as (detect, library, described):

@@ -5,7 +5,7 @@ import queue
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -13,12 +13,14 @@ from typing import Final
 
 import numpy as np
 
+from calib.errors import GroundsbotError
 from calib.picture_bytes import claimed_size
 from calib.robot import parse_robot_yaml
 from offline.errors import OfflineError
 from offline.new_log import new_log
 from offline.stages import Progress
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings, Picture
+from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
 from onboard.log_reader import read_head, read_log
 from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
@@ -26,6 +28,7 @@ from onboard.log_writer import LogWriter
 from onboard.measurements import detections_message
 from onboard.messages import (
     TOPICS,
+    CameraCalibration,
     CompressedImage,
     Event,
     EventKind,
@@ -104,12 +107,17 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
 
 
 def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
-    run = read_head(log).get("/run")
+    head = read_head(log)
+    run, calibration = head.get("/run"), head.get("/camera/calibration")
     if not isinstance(run, RunInfo):
         raise OfflineError(f"{log}: what says whose run it is, is damaged; salvage it first")
     recorder = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").recorder
     families = options.families or tuple(recorder.families)
-    return DetectorSettings(families, options.library or recorder.detector, options.quad_decimate)
+    camera = None
+    if isinstance(calibration, CameraCalibration):
+        with suppress(GroundsbotError):  # mapping says what is wrong with it; tags are found without
+            camera = camera_from_message(calibration)
+    return DetectorSettings(families, options.library or recorder.detector, options.quad_decimate, camera=camera)
 
 
 @dataclass

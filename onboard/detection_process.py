@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera_model import CameraModel
 from calib.picture_bytes import is_jpeg
 from onboard.errors import OnboardError
 from onboard.picture import decode, decode_grey, encode_jpeg, to_grey
@@ -36,10 +37,11 @@ class DetectorSettings:
     library: str = "pupil-apriltags"
     quad_decimate: float = 2.0
     jpeg_quality: int = 90
+    camera: CameraModel | None = None
 
     def make(self) -> TagDetector:
         """The detector, in this process."""
-        return TagDetector(self.families, self.library, self.quad_decimate)
+        return TagDetector(self.families, self.library, self.quad_decimate, camera=self.camera)
 
 
 class DetectionResult(NamedTuple):

@@ -57,7 +57,9 @@ class RobotFiles:
     def detector_settings(self) -> DetectorSettings:
         """How to detect."""
         options = self.robot.recorder
-        return DetectorSettings(tuple(options.families), options.detector, options.quad_decimate, options.jpeg_quality)
+        return DetectorSettings(
+            tuple(options.families), options.detector, options.quad_decimate, options.jpeg_quality, self.camera
+        )
 
 
 def capture_settings(path: Path, size: str | None) -> CameraSettings:

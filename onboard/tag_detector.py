@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.arrays import FloatArray
+from calib.camera_model import CameraModel
+from calib.tag_family import tag_bits
+from onboard.corner_refinement import refined_corners
 from onboard.errors import OnboardError
 
 SMALLEST_SIDE_PX: Final = 32  # the libraries crash on empty and tiny pictures
@@ -49,6 +52,9 @@ class TagDetector:
         library: str = "pupil-apriltags",
         quad_decimate: float = 2.0,
         threads: int = 1,
+        *,
+        camera: CameraModel | None = None,
+        refine: bool = True,
     ) -> None:
         """Loads the library.
 
@@ -58,6 +64,8 @@ class TagDetector:
             quad_decimate: 2 looks for tags in a picture of half the size: about eight times as fast, and tags under
                 about 27 px are missed.
             threads: within the library.
+            camera: whose pictures these are, for the bends that its lens gives to a tag's sides; None: not known.
+            refine: sharpens corners on the picture (`onboard.corner_refinement`).
 
         Raises:
             OnboardError: neither library is there, or a family or the library is unknown.
@@ -67,7 +75,11 @@ class TagDetector:
             raise OnboardError(f"recorder.families: {unknown or 'none'} cannot be detected; use {', '.join(_FAMILIES)}")
         name = _installed(library)
         self.library = f"{name} {importlib.metadata.version(name)}"
-        self.settings = f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads}"
+        corners = "library" if not refine else "sides" if camera is None else "sides,lens"
+        self.settings = (
+            f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads} corners={corners}"
+        )
+        self._camera, self._refine = camera, refine
         # One for each family: given several, pupil-apriltags looks for the first only.
         self._detectors = [(family, _kept_detector(name, family, quad_decimate, threads)) for family in families]
 
@@ -88,7 +100,18 @@ class TagDetector:
             for family, detector in self._detectors
             for each in detector.detect(grey)
         ]
+        if self._refine:
+            found = self._sharpened(grey, found)
         return sorted(found, key=lambda each: (each.family, each.tag_id, *each.corners_px[0]))
+
+    def _sharpened(self, grey: NDArray[np.uint8], found: list[Detection]) -> list[Detection]:
+        """Those whose sides can be told from the picture, with the corners that follow from these."""
+        camera = self._camera
+        if camera is not None and grey.shape != (camera.height_px, camera.width_px):
+            camera = None
+        cells = np.array([len(tag_bits(each.family, each.tag_id)) for each in found], dtype=np.int64)
+        corners_px, _ = refined_corners(grey, np.array([each.corners_px for each in found]), cells, camera)
+        return [each._replace(corners_px=corners) for each, corners in zip(found, corners_px, strict=True)]
 
 
 def _our_corners(corners: FloatArray) -> FloatArray:
