@@ -202,7 +202,7 @@ def test_pictures_of_a_bag_give_what_the_detector_finds_in_them(tmp_path: Path, 
         drawn = draw_tag("tag36h11", 7, corners_px, (PICTURES.height_px, PICTURES.width_px))
         picture = drawn + np.random.default_rng(number).integers(0, 3, drawn.shape, np.uint8)
         made.picture(form, picture, stamp_ns)
-        (found,) = TagDetector(quad_decimate=1.0).detect(picture)
+        (found,) = TagDetector(quad_decimate=1.0, camera=PICTURES).detect(picture)
         np.testing.assert_allclose(found.corners_px, corners_px, atol=0.5)
         expected.append((stamp_ns, found.corners_px.ravel().tolist()))
     report = imported(made.write(tmp_path / "drive"), tmp_path)
