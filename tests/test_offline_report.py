@@ -452,3 +452,11 @@ def test_it_prints(window: Page, made: Path) -> None:
     assert 2 <= len(printed) <= 8
     for part in ("became one map of 4 tags", "Before merging", "Calibration"):
         assert part in " ".join(text.split())
+
+
+def test_figures_follow_the_window_and_overlap_nothing(window: Page, made: Path) -> None:
+    window.open(made / "report.html", wide=1200)
+    window.call("Emulation.setDeviceMetricsOverride", width=800, height=2500, deviceScaleFactor=1, mobile=False)
+    drawn = "[...document.querySelectorAll('.plot')].map((each) => [each, each.querySelector('.main-svg')])"
+    window.wait_for(f"{drawn}.every(([each, svg]) => svg.clientWidth === each.clientWidth && svg.clientWidth < 800)")
+    assert window.look(f"{drawn}.every(([each, svg]) => svg.clientHeight <= each.clientHeight)")

@@ -4,7 +4,7 @@
   const CHI2_95 = Math.sqrt(5.991464547107979); // of two degrees of freedom
   const STEPS = 36;
   // No button may send a map anywhere.
-  const CONFIG = { responsive: true, displaylogo: false, scrollZoom: true, showSendToCloud: false, plotlyServerURL: "",
+  const CONFIG = { displaylogo: false, scrollZoom: true, showSendToCloud: false, plotlyServerURL: "",
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
   const STILL = { ...CONFIG, scrollZoom: false };
   const PAPER_PX = 690; // between the margins of A4 and of Letter
@@ -21,13 +21,17 @@
       tickcolor: colour("--rule"), ...extra };
   }
 
-  function layout(extra) {
+  function layout(element, extra) {
     return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      font: { color: colour("--front"), family: "system-ui, sans-serif", size: 12 }, width: printing ? PAPER_PX : undefined,
+      font: { color: colour("--front"), family: "system-ui, sans-serif", size: 12 }, width: widthOf(element),
       modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--quiet"), activecolor: colour("--front") },
       hoverlabel: { align: "left", bgcolor: colour("--panel"), bordercolor: colour("--rule"),
         font: { color: colour("--front") } },
       margin: { l: 50, r: 12, t: 12, b: 44 }, ...extra };
+  }
+
+  function widthOf(element) {
+    return printing ? PAPER_PX : element.clientWidth;
   }
 
   function extent(traces) {
@@ -45,11 +49,11 @@
   // So that metres are as long along both axes without much empty room.
   function plan(element, traces) {
     const { wide, high } = extent(traces);
-    const width = printing ? PAPER_PX : element.clientWidth;
+    const width = widthOf(element);
     const entries = traces.filter((trace) => trace.showlegend !== false).map((trace) => 60 + 7 * trace.name.length);
     const legend = Math.ceil(1.25 * entries.reduce((sum, entry) => sum + entry, 0) / width);
     const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
-    return layout({ height, dragmode: "pan", hovermode: "closest",
+    return layout(element, { height, dragmode: "pan", hovermode: "closest",
       legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0 },
       margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
       xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
@@ -199,7 +203,7 @@
     }
     const gaps = line.gaps.map(([x0, x1]) => ({ type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1,
       fillcolor: colour("--quiet"), opacity: 0.3, line: { width: 0 }, layer: "below" }));
-    return Plotly.react(element, traces, layout({ height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
+    return Plotly.react(element, traces, layout(element, { height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
       dragmode: "zoom",
       xaxis: axis({ title: { text: "seconds since the run's start", standoff: 4 }, anchor: "y" }),
       yaxis: axis({ title: { text: "sigmas" }, domain: [0, 0.3], rangemode: "tozero" }),
@@ -231,6 +235,12 @@
     });
   }
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+  // Plotly's own way to follow the window gives figures a height that overlaps what comes below.
+  let later = 0;
+  addEventListener("resize", () => {
+    clearTimeout(later);
+    later = setTimeout(() => printing || drawAll(), 100);
+  });
   addEventListener("beforeprint", () => {
     printing = true;
     for (const details of document.querySelectorAll("details")) details.open = true;
