@@ -18,8 +18,10 @@ _STYLE: Final = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; margin: 2em auto; max-width: 1180px; padding: 0 1em; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.1em; margin: 1.6em 0 .4em; }
 .pair { display: flex; flex-wrap: wrap; gap: 2em; } figure { margin: 0; } figcaption { color: #555; max-width: 560px; }
+svg { max-width: 100%; height: auto; }
 table { border-collapse: collapse; } td, th { padding: .15em .8em .15em 0; text-align: right; font-weight: normal; }
-th { color: #555; border-bottom: 1px solid #ccc; } td:first-child, th:first-child, td.words { text-align: left; }
+th { color: #555; border-bottom: 1px solid #ccc; }
+td:first-child, th:first-child, .words { text-align: left; }
 tr.out td { color: #a33; } .bar { display: inline-block; height: .7em; background: #47a; }
 """
 
@@ -40,11 +42,13 @@ def _map_figure(result: Calibration) -> str:
     grid, expected = error_map(result)
     height = round(_WIDTH_PX * result.model.height_px / result.model.width_px)
     low, high = float(np.nanmin(expected)), float(np.nanmax(expected))
-    share = np.log(np.nan_to_num(expected, nan=low) / low) / max(np.log(high / low), 1e-9)
+    share = np.log(np.nan_to_num(expected, nan=high) / low) / max(np.log(high / low), 1e-9)
     coloured = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    coloured[~np.isfinite(expected)] = 128
     large = cv2.resize(coloured, (_WIDTH_PX, height), interpolation=cv2.INTER_CUBIC)
+    imaged = np.isfinite(expected)
+    large[cv2.resize(imaged.astype(np.uint8), (_WIDTH_PX, height), interpolation=cv2.INTER_NEAREST) == 0] = 128
     encoded = base64.b64encode(cv2.imencode(".png", large)[1].tobytes()).decode()
+    outside = "" if imaged.all() else " Grey: the lens has no image there."
     scale = _WIDTH_PX / result.model.width_px
     labels = []
     rows, columns = expected.shape
@@ -55,11 +59,11 @@ def _map_figure(result: Calibration) -> str:
                 x, y = (grid.pixels[at] + 0.5) * scale
                 labels.append(f"<text x='{x:.0f}' y='{y + 4:.0f}'>{expected[at]:.2g}</text>")
     return (
-        f"<figure><svg width='{_WIDTH_PX}' height='{height}' font-size='12' text-anchor='middle' fill='white' "
-        f"stroke='black' stroke-width='2' paint-order='stroke'>"
+        f"<figure><svg width='{_WIDTH_PX}' height='{height}' viewBox='0 0 {_WIDTH_PX} {height}' font-size='12' "
+        "text-anchor='middle' fill='white' stroke='black' stroke-width='2' paint-order='stroke'>"
         f"<image href='data:image/png;base64,{encoded}' width='{_WIDTH_PX}' height='{height}'/>{''.join(labels)}</svg>"
         f"<figcaption>How many pixels a prediction may be off (RMS), after the best rotation: {low:.2g} to {high:.2g}."
-        "</figcaption></figure>"
+        f"{outside}</figcaption></figure>"
     )
 
 
@@ -72,7 +76,8 @@ def _views_figure(result: Calibration) -> str:
         for x, y in (view.corners.pixels + 0.5) * scale:
             dots.append(f"<circle cx='{x:.1f}' cy='{y:.1f}' r='1.6' fill='{colour}'/>")
     return (
-        f"<figure><svg width='{_WIDTH_PX}' height='{height}' style='background:#f4f4f0'>{''.join(dots)}</svg>"
+        f"<figure><svg width='{_WIDTH_PX}' height='{height}' viewBox='0 0 {_WIDTH_PX} {height}' "
+        f"style='background:#f4f4f0'>{''.join(dots)}</svg>"
         f"<figcaption>Corners seen, in {int(result.lens.views.sum())} views that were used (blue) and "
         f"{int((~result.lens.views).sum())} that were not (red).</figcaption></figure>"
     )
@@ -84,7 +89,7 @@ def _parameters_table(result: Calibration) -> str:
         f"<tr><td>{name}</td><td>{value:.6g}</td><td>{sigma:.2g}</td></tr>"
         for name, value, sigma in zip(estimate.parameters, values, estimate.sigmas, strict=True)
     )
-    scores = ", ".join(f"{kind} {np.sqrt(0.5 * score):.4f} px" for kind, score in result.scores.items())
+    scores = ", ".join(f"{kind} {np.sqrt(0.5 * score):.2g} px" for kind, score in result.scores.items())
     tried = f"<p>RMS in views left out of the fit: {scores}.</p>" if len(result.scores) > 1 else ""
     return (
         f"<h2>{result.model.distortion_model}, {result.model.width_px}x{result.model.height_px}</h2>{tried}"
@@ -96,7 +101,7 @@ def _views_table(result: Calibration) -> str:
     rows = "".join(_view_rows(result))
     return (
         "<h2>Views</h2><table><tr><th>view</th><th>corners</th><th>used</th><th>residual px</th><th>blur px</th>"
-        f"<th></th></tr>{rows}</table>"
+        f"<th class='words'>residual, or why it was not used</th></tr>{rows}</table>"
     )
 
 
