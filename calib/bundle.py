@@ -229,36 +229,44 @@ def board_pose(
     """R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane; None where no pose explains them.
 
     A plane has two poses that explain it nearly as well as each other: `rank` 0 is the better one.
-
-    The pose is looked for by a camera without distortion that looks towards the board: far off the axis of a fisheye
-    a plane at z = 1 stretches all errors, and the board's own origin may lie behind the camera.
     """
-    rays = model.unproject(pixels)
+    poses = planar_poses(points_m, model.unproject(pixels))
+    return poses[rank] if rank < len(poses) else None
+
+
+def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """The poses T_camera_board, R `[3, 3]` and t `[3]`, that explain corners on a plane, best first; two at most.
+
+    They are looked for by a camera without distortion that looks towards the board: far off the axis of a fisheye
+    a plane at z = 1 stretches all errors, and the board's own origin may lie behind the camera.
+
+    Args:
+        points_m: `[N, 3]` corners on the board, z = 0.
+        rays: `[N, 3]` towards them; NaN where the lens has none.
+    """
     good = np.isfinite(rays).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
-        return None
+        return []
     toward = rays[good].mean(axis=0)
     turn = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), toward[np.newaxis])[0]
     turned = turn.apply(rays[good])
     if turned[:, 2].min() < _LEAST_COSINE:
-        return None
+        return []
     try:
         found, turns, places, errors = cv2.solvePnPGeneric(
             points_m[good], turned[:, :2] / turned[:, 2:], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
         )
     except cv2.error:
-        return None
+        return []
     if not found:
-        return None
-    order = np.argsort([float(np.asarray(error).ravel()[0]) for error in errors], kind="stable")
-    if rank >= len(order):
-        return None
-    best = int(order[rank])
-    place = np.asarray(places[best], dtype=np.float64).ravel()
-    if not np.isfinite(place).all():
-        return None
-    back = turn.inv()
-    return (back * Rotation.from_rotvec(np.asarray(turns[best]).ravel())).as_matrix(), back.apply(place)
+        return []
+    back, poses = turn.inv(), []
+    for i in np.argsort([float(np.asarray(error).ravel()[0]) for error in errors], kind="stable").tolist():
+        place = np.asarray(places[i], dtype=np.float64).ravel()
+        if np.isfinite(place).all():
+            rotation = (back * Rotation.from_rotvec(np.asarray(turns[i]).ravel())).as_matrix()
+            poses.append((rotation, back.apply(place)))
+    return poses
 
 
 def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:

@@ -9,6 +9,7 @@ from calib.command_line import EXIT_WITH_LOSSES, new_app
 from calib.command_line import run as run_program
 from calib.errors import GroundsbotError
 from offline.export_options import ExportFormat, ExportOptions
+from offline.map_model import MapModel
 
 app = new_app("Turns run logs into one map of tags and trajectories, and tells what is in them.")
 
@@ -126,6 +127,12 @@ def map_command(
     keep_suspects: Annotated[
         bool, typer.Option("--keep-suspects", help="Name tags that do not belong, but keep them as one tag each.")
     ] = False,
+    model: Annotated[
+        MapModel,
+        typer.Option(
+            help="What the map is solved on last: tags' corners in pixels, or their places on the floor only."
+        ),
+    ] = MapModel.FLOOR,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
@@ -139,7 +146,17 @@ def map_command(
     """
     from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
-    options = MapOptions(logs, output, robot or (), noise, overwrite, start or (), distance or (), keep_suspects)
+    options = MapOptions(
+        logs,
+        output,
+        robot or (),
+        noise,
+        overwrite,
+        start or (),
+        distance or (),
+        keep_suspects,
+        corners=model is MapModel.CORNERS,
+    )
     result, costs = make_map(options)
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))

@@ -1,17 +1,23 @@
 """The solved graph as plain edges between poses and tags, for other tools to read."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray
+from offline.factors import State
 from offline.graph import Graph
 from offline.result import GraphEdges
 from offline.robust import losses_and_weights
 from offline.solver import Solution
 
 
-def edges_of(graph: Graph, solution: Solution) -> GraphEdges:
+def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> GraphEdges:
     """Motions and tag places with the solved calibration put in, so that the solution is their least squares.
+
+    A solution refined on corners pulls on headings too, which edges between places cannot say. There the edges are what
+    the refined map itself has, with the information that they have without corners.
 
     A reading is turned into a place in base such that it pulls on pose and tag as it did in the solve: the place lies
     off where the state has the tag by what the reading's residual amounts to there. For (x, y) that is the reading
@@ -25,7 +31,7 @@ def edges_of(graph: Graph, solution: Solution) -> GraphEdges:
     in_base = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
     _, motion_weight = losses_and_weights(solution.losses.odometry, odometry.residual(state))
     _, place_weight = losses_and_weights(solution.losses.readings, residual)
-    return GraphEdges(
+    edges = GraphEdges(
         first=odometry.first,
         motion=odometry.expected(state),
         motion_information=_information(odometry.scaled_whitening(state), motion_weight),
@@ -33,6 +39,13 @@ def edges_of(graph: Graph, solution: Solution) -> GraphEdges:
         tag=readings.tag,
         place_m=in_base - np.linalg.solve(by_place, residual[..., None])[..., 0],
         place_information=_information(by_place, place_weight),
+    )
+    if refined is None:
+        return edges
+    return replace(
+        edges,
+        motion=se2.between(refined.poses[odometry.first], refined.poses[odometry.first + 1]),
+        place_m=se2.apply(se2.inverse(refined.poses[readings.pose]), refined.tags[readings.tag]),
     )
 
 

@@ -7,14 +7,24 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from calib.robot import Mount
+from offline.corner_map import Refined
+from offline.corner_solver import CornerSolution
 from offline.edges import edges_of
 from offline.factors import State
 from offline.graph import Graph, Parameter, build_graph
 from offline.local_map import LocalMap
+from offline.map_model import MapModel
 from offline.measured import Measurements
 from offline.measured_map import with_measurements
 from offline.merge import Group
-from offline.result import CalibrationResult, Component, RunResult, StartToStart, TagResult
+from offline.result import (
+    CalibrationResult,
+    Component,
+    RunResult,
+    StartToStart,
+    TagPose,
+    TagResult,
+)
 from offline.run import TagKey
 from offline.solver import Solution, solve
 from offline.stages import Stages
@@ -39,16 +49,17 @@ def solve_global_map(
         return graph, solve(graph.problem, start)
 
 
-def component_of(graph: Graph, solution: Solution) -> Component:
-    """Typed results with covariances, in the frame of the first chain's start."""
-    state = solution.state
+def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
+    """Typed results with covariances, in the frame of the first chain's start; refined on corners where they are."""
+    last = refined.solution if refined else solution
+    state, columns = last.state, last.problem.columns
     starts = graph.first_pose
-    columns = graph.problem.columns
-    joint = solution.covariance(np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)]))
+    joint = last.covariance(np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)]))
     joint = _in_map_axes(joint, state.poses[starts, 2])
     n_starts = 3 * len(starts)
     runs = tuple(
-        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(len(graph.chains))
+        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mount_of(state, i))
+        for i in range(len(graph.chains))
     )
     tag_covariances = [
         joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2]
@@ -57,24 +68,25 @@ def component_of(graph: Graph, solution: Solution) -> Component:
     return Component(
         frame_run=graph.chains[0].name,
         runs=runs,
-        tags=_tag_results(graph, state, tag_covariances),
+        tags=_tag_results(graph, state, tag_covariances, refined.tag_poses if refined else [None] * len(graph.tags)),
         joint_covariance=joint,
-        cost=solution.cost,
-        n_residuals=graph.problem.n_residuals,
+        cost=last.cost,
+        n_residuals=last.problem.n_residuals,
         start_to_start=_start_to_start(runs, joint),
-        edges=edges_of(graph, solution),
+        edges=edges_of(graph, solution, refined.solution.state if refined else None),
+        model=MapModel.CORNERS if refined else MapModel.FLOOR,
     )
 
 
-def calibration_of(graph: Graph, solution: Solution, component: int) -> list[CalibrationResult]:
+def calibration_of(
+    parameters: Sequence[Parameter], solution: Solution | CornerSolution, component: int
+) -> list[CalibrationResult]:
     """What the solve found for the calibration numbers it carried."""
-    columns = graph.problem.columns.calibration
+    columns = solution.problem.columns.calibration
     sigmas = np.sqrt(np.diag(solution.covariance(columns)))
     return [
         CalibrationResult(parameter.owner, parameter.name, component, float(value), float(sigma), parameter.sigma)
-        for parameter, value, sigma, column in zip(
-            graph.parameters, solution.state.calibration, sigmas, columns, strict=True
-        )
+        for parameter, value, sigma, column in zip(parameters, solution.state.calibration, sigmas, columns, strict=True)
         if column >= 0
     ]
 
@@ -107,10 +119,9 @@ def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArra
     return turned
 
 
-def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray) -> RunResult:
+def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mount: Mount | None) -> RunResult:
     chain = graph.chains[index]
     poses = graph.poses_of(state, index)
-    mount = graph.mount_of(state, index)
     return RunResult(
         name=chain.name,
         run=chain.run.name,
@@ -132,7 +143,9 @@ def _components(mount: Mount) -> FloatArray:
     return np.concatenate([place_m, turn.as_quat(canonical=True)])
 
 
-def _tag_results(graph: Graph, state: State, covariances: Sequence[FloatArray]) -> tuple[TagResult, ...]:
+def _tag_results(
+    graph: Graph, state: State, covariances: Sequence[FloatArray], poses: Sequence[TagPose | None]
+) -> tuple[TagResult, ...]:
     results = []
     for i, (tag, n) in enumerate(zip(graph.tags, graph.n_readings().tolist(), strict=True)):
         seen_by = [chain for chain in graph.chains if tag in chain.tags]
@@ -148,6 +161,7 @@ def _tag_results(graph: Graph, state: State, covariances: Sequence[FloatArray]) 
                 covariance=covariances[i],
                 n_observations=n,
                 runs=tuple(chain.name for chain in seen_by),
+                pose=poses[i],
             )
         )
     return tuple(results)

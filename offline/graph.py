@@ -75,7 +75,7 @@ class Graph:
         run = self.chains[chain].run
         if run.camera is None:
             return None
-        parameters = [*_mount_parameters(run.robot), *_camera_parameters(self.chains[chain])]
+        parameters = [*mount_parameters_of(run.robot), *camera_parameters_of(self.chains[chain])]
         found = state.calibration[_indices(self.parameters, parameters)].tolist()
         corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
         mount = run.robot.mount.model_dump()
@@ -87,7 +87,7 @@ class Graph:
     def tag_scales(self, chain: int) -> IntArray:
         """Indices of the scales of all batches of tags that one chain read."""
         owner = self.chains[chain]
-        scales = sorted({_scale_parameter(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
+        scales = sorted({scale_parameter_of(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
         return _indices(self.parameters, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
@@ -177,13 +177,13 @@ def _reading_factors(
     for chain, start in zip(chains, first_pose, strict=True):
         readings = chain.readings
         own_tags = np.array([tag_index[t] for t in chain.tags], dtype=np.int64)
-        scales = np.array([parameters.index(_scale_parameter(chain, t)) for t in chain.tags], dtype=np.int64)
+        scales = np.array([parameters.index(scale_parameter_of(chain, t)) for t in chain.tags], dtype=np.int64)
         pose.append(start + readings.keyframe)
         tag.append(own_tags[readings.tag])
         by_camera = readings.in_camera[:, None]
         mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
-        mount_parameters.append(np.where(by_camera, _indices(parameters, _mount_parameters(chain.run.robot)), 0))
-        camera_parameters.append(np.where(by_camera, _indices(parameters, _camera_parameters(chain)), 0))
+        mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(chain.run.robot)), 0))
+        camera_parameters.append(np.where(by_camera, _indices(parameters, camera_parameters_of(chain)), 0))
         scale_parameter.append(scales[readings.tag])
     return ReadingFactors(
         pose=np.concatenate(pose),
@@ -201,9 +201,9 @@ def _reading_factors(
 
 def _parameters(chain: Chain) -> list[Parameter]:
     robot = chain.run.robot
-    found = _wheel_parameters(robot) + [_scale_parameter(chain, tag) for tag in chain.tags]
+    found = _wheel_parameters(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
     if chain.readings.in_camera.any():
-        found += _mount_parameters(robot) + _camera_parameters(chain)
+        found += mount_parameters_of(robot) + camera_parameters_of(chain)
     return [p for p in found if p != _NONE]
 
 
@@ -220,7 +220,7 @@ def _wheel_parameters(robot: Robot) -> list[Parameter]:
     ]
 
 
-def _mount_parameters(robot: Robot) -> list[Parameter]:
+def mount_parameters_of(robot: Robot) -> list[Parameter]:
     """In the order of MOUNT_PARAMETERS."""
     mount = robot.mount
     nominal = (mount.x_m, mount.y_m, mount.yaw_rad)
@@ -230,7 +230,7 @@ def _mount_parameters(robot: Robot) -> list[Parameter]:
     ]
 
 
-def _camera_parameters(chain: Chain) -> list[Parameter]:
+def camera_parameters_of(chain: Chain) -> list[Parameter]:
     """In the order of CAMERA_PARAMETERS; none of them is known to positions that somebody else worked out."""
     if not chain.readings.by_camera.any():
         return [_NONE] * len(CAMERA_PARAMETERS)
@@ -243,7 +243,7 @@ def _camera_parameters(chain: Chain) -> list[Parameter]:
     ]
 
 
-def _scale_parameter(chain: Chain, tag: TagKey) -> Parameter:
+def scale_parameter_of(chain: Chain, tag: TagKey) -> Parameter:
     """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
     robot = chain.run.robot
     if not any(batch.family == tag.family for batch in robot.tags):

@@ -44,6 +44,7 @@ class MapOptions:
     starts: Sequence[str] = ()
     distances: Sequence[str] = ()
     keep_suspects: bool = False
+    corners: bool = False
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -63,7 +64,14 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
         stages, workings = Stages(show), Workings()
         tape = TapeOptions(options.starts, options.distances)
         result = map_logs(
-            logs, robot_files, noise, stages, tape, keep_suspects=options.keep_suspects, workings=workings
+            logs,
+            robot_files,
+            noise,
+            stages,
+            tape,
+            keep_suspects=options.keep_suspects,
+            corners=options.corners,
+            workings=workings,
         )
         with folder_written_whole(options.output) as folder:
             _write_files(result, workings, folder, options.output, stages)

@@ -18,6 +18,7 @@ from calib.errors import CalibError
 from calib.files import written_whole
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
+from offline.map_model import MapModel
 from offline.result import (
     AdviceResult,
     AlignmentResult,
@@ -34,6 +35,7 @@ from offline.result import (
     RunResult,
     StartToStart,
     SuspectTag,
+    TagPose,
     TagResult,
 )
 from offline.trajectory_file import read_tum, write_tum
@@ -152,6 +154,7 @@ def _component_json(component: Component) -> dict[str, Any]:
         "frame_run": component.frame_run,
         "runs": [run.name for run in component.runs],
         "tags": [{"family": t.family, "tag_id": t.tag_id, "instance": t.instance} for t in component.tags],
+        "model": component.model,
         "cost": _plain(component.cost),
         "n_residuals": component.n_residuals,
     }
@@ -179,9 +182,10 @@ def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
         "tag_id": tag.tag_id,
         "instance": tag.instance,
         "size_m": _plain(tag.size_m),
-        "position_m": _plain(tag.position_m),
-        "quaternion_xyzw": None,
-        "covariance": _plain(tag.covariance),
+        "position_m": _plain(tag.position_m if tag.pose is None else np.append(tag.position_m, tag.pose.height_m)),
+        "quaternion_xyzw": None if tag.pose is None else _plain(tag.pose.quaternion_xyzw),
+        "covariance": _plain(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
+        "pose_covariance": None if tag.pose is None else _plain(tag.pose.covariance),
         "n_observations": tag.n_observations,
         "runs": list(tag.runs),
         "component": component,
@@ -271,8 +275,8 @@ def _tag_row(tag: TagResult) -> Sequence[str | int]:
         tag.tag_id,
         _decimal(tag.position_m[0]),
         _decimal(tag.position_m[1]),
-        "",  # height and direction are not estimated on the floor plan
-        "",
+        "" if tag.pose is None else _decimal(tag.pose.height_m),
+        "" if tag.pose is None else _decimal(tag.pose.yaw_rad),
         _decimal(sigma_x_m),
         _decimal(sigma_y_m),
         tag.n_observations,
@@ -323,6 +327,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
             if pair["a"] in names
         ),
         edges=_edges(f"{key}edges_", arrays),
+        model=MapModel(entry.get("model", MapModel.FLOOR)),
     )
 
 
@@ -356,11 +361,19 @@ def _tag(entry: dict[str, Any]) -> TagResult:
         tag_id=entry["tag_id"],
         instance=entry["instance"],
         size_m=entry["size_m"],
-        position_m=_array(entry["position_m"]),
-        covariance=_array(entry["covariance"]),
+        position_m=_array(entry["position_m"])[:2],
+        covariance=_array(entry["covariance"])[:2, :2],
         n_observations=entry["n_observations"],
         runs=tuple(entry["runs"]),
+        pose=_tag_pose(entry),
     )
+
+
+def _tag_pose(entry: dict[str, Any]) -> TagPose | None:
+    if entry["quaternion_xyzw"] is None:
+        return None
+    height_m = _number(entry["position_m"][2])
+    return TagPose(height_m, _array(entry["quaternion_xyzw"]), _array(entry["pose_covariance"]))
 
 
 def _alignment(entry: dict[str, Any]) -> AlignmentResult:

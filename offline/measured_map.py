@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.arrays import FloatArray
+from offline.corner_solver import CornerSolution
 from offline.factors import Linearised, State, whitening
 from offline.graph import Graph
 from offline.measured import MeasuredDistance, MeasuredStart, Measurements
@@ -52,11 +53,13 @@ def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
     return replace(graph, problem=replace(graph.problem, measured=measured))
 
 
-def judged(graph: Graph, solution: Solution, measurements: Measurements, component: int) -> list[MeasurementResult]:
+def judged(
+    graph: Graph, solution: Solution | CornerSolution, measurements: Measurements, component: int
+) -> list[MeasurementResult]:
     """What the component makes of the measurements that it uses."""
     starts, distances = _usable(graph, measurements)
     measured, state = graph.problem.measured, solution.state
-    by_start, by_distance = measured.linearise(state, graph.problem.columns)
+    by_start, by_distance = measured.linearise(state, solution.problem.columns)
     in_map = state.poses[measured.starts.pose], _lengths(measured.distances, state)
     told = _told(measurements.frame, starts, distances)
     rows = [(by_start, m) for m in range(len(starts))] + [(by_distance, m) for m in range(len(distances))]
@@ -116,7 +119,7 @@ def _names(graph: Graph) -> list[str]:
     return [chain.name for chain in graph.chains]
 
 
-def _off(kind: Linearised, m: int, solution: Solution) -> tuple[float | None, float]:
+def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:
     """How far a measurement lies from what all others say, in sigmas, and how far chance may put it.
 
     With S = J H^-1 J^T the share of the residual that the estimate took, r^T (I - S)^-1 r is that of a prediction

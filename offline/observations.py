@@ -61,6 +61,8 @@ class Readings:
         by_camera: (M, 2, 3) derivative of the value by CAMERA_PARAMETERS.
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
+        corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
+        corner_sigmas: (M,) how many times the noise's sigma such corners count with.
     """
 
     keyframe: IntArray
@@ -71,6 +73,8 @@ class Readings:
     by_camera: FloatArray
     polar: BoolArray
     in_camera: BoolArray
+    corners_px: FloatArray
+    corner_sigmas: FloatArray
 
     def __len__(self) -> int:
         """Number of readings."""
@@ -87,6 +91,8 @@ class Readings:
             self.by_camera[mask],
             self.polar[mask],
             self.in_camera[mask],
+            self.corners_px[mask],
+            self.corner_sigmas[mask],
         )
 
     def weighed(self, noise: NoiseParameters) -> "Readings":
@@ -99,7 +105,12 @@ class Readings:
         turn = root @ (sigmas[..., None] * np.linalg.inv(root))
         back = turn.swapaxes(-1, -2)
         parts = replace(self.parts, unit=turn @ self.parts.unit @ back, rest=turn @ self.parts.rest @ back)
-        return replace(self, covariance=turn @ self.covariance @ back, parts=parts)
+        return replace(
+            self,
+            covariance=turn @ self.covariance @ back,
+            parts=parts,
+            corner_sigmas=self.corner_sigmas * sigmas.max(axis=-1),
+        )
 
 
 def read_detections(
@@ -153,6 +164,8 @@ def read_detections(
             by_camera=_by_camera(run.robot, found.range_bearing[good], found.by_turn[good], twist[keyframe[good]]),
             polar=np.ones(int(good.sum()), dtype=np.bool_),
             in_camera=np.ones(int(good.sum()), dtype=np.bool_),
+            corners_px=corners_px[good],
+            corner_sigmas=np.ones(int(good.sum())),
         ),
         warnings,
     )
@@ -203,7 +216,16 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
     parts = _position_parts(range_m, modelled, covariance)
     unaffected = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
     readings = Readings(
-        keyframe, positions.tag, value, covariance, parts, unaffected, positions.polar | unknown, positions.in_camera
+        keyframe,
+        positions.tag,
+        value,
+        covariance,
+        parts,
+        unaffected,
+        positions.polar | unknown,
+        positions.in_camera,
+        corners_px=np.full((len(value), 4, 2), np.nan),
+        corner_sigmas=np.ones(len(value)),
     )
     if good.all():
         return readings, []
@@ -232,6 +254,8 @@ def joined(a: Readings, b: Readings) -> Readings:
         np.concatenate([a.by_camera, b.by_camera]),
         np.concatenate([a.polar, b.polar]),
         np.concatenate([a.in_camera, b.in_camera]),
+        np.concatenate([a.corners_px, b.corners_px]),
+        np.concatenate([a.corner_sigmas, b.corner_sigmas]),
     )
     return both.where(np.argsort(both.keyframe, kind="stable"))
 
@@ -343,4 +367,7 @@ def _no_readings() -> Readings:
     none = np.zeros((0, 2, 2))
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
     by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
-    return Readings(empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool)
+    corners_px, sigmas = np.zeros((0, 4, 2)), np.zeros(0)
+    return Readings(
+        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, sigmas
+    )

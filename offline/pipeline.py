@@ -8,6 +8,8 @@ from calib.noise import NoiseParameters
 from offline.advice import advise
 from offline.chain import Chain, chains_of
 from offline.checks import COMPARED, check_warnings, checks_of, metre_of
+from offline.corner_graph import has_corners
+from offline.corner_map import refine
 from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
@@ -49,6 +51,7 @@ def map_logs(
     prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
+    corners: bool = False,
     workings: Workings | None = None,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
@@ -61,6 +64,7 @@ def map_logs(
         tape: what somebody measured.
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
+        corners: the solved map is refined on the tags' corners, where logs have them.
         workings: takes what the map was made from.
 
     Raises:
@@ -79,7 +83,9 @@ def map_logs(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return build_map(runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects, workings=workings)
+    return build_map(
+        runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects, corners=corners, workings=workings
+    )
 
 
 def build_map(
@@ -90,6 +96,7 @@ def build_map(
     prior_noise: NoiseParameters = NoiseParameters(),
     *,
     keep_suspects: bool = False,
+    corners: bool = False,
     workings: Workings | None = None,
 ) -> MapResult:
     """As `map_logs`, from runs already read.
@@ -101,6 +108,7 @@ def build_map(
         tape: what somebody measured.
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
+        corners: the solved map is refined on the tags' corners, where logs have them.
         workings: takes what the map was made from.
 
     Raises:
@@ -128,7 +136,9 @@ def build_map(
     workings.maps += maps
     found = _Found()
     for members in merged.groups:
-        workings.solved.append(found.add(maps, members, measurements, stages, keep_suspects=keep_suspects))
+        workings.solved.append(
+            found.add(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
+        )
     named = {(each.family, each.tag_id) for each in found.suspects}
     measured = found.measured + unused(measurements, found.measured)
     warnings = [w for run in runs for w in run.warnings] + broken + [w for chain in chains for w in chain.warnings]
@@ -189,6 +199,7 @@ class _Found:
         stages: Stages,
         *,
         keep_suspects: bool,
+        corners: bool,
     ) -> Solved:
         """Solves one more component, tags that do not belong apart unless they are kept, and takes what it says."""
         index = len(self.components)
@@ -200,10 +211,16 @@ class _Found:
         graph, solution = searched.graph, searched.solution
         if keep_suspects and suspects:
             graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
+        refined = None
+        if corners and has_corners(graph):
+            with stages.stage("refining on tag corners"):
+                refined, refused = refine(graph, solution)
+            self.warnings += [f"component {index}: {sentence}" for sentence in refused]
         with stages.stage("covariances"):
-            self.components.append(component_of(graph, solution))
-            self.calibration += calibration_of(graph, solution, index)
-            self.measured += judged(graph, solution, measurements, index)
+            self.components.append(component_of(graph, solution, refined))
+            last = refined.solution if refined else solution
+            self.calibration += calibration_of(refined.parameters if refined else graph.parameters, last, index)
+            self.measured += judged(graph, last, measurements, index)
             self.checks += checks_of(graph, solution, index)
             self.metres.append(metre_of(graph, index))
         with stages.stage("advice"):
@@ -213,7 +230,7 @@ class _Found:
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
             )
         self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
-        return Solved(members, graph, solution)
+        return Solved(members, graph, solution, last.state.poses)
 
 
 def _measurements(tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain]) -> Measurements:

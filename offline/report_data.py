@@ -91,9 +91,7 @@ def _component(
     runs = [run for run in document["runs"] if run["component"] == index]
     tags = [tag for tag in document["tags"] if tag["component"] == index]
     several = has_several_families(document)
-    merged = [
-        _trace(run["run"], colours, solved.graph.poses_of(solved.solution.state, i)) for i, run in enumerate(runs)
-    ]
+    merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
     return {
         "frame_run": document["components"][index]["frame_run"],
         "runs": merged,

@@ -5,6 +5,7 @@ A run with unbroken odometry is one chain; where the odometry broke, a run has s
 """
 
 from dataclasses import dataclass, field
+from math import atan2
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
+from offline.map_model import MapModel
 
 # What is right goes beyond this once in 16,000 times.
 MAX_SIGMAS: Final = 4.0
@@ -41,6 +43,27 @@ class RunResult:
 
 
 @dataclass(frozen=True)
+class TagPose:
+    """How one tag hangs in space.
+
+    Attributes:
+        height_m: of its centre above the floor.
+        quaternion_xyzw: (4,) R_map_tag.
+        covariance: (6, 6) of x, y, height and a small turn about map's axes: m^2, m rad, rad^2.
+    """
+
+    height_m: float
+    quaternion_xyzw: FloatArray
+    covariance: FloatArray
+
+    @property
+    def yaw_rad(self) -> float:
+        """Where the face looks on the floor."""
+        x, y, z, w = self.quaternion_xyzw.tolist()
+        return atan2(2.0 * (y * z - x * w), 2.0 * (x * z + y * w))
+
+
+@dataclass(frozen=True)
 class TagResult:
     """One tag in its component's map frame."""
 
@@ -52,6 +75,7 @@ class TagResult:
     covariance: FloatArray  # (2, 2) m^2
     n_observations: int
     runs: tuple[str, ...]  # names of the runs that saw it
+    pose: TagPose | None = None  # None where it is known on the floor only
 
 
 @dataclass(frozen=True)
@@ -140,6 +164,7 @@ class Component:
     n_residuals: int
     start_to_start: tuple[StartToStart, ...] = ()
     edges: GraphEdges | None = None
+    model: MapModel = MapModel.FLOOR
 
     @property
     def tag_covariance(self) -> FloatArray:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from calib.arrays import FloatArray
 from offline.graph import Graph
 from offline.local_map import LocalMap
 from offline.merge import Group
@@ -16,11 +17,18 @@ class Solved(NamedTuple):
         group: indices into `Workings.maps`, and where the alignments put their starts.
         graph: its chains are the group's members in order, its tags those of the component in order.
         solution: of that graph.
+        poses: (P, 3) of its keyframes as the map has them: refined on corners where that was possible.
     """
 
     group: Group
     graph: Graph
     solution: Solution
+    poses: FloatArray
+
+    def poses_of(self, chain: int) -> FloatArray:
+        """(K, 3) of one chain."""
+        first = int(self.graph.first_pose[chain])
+        return self.poses[first : first + len(self.graph.chains[chain].stamps_ns)]
 
 
 @dataclass

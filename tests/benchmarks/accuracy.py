@@ -82,6 +82,7 @@ METHODS: Final[dict[str, Method]] = {
     "dead reckoning": Method(lambda drives: dead_reckoning(drives.runs)),
     "paper": Method(lambda drives: paper_scheme(drives.runs)),
     "2D": Method(lambda drives: build_map(drives.runs)),
+    "corners": Method(lambda drives: build_map(drives.runs, corners=True), most_times_bound=1.1),
 }
 
 

@@ -1,0 +1,86 @@
+"""A solved map of the floor, refined on the corners of its tags; or why that was not to be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.arrays import FloatArray
+from calib.robot import Mount
+from offline.corner_graph import CornerGraph, corner_graph
+from offline.corner_problem import CORNER_LOSS
+from offline.corner_solver import CornerSolution, solve_corners
+from offline.factors import State
+from offline.graph import Graph, Parameter
+from offline.result import TagPose
+from offline.robust import losses_and_weights
+from offline.solver import Solution
+
+# Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
+_MOST_OUTLIERS: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What corners made of a solved map."""
+
+    corners: CornerGraph
+    solution: CornerSolution
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Calibration numbers, in order."""
+        return self.corners.parameters
+
+    @property
+    def tag_poses(self) -> Sequence[TagPose | None]:
+        """How each tag hangs; None for those of which no corners were kept."""
+        state, columns = self.solution.state, self.solution.problem.columns
+        six = np.column_stack([columns.tags, columns.heights, columns.turns])
+        quaternions = Rotation.from_matrix(state.turns).as_quat(canonical=True)
+        found: list[TagPose | None] = []
+        for t, is_hung in enumerate(self.corners.is_hung.tolist()):
+            to_map = np.eye(6)
+            to_map[3:, 3:] = state.turns[t]  # R exp(d) = exp(R d) R
+            pose = TagPose(
+                float(state.heights_m[t]), quaternions[t], to_map @ self.solution.covariance(six[t]) @ to_map.T
+            )
+            found.append(pose if is_hung else None)
+        return found
+
+    def mount_of(self, state: State, chain: int) -> Mount | None:
+        """Where one chain's camera sits, as corrected; None for a log without a camera."""
+        mount = self.corners.graph.mount_of(state, chain)
+        height = self.corners.height_of(chain)
+        if mount is None or height is None:
+            return mount
+        return mount.model_copy(update={"z_m": mount.z_m + float(state.calibration[height])})
+
+
+def refine(graph: Graph, solution: Solution) -> tuple[Refined | None, list[str]]:
+    """Minimises the distance in pixels between corners seen and predicted, from the solution on the floor.
+
+    Returns:
+        What came of it, or None and a sentence that says why the map stays as it was.
+    """
+    if not solution.converged:
+        return None, []  # the map says so already
+    corners, start = corner_graph(graph, solution.state)
+    found = solve_corners(corners.problem, start)
+    reason = "" if found.converged else found.reason
+    if not reason and (share := _outliers(found)) > _MOST_OUTLIERS:
+        reason = (
+            f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
+        )
+    if reason:
+        return None, [f"not refined on tag corners: {reason}; the map is that of tag positions on the floor"]
+    return Refined(corners, found), []
+
+
+def _outliers(found: CornerSolution) -> float:
+    """Share of looks beyond where Huber's loss leaves the square."""
+    residual: FloatArray = found.problem.corners.residual(found.state)
+    _, weight = losses_and_weights(CORNER_LOSS, residual)
+    return float((weight < 1.0).mean())

@@ -1,0 +1,271 @@
+"""All factors of an estimate on tag corners: wheels, corners in pixels, positions that came without corners, priors."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from calib import se2
+from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState
+from offline.corner_order import corner_order
+from offline.factors import CalibrationPrior, Linearised, OdometryFactors, ReadingFactors
+from offline.fronts import Fronts
+from offline.measured_factors import Measured
+from offline.robust import Loss, huber, losses_and_weights
+from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
+
+# Beyond it lie as many of good looks, with their eight numbers, as of good readings with two.
+CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
+# How a picture stands and which of its looks count settle together in a few rounds; most of them in one.
+_WEIGHT_ROUNDS: Final = 3
+_N_LOOK: Final = 17
+
+
+class Normal(NamedTuple):
+    """J^T W J (M, k, k) and J^T W r (M, k) of a kind of factor."""
+
+    matrix: FloatArray
+    gradient: FloatArray
+
+
+class Weighed(NamedTuple):
+    """Looks weighed by how well they fit, each picture standing as it fits best.
+
+    Attributes:
+        weight: (M,) of each look.
+        residual: (M, 8) with the picture as it stands.
+        standing: (P, 3) how, in WOBBLE.
+        cost: sum of the looks' losses and of the squares of what the pictures stand off.
+    """
+
+    weight: FloatArray
+    residual: FloatArray
+    standing: FloatArray
+    cost: float
+
+
+@dataclass(frozen=True)
+class CornerProblem:
+    """All factors of one estimate, and where the variables sit.
+
+    Attributes:
+        readings: of tags whose corners nobody kept.
+        anchor: (T,) a pose from which each tag was seen.
+        wobble_sigma: (3,) how far off level pictures are, in WOBBLE; zeros on a hall floor.
+    """
+
+    odometry: OdometryFactors
+    corners: CornerFactors
+    readings: ReadingFactors
+    prior: CalibrationPrior
+    measured: Measured
+    columns: SpatialColumns
+    anchor: IntArray
+    wobble_sigma: FloatArray
+
+    @property
+    def n_residuals(self) -> int:
+        """How many measured numbers there are, priors apart."""
+        measured = self.readings.value.size + self.measured.n_residuals
+        return self.odometry.motion.size + 8 * len(self.corners.looks) + measured
+
+    @cached_property
+    def order(self) -> Fronts:
+        """The order of elimination, settled once."""
+        return corner_order(self)
+
+    @cached_property
+    def pictures(self) -> tuple[IntArray, int]:
+        """(M,) picture of each look, and how many there are."""
+        poses, picture = np.unique(self.corners.looks.pose, return_inverse=True)
+        return picture, len(poses)
+
+    @cached_property
+    def pairs(self) -> IntArray:
+        """(N, 2) looks that share a picture, which couples them where pictures wobble."""
+        if not self.wobble_sigma.any():
+            return np.zeros((0, 2), dtype=np.int64)
+        picture, n = self.pictures
+        order = np.argsort(picture, kind="stable")
+        groups = np.split(order, np.searchsorted(picture[order], np.arange(1, n)))
+        found = [(a, b) for group in groups for i, a in enumerate(group) for b in group[i + 1 :]]
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+    def kinds(self) -> list[IntArray]:
+        """The columns (M, k) of each kind of factor, in the order in which `linearise` gives them."""
+        look, columns = self.corners.columns(self.columns), self.columns
+        starts, distances = self.measured.starts, self.measured.distances
+
+        def ends(index: IntArray, of: IntArray) -> IntArray:
+            return np.where(index[:, None] >= 0, of[index], -1)
+
+        return [
+            np.concatenate(
+                [
+                    columns.poses[self.odometry.first],
+                    columns.poses[self.odometry.first + 1],
+                    columns.calibration[self.odometry.parameters],
+                ],
+                axis=1,
+            ),
+            np.concatenate(
+                [
+                    columns.poses[self.readings.pose],
+                    columns.tags[self.readings.tag],
+                    columns.calibration[self.readings.mount_parameters],
+                    columns.calibration[self.readings.scale_parameter][:, None],
+                    columns.calibration[self.readings.camera_parameters],
+                ],
+                axis=1,
+            ),
+            columns.calibration[:, None],
+            columns.poses[starts.pose],
+            np.concatenate(
+                [
+                    ends(distances.pose_a, columns.poses),
+                    ends(distances.tag_a, columns.tags),
+                    ends(distances.pose_b, columns.poses),
+                    ends(distances.tag_b, columns.tags),
+                ],
+                axis=1,
+            ),
+            look,
+            look[self.pairs].reshape(len(self.pairs), 2 * _N_LOOK),
+        ]
+
+    def linearise(self, state: SpatialState) -> tuple[list[Normal], float]:
+        """Normal equations of each kind, in the order of `kinds`, and the cost: half the sum of all losses."""
+        columns = self.columns
+        odometry_loss, reading_loss = DEFAULT_LOSSES
+        normals, total = [], 0.0
+        plain: list[tuple[Linearised, Loss | None]] = [
+            (self.odometry.linearise(state, columns), odometry_loss),
+            (self.readings.linearise(state, columns), reading_loss),
+            (self.prior.linearise(state, columns), None),
+            *((kind, None) for kind in self.measured.linearise(state, columns)),
+        ]
+        for kind, loss in plain:
+            normal, cost = _normal(kind, loss)
+            normals.append(normal)
+            total += cost
+        look, pair, cost = self._looks(state)
+        return [*normals, look, pair], 0.5 * (total + cost)
+
+    def weighed(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
+        """Weighs looks whose pictures may stand off level.
+
+        Args:
+            residual: (M, 8) of level pictures.
+            wobble: (M, 8, 3) derivative by how a picture stands.
+        """
+        picture, n = self.pictures
+        losses, weight = losses_and_weights(CORNER_LOSS, residual)
+        standing: FloatArray = np.zeros((n, 3))
+        if not self.wobble_sigma.any():
+            return Weighed(weight, residual, standing, float(losses.sum()))
+        inverse = 1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2
+        level: FloatArray = residual
+        for _ in range(_WEIGHT_ROUNDS):
+            heavy = (weight[:, None, None] * wobble).swapaxes(-1, -2)
+            information = self._by_picture(heavy @ wobble) + np.diag(inverse)
+            standing = np.asarray(-np.linalg.solve(information, self._by_picture(heavy @ level[..., None]))[..., 0])
+            residual = np.asarray(level + (wobble @ standing[picture][..., None])[..., 0], dtype=np.float64)
+            losses, weight = losses_and_weights(CORNER_LOSS, residual)
+        return Weighed(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
+
+    def moved(self, state: SpatialState, step: FloatArray) -> SpatialState:
+        """The state after a step (n,): tags move along with their anchors as on a rigid body, see `solver.Problem`."""
+        padded, columns = np.append(step, 0.0), self.columns
+        by_pose = padded[columns.poses]
+        poses = se2.compose(state.poses, se2.exp(by_pose))
+        before, turned = state.poses[self.anchor], by_pose[self.anchor]
+        from_anchor = se2.apply(se2.inverse(before), state.tags)
+        moved_along = turned[:, :2] + turned[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
+        to_anchor_axes = np.column_stack([np.zeros((len(before), 2)), -before[:, 2]])
+        own = se2.apply(to_anchor_axes, padded[columns.tags]) - moved_along
+        up = np.zeros((len(before), 3))
+        up[:, 2] = turned[:, 2]
+        along = np.einsum("tji,tj->ti", state.turns, up)  # the anchor's turn, about the tag's own axes
+        free = columns.heights >= 0
+        rest = np.where(free[:, None], padded[columns.turns] - along, 0.0)
+        about_up = Rotation.from_rotvec(np.where(free[:, None], up, 0.0)).as_matrix()
+        return SpatialState(
+            poses=poses,
+            tags=se2.apply(poses[self.anchor], from_anchor + own),
+            calibration=state.calibration + padded[columns.calibration],
+            heights_m=state.heights_m + padded[columns.heights],
+            turns=about_up @ state.turns @ Rotation.from_rotvec(rest).as_matrix(),
+        )
+
+    def _looks(self, state: SpatialState) -> tuple[Normal, Normal, float]:
+        """Of looks and of pairs that share a picture, how the pictures stand eliminated; and twice their cost."""
+        linearised, wobble = self.corners.linearise(state, self.columns)
+        weighed = self.weighed(linearised.residual, wobble)
+        if not np.isfinite(weighed.cost):
+            weighed = weighed._replace(cost=float("inf"))
+        ((_, jacobian),) = linearised.blocks
+        transposed = jacobian.swapaxes(-1, -2)
+        matrix = transposed @ (weighed.weight[:, None, None] * jacobian)
+        gradient = (transposed @ (weighed.weight[:, None] * weighed.residual)[..., None])[..., 0]
+        if not self.wobble_sigma.any():
+            none = Normal(np.zeros((0, 2 * _N_LOOK, 2 * _N_LOOK)), np.zeros((0, 2 * _N_LOOK)))
+            return Normal(matrix, gradient), none, weighed.cost
+        picture, _ = self.pictures
+        heavy = weighed.weight[:, None, None] * wobble
+        own = self._by_picture(wobble.swapaxes(-1, -2) @ heavy)
+        own += np.diag(1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2)
+        coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 17)
+        taken = np.linalg.solve(own[picture], coupled)
+        matrix = matrix - coupled.swapaxes(-1, -2) @ taken
+        a, b = self.pairs.T
+        across = -coupled[a].swapaxes(-1, -2) @ taken[b]
+        pair = np.zeros((len(a), 2 * _N_LOOK, 2 * _N_LOOK))
+        pair[:, :_N_LOOK, _N_LOOK:] = across
+        pair[:, _N_LOOK:, :_N_LOOK] = across.swapaxes(-1, -2)
+        return Normal(matrix, gradient), Normal(pair, np.zeros((len(a), 2 * _N_LOOK))), weighed.cost
+
+    def _by_picture(self, values: FloatArray) -> FloatArray:
+        """Sums (P, ...) of values (M, ...) of looks."""
+        picture, n = self.pictures
+        summed = np.zeros((n, *values.shape[1:]))
+        np.add.at(summed, picture, values)
+        return summed
+
+
+# rad and m: a floor that is as good as level keeps its information finite.
+_LEVEL: Final = 1e-7
+
+
+def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:
+    """Normal equations, and the sum of losses."""
+    jacobian = np.concatenate([derivative for _, derivative in kind.blocks], axis=-1)
+    if loss is None:
+        weight, cost = np.ones(len(jacobian)), float((kind.residual**2).sum())
+    else:
+        losses, weight = losses_and_weights(loss, kind.residual)
+        cost = float(losses.sum())
+    heavy = weight[:, None, None] * jacobian
+    transposed = heavy.swapaxes(-1, -2)
+    return Normal(transposed @ jacobian, (transposed @ kind.residual[..., None])[..., 0]), cost
+
+
+def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:
+    """Poses, tags' places, heights, turns, calibration; held: the first pose, exact calibration, turns nobody saw."""
+    n_tags = len(free)
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    n = 3 * n_poses - 3
+    tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
+    n += 2 * n_tags
+    hung = np.where(free, np.cumsum(free) - 1, -1)
+    heights = np.where(free, n + hung, -1)
+    n += int(free.sum())
+    turns = np.where(free[:, None], n + 3 * hung[:, None] + np.arange(3), -1)
+    n += 3 * int(free.sum())
+    known = sigmas > 0.0
+    calibration = np.where(known, n + np.cumsum(known) - 1, -1)
+    return SpatialColumns(poses, tags, calibration, n + int(known.sum()), heights, turns)

@@ -1,0 +1,225 @@
+"""Corner factors against numbers: Jacobians, pictures that stand off level, fronts against a dense solve."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import se2
+from calib.arrays import FloatArray, IntArray
+from calib.camera_model import CameraModel
+from offline.corner_factors import CornerFactors, Looks, SpatialColumns, SpatialState
+from offline.corner_problem import CornerProblem, columns_of
+from offline.factors import CalibrationPrior, OdometryFactors, ReadingFactors
+from offline.fronts import NotPositiveError, build_fronts, common_ancestor
+from offline.measured_factors import NOTHING_MEASURED
+
+CAMERAS = {
+    "plumb_bob": (-0.18, 0.07, 0.0006, -0.0004, 0.01),
+    "rational_polynomial": (0.3, -0.1, 0.0005, -0.0003, 0.02, 0.5, -0.05, 0.01),
+    "equidistant": (-0.01, 0.004, -0.002, 0.0003),
+}
+N_POSES, N_TAGS, N_LOOKS = 5, 3, 12
+SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01])
+WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces somebody who looks along x
+
+
+def made_state(rng: np.random.Generator) -> SpatialState:
+    """Poses near the origin that look along x, at tags two to four metres away that hang askew."""
+    turns = Rotation.from_rotvec(0.3 * rng.standard_normal((N_TAGS, 3))).as_matrix() @ WALL
+    return SpatialState(
+        poses=np.column_stack([0.2 * rng.standard_normal((N_POSES, 2)), 0.1 * rng.standard_normal(N_POSES)]),
+        tags=np.column_stack([rng.uniform(2, 4, N_TAGS), rng.uniform(-0.6, 0.6, N_TAGS)]),
+        calibration=np.r_[0.0, 0.01 * rng.standard_normal(len(SIGMAS) - 1)],
+        heights_m=rng.uniform(0.3, 0.6, N_TAGS),
+        turns=turns,
+    )
+
+
+def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFactors:
+    """Looks by two cameras at once, each row read out from elsewhere."""
+    camera = CameraModel("one", 1280, 720, 902.4, 901.1, 643.2, 356.7, model, CAMERAS[model])
+    looks = Looks(
+        pose=np.sort(np.concatenate([np.arange(N_POSES), rng.integers(0, N_POSES, N_LOOKS - N_POSES)])),
+        tag=np.arange(N_LOOKS) % N_TAGS,
+        corners_px=rng.uniform(0, 700, (N_LOOKS, 4, 2)),
+        sigma_px=rng.uniform(0.5, 2.0, N_LOOKS),
+        side_m=np.full(N_LOOKS, 0.15),
+        camera=np.arange(N_LOOKS) % 2,
+        moved=0.02 * rng.standard_normal((N_LOOKS, 4, 3)),
+        twist=0.5 * rng.standard_normal((N_LOOKS, 3)),
+        mount=np.tile([0.15, 0.02, 0.42, 0.02, 0.03, 0.1], (N_LOOKS, 1)),
+        mount_parameters=np.tile(np.arange(1, 7), (N_LOOKS, 1)),
+        time_parameter=np.full(N_LOOKS, 7),
+        scale_parameter=np.full(N_LOOKS, 8),
+    )
+    return CornerFactors(looks, (camera, replace(camera, fx_px=700.0)))
+
+
+def made_problem(
+    seed: int, wobble_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[CornerProblem, SpatialState]:
+    """Looks that fit the state but for some pixels, and the motions between its poses."""
+    rng = np.random.default_rng(seed)
+    state, factors = made_state(rng), made_factors(rng)
+    state = replace(state, poses=np.concatenate([np.zeros((1, 3)), state.poses[1:]]))
+    seen = factors.looks.corners_px + factors.residual(state).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
+    noisy = seen + 0.5 * rng.standard_normal(seen.shape)
+    none = np.zeros(0, dtype=np.int64)
+    steps = np.arange(N_POSES - 1)
+    problem = CornerProblem(
+        odometry=OdometryFactors(
+            steps,
+            se2.between(state.poses[:-1], state.poses[1:]),
+            np.tile(np.eye(3) / 0.05, (N_POSES - 1, 1, 1)),
+            np.zeros((N_POSES - 1, 3, 3)),
+            np.zeros((N_POSES - 1, 3), dtype=np.int64),
+        ),
+        corners=replace(factors, looks=replace(factors.looks, corners_px=noisy)),
+        readings=ReadingFactors(
+            none,
+            none,
+            np.zeros((0, 2)),
+            none > 0,
+            np.zeros((0, 2, 2)),
+            np.zeros((0, 3)),
+            np.zeros((0, 3), dtype=int),
+            none,
+            np.zeros((0, 2, 3)),
+            np.zeros((0, 3), dtype=int),
+        ),
+        prior=CalibrationPrior(SIGMAS),
+        measured=NOTHING_MEASURED,
+        columns=columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS),
+        anchor=np.arange(N_TAGS),
+        wobble_sigma=np.array(wobble_sigma),
+    )
+    return problem, state
+
+
+def moved(state: SpatialState, columns: SpatialColumns, step: FloatArray) -> SpatialState:
+    """The plainest reading of what columns mean."""
+    padded = np.append(step, 0.0)
+    return SpatialState(
+        se2.compose(state.poses, se2.exp(padded[columns.poses])),
+        state.tags + padded[columns.tags],
+        state.calibration + padded[columns.calibration],
+        state.heights_m + padded[columns.heights],
+        state.turns @ Rotation.from_rotvec(padded[columns.turns]).as_matrix(),
+    )
+
+
+def dense(columns: SpatialColumns, own: IntArray, values: FloatArray) -> FloatArray:
+    """Rows of all columns from blocks (M, r, k) and the columns (M, k) they belong to."""
+    out = np.zeros((*values.shape[:2], columns.n + 1))
+    for m, each in enumerate(own):
+        for k, column in enumerate(each):
+            out[m, :, column] += values[m, :, k]
+    rows: FloatArray = out[..., :-1]
+    return rows
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_derivatives_are_those_of_the_residuals(model: str) -> None:
+    rng = np.random.default_rng(1)
+    state, factors = made_state(rng), made_factors(rng, model)
+    columns = columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS)
+    linearised, _ = factors.linearise(state, columns)
+    ((own, jacobian),) = linearised.blocks
+    assert np.isfinite(linearised.residual).all()
+    step = 1e-6
+    numeric = np.empty((N_LOOKS, 8, columns.n))
+    for i, e in enumerate(step * np.eye(columns.n)):
+        up, down = (factors.residual(moved(state, columns, way * e)) for way in (1.0, -1.0))
+        numeric[..., i] = (up - down) / (2 * step)
+    np.testing.assert_allclose(dense(columns, own, jacobian), numeric, rtol=1e-7, atol=1e-5)
+
+
+def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> None:
+    """Roll, pitch and height of base, put into the mount: the camera rises and turns about base's axes, not its own."""
+    rng = np.random.default_rng(2)
+    state, factors = made_state(rng), made_factors(rng)
+    looks = replace(factors.looks, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
+    factors = replace(factors, looks=looks)
+    _, wobble = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
+    step = 1e-6
+
+    def stood(off: FloatArray) -> FloatArray:
+        mount = looks.mount + state.calibration[looks.mount_parameters]
+        level = Rotation.from_euler("ZYX", mount[0, [5, 4, 3]])
+        tilt = Rotation.from_rotvec([off[0], off[1], 0.0])
+        risen = tilt.apply(mount[0, :3]) + np.array([0.0, 0.0, off[2]])
+        tilted = np.concatenate([risen, (tilt * level).as_euler("ZYX")[::-1]]) - state.calibration[1:7]
+        return replace(factors, looks=replace(looks, mount=np.tile(tilted, (N_LOOKS, 1)))).residual(state)
+
+    numeric = np.stack([(stood(e) - stood(-e)) / (2 * step) for e in step * np.eye(3)], axis=-1)
+    np.testing.assert_allclose(wobble, numeric, atol=1e-5)
+
+
+def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance() -> None:
+    """R + J S J^T for all corners of a picture together, by a plain inverse, against the low-rank elimination."""
+    problem, state = made_problem(3, wobble_sigma=(0.004, 0.006, 0.003))
+    normals, cost = problem.linearise(state)
+    H, g = as_dense(problem, [n.matrix for n in normals]), problem.order.summed([n.gradient for n in normals])
+    linearised, wobble = problem.corners.linearise(state, problem.columns)
+    ((own, blocks),) = linearised.blocks
+    jacobian = dense(problem.columns, own, blocks)
+    level, _ = replace(problem, wobble_sigma=np.zeros(3)).linearise(state)
+    expected = as_dense(problem, [*(n.matrix for n in level[:-2]), 0 * level[-2].matrix, 0 * normals[-1].matrix])
+    gradient = problem.order.summed([*(n.gradient for n in level[:-2]), 0 * level[-2].gradient, normals[-1].gradient])
+    looks_cost = 0.0
+    for pose in np.unique(problem.corners.looks.pose):
+        of = problem.corners.looks.pose == pose
+        J, W, r = (np.concatenate(list(each[of])) for each in (jacobian, wobble, linearised.residual))
+        whole = np.linalg.inv(np.eye(len(r)) + W @ np.diag(problem.wobble_sigma**2) @ W.T)
+        expected += J.T @ whole @ J
+        gradient += J.T @ whole @ r
+        looks_cost += float(r @ whole @ r)
+    assert len(problem.pairs) > 3
+    np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(g, gradient, rtol=1e-8, atol=1e-9 * np.abs(gradient).max())
+    others = replace(problem, wobble_sigma=np.zeros(3)).linearise(state)[1] - 0.5 * (linearised.residual**2).sum()
+    assert cost == pytest.approx(others + 0.5 * looks_cost)
+
+
+def as_dense(problem: CornerProblem, matrices: list[FloatArray]) -> FloatArray:
+    n = problem.columns.n
+    H = np.zeros((n + 1, n + 1))
+    for columns, matrix in zip(problem.kinds(), matrices, strict=True):
+        np.add.at(H, (columns[:, :, None], columns[:, None, :]), matrix)
+    return H[:n, :n]
+
+
+def test_fronts_solve_as_a_dense_matrix_does() -> None:
+    """Along a chain of 40 poses with tags seen here and there, nodes without a column of their own among them."""
+    rng = np.random.default_rng(4)
+    n_leaves, n_own = 5, 3
+    parent = np.array([5, 5, 6, 6, 6, 7, 7, -1])
+    node_of = np.concatenate([np.repeat(np.arange(n_leaves), n_own), [6, 7, 7]])
+    n = len(node_of)
+    kinds = [np.array([[3 * i, 3 * i + 1, 3 * i + 2, -1 if i == 2 else 15] for i in range(n_leaves)])]
+    kinds.append(np.array([[3 * i + 2, 16, 17] for i in range(n_leaves)]))
+    kinds[0][:2, 3] = 16  # tag 15 hangs in the branch of leaves 2 to 4 only
+    roots = [rng.standard_normal((len(k), k.shape[1], k.shape[1] + 2)) for k in kinds]
+    normals = [root @ root.swapaxes(-1, -2) for root in roots]
+    H = np.zeros((n + 1, n + 1))
+    for columns, normal in zip(kinds, normals, strict=True):
+        np.add.at(H, (columns[:, :, None], columns[:, None, :]), normal)
+    H = H[:n, :n]
+    order = build_fronts(n, node_of, parent, kinds)
+    assert min(front.n_own for front in order.fronts) == 0
+    raised = rng.uniform(0, 1, n)
+    for extra in (None, raised):
+        whole = H if extra is None else H + np.diag(extra)
+        factor = order.factorise(order.assembled(normals), extra)
+        vector = rng.standard_normal(n)
+        np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(whole, vector), rtol=1e-8)
+        wanted = np.array([16, 0, -1, 7, 14])
+        inverse = np.linalg.inv(whole)
+        expected = inverse[np.ix_(wanted, wanted)] * ((wanted >= 0)[:, None] & (wanted >= 0))
+        np.testing.assert_allclose(factor.covariance(wanted), expected, rtol=1e-8, atol=1e-12)
+    with pytest.raises(NotPositiveError):
+        order.factorise(order.assembled([-normal for normal in normals]))
+    assert common_ancestor([0, 1], parent) == 5
+    assert common_ancestor([0, 2, 3], parent) == 7

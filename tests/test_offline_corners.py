@@ -1,0 +1,226 @@
+"""Maps refined on tag corners: exact where corners are, honest where they are noisy, the floor where neither."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from calib import se2
+from calib.arrays import FloatArray
+from calib.noise import NoiseParameters
+from fixtures.simulate import TRUTH_FILE, simulate
+from offline import corner_map
+from offline.corner_factors import SpatialState
+from offline.corner_graph import corner_graph
+from offline.corner_problem import CornerProblem
+from offline.corner_solver import CornerSolution, solve_corners
+from offline.edges import edges_of
+from offline.evaluation import evaluate
+from offline.global_map import component_of
+from offline.map_io import read_map, write_map
+from offline.map_model import MapModel
+from offline.pipeline import build_map, map_logs
+from offline.result import MapResult
+from offline.run import Detections, Run, load_run
+from offline.truth import read_truth
+from offline.workings import Workings
+from onboard.log_reader import find_logs
+from tests.made_drives import MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
+from tests.programs import Run as Program
+
+ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
+STARTS = {"a": [1.0, 1.5, 0.3], "b": [1.4, 2.2, -0.2]}
+# Upright, rolled, and leaning: the last two are read badly by whoever takes them for upright.
+TAGS = [
+    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
+    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
+    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
+    MadeTag(3, (0.0, 2.9, 0.6), -0.1, roll_rad=0.4),
+    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
+    MadeTag(5, (4.5, 0.0, 0.5), np.pi / 2, roll_rad=np.pi),
+    MadeTag(6, (4.3, 4.0, 0.7), -np.pi / 2, pitch_rad=-0.5),
+]
+NOISE = NoiseParameters()
+CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+
+def drive_of(name: str) -> MadeDrive:
+    return made_drive(STARTS[name], ROUND)
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> MapResult:
+    folder = tmp_path_factory.mktemp("exact")
+    logs = [write_drive(folder, drive_of(name), TAGS, made_robot(name)) for name in STARTS]
+    return map_logs(logs, noise=NOISE, corners=True)
+
+
+def assert_hang_as_made(result: MapResult, atol: float) -> None:
+    """All four corners of each tag where they were made, in the world."""
+    x, y, theta = STARTS["a"]
+    turn = Rotation.from_euler("z", theta)
+    for tag, made in zip(result.components[0].tags, TAGS, strict=True):
+        assert tag.pose is not None
+        corners = Rotation.from_quat(tag.pose.quaternion_xyzw).apply(0.15 * CORNERS)
+        in_world = turn.apply(corners + np.append(tag.position_m, tag.pose.height_m)) + np.array([x, y, 0.0])
+        np.testing.assert_allclose(in_world, made.corners_m(), atol=atol, err_msg=str(made))
+
+
+def test_exact_corners_give_every_tag_back_as_it_hangs(exact: MapResult) -> None:
+    (component,) = exact.components
+    assert component.model is MapModel.CORNERS
+    assert [warning for warning in exact.warnings if "upright" not in warning] == []
+    assert_hang_as_made(exact, atol=1e-6)
+    for run in component.runs:
+        true = se2.between(STARTS["a"], drive_of(run.robot_id).at(run.stamps_ns))
+        np.testing.assert_allclose(se2.log(se2.between(true, run.T_map_base)), 0.0, atol=1e-6)
+    assert {number.name for number in exact.calibration} >= {"mount_z_m", "mount_roll_rad", "time_offset_s"}
+
+
+def test_a_refined_map_is_read_back_as_it_was_written(exact: MapResult, tmp_path: Path) -> None:
+    write_map(exact, tmp_path)
+    again = read_map(tmp_path)
+    assert again.components[0].model is MapModel.CORNERS
+    rows = list(csv.DictReader((tmp_path / "tags.csv").open()))
+    for tag, found, made, row in zip(exact.components[0].tags, again.components[0].tags, TAGS, rows, strict=True):
+        assert tag.pose is not None
+        assert found.pose is not None
+        assert found.pose.height_m == pytest.approx(tag.pose.height_m)
+        np.testing.assert_allclose(found.pose.quaternion_xyzw, tag.pose.quaternion_xyzw)
+        np.testing.assert_allclose(found.pose.covariance, tag.pose.covariance)
+        np.testing.assert_array_equal(found.position_m, tag.position_m)
+        np.testing.assert_allclose(found.covariance, tag.pose.covariance[:2, :2])
+        assert float(row["z_m"]) == pytest.approx(made.position_m[2], abs=2e-6)
+        apart = float(row["yaw_rad"]) - (made.yaw_rad - STARTS["a"][2])
+        assert np.sin(apart / 2) == pytest.approx(0.0, abs=2e-6)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    drive = made_drive(STARTS["a"], ROUND[:2])
+    return load_run(
+        write_drive(tmp_path_factory.mktemp("short"), drive, TAGS[:3], made_robot("a"), corner_sigma_px=0.2)
+    )
+
+
+def rolled_run(tmp_path: Path, readout_s: float) -> Run:
+    """A drive whose pictures are read out row by row, each corner seen from where the robot was by then."""
+    drive, robot = drive_of("a"), made_robot("a", readout_s=readout_s)
+    run = load_run(write_drive(tmp_path, drive, TAGS, robot))
+    camera = run.camera
+    assert camera is not None
+    corners_px, whole = run.detections.corners_px.copy(), np.ones(len(run.detections.tag), dtype=np.bool_)
+    for i, (stamp_ns, tag) in enumerate(zip(run.detections.stamps_ns, run.detections.tag, strict=True)):
+        for corner in range(4):
+            for _ in range(2):
+                share = corners_px[i, corner, 1] / (camera.height_px - 1) - 0.5
+                pose = drive.at(np.array([stamp_ns + round(share * readout_s * 1e9)]))[0]
+                seen = seen_corners_px(TAGS[run.tags[tag].tag_id], pose, robot, camera)
+                whole[i] &= seen is not None
+                if seen is not None:
+                    corners_px[i, corner] = seen[corner]
+    detections = run.detections
+    kept = Detections(detections.stamps_ns[whole], detections.tag[whole], corners_px[whole])
+    return replace(run, detections=kept)
+
+
+def test_each_row_is_seen_from_where_the_wheels_say_that_the_robot_was(tmp_path: Path) -> None:
+    run = rolled_run(tmp_path, readout_s=0.03)
+    mapped = build_map([run], noise=NOISE, corners=True)
+    assert mapped.components[0].model is MapModel.CORNERS, mapped.warnings
+    # Where speeds change between a stamp and a row, one arc is not quite what was driven.
+    assert mapped.components[0].cost < 1.0
+    assert_hang_as_made(mapped, atol=2e-3)
+    global_shutter = run.robot.model_copy(update={"readout_s": 0.0})
+    ignored = build_map([replace(run, robot=global_shutter)], noise=NOISE, corners=True)
+    assert ignored.components[0].cost > 20.0
+
+
+@pytest.mark.parametrize("what", ["no end", "no fit"])
+def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
+    what: str, short: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(problem: CornerProblem, start: SpatialState) -> CornerSolution:
+        return replace(solve_corners(problem, start), converged=False, reason="no step lowers the cost")
+
+    def unfit(problem: CornerProblem, start: SpatialState) -> CornerSolution:
+        found = solve_corners(problem, start)
+        off = replace(problem.corners.looks, corners_px=problem.corners.looks.corners_px + 20.0)
+        return replace(found, problem=replace(problem, corners=replace(problem.corners, looks=off)))
+
+    monkeypatch.setattr(corner_map, "solve_corners", {"no end": stopped, "no fit": unfit}[what])
+    result = build_map([short], noise=NOISE, corners=True)
+    assert result.components[0].model is MapModel.FLOOR
+    assert all(tag.pose is None for tag in result.components[0].tags)
+    (said,) = [warning for warning in result.warnings if "not refined on tag corners" in warning]
+    assert ("no step lowers the cost" if what == "no end" else "100 % of the looks at tags do not fit") in said
+    assert said.endswith("the map is that of tag positions on the floor")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Workings]:
+    folder, workings = tmp_path_factory.mktemp("drives") / "room", Workings()
+    simulate("room", 3, folder, render=False)
+    return folder, map_logs(find_logs([folder]), corners=True, workings=workings), workings
+
+
+def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Workings]) -> None:
+    """Chi-square of one map's joint errors, 99.9 %; and every start better known than on the floor."""
+    folder, result, workings = room
+    (component,) = result.components
+    assert component.model is MapModel.CORNERS
+    errors = evaluate(result, read_truth(folder / TRUTH_FILE)).components[0]
+    n = 2 * len(component.tags)
+    assert errors.nees_tags_per_dim is not None
+    assert chi2.ppf(0.0005, n) < n * errors.nees_tags_per_dim < chi2.ppf(0.9995, n)
+    floor = component_of(workings.solved[0].graph, workings.solved[0].solution)
+    for refined, known in zip(component.start_to_start, floor.start_to_start, strict=True):
+        assert np.linalg.det(refined.covariance) < np.linalg.det(known.covariance)
+    np.testing.assert_array_equal(workings.solved[0].poses_of(1), component.runs[1].T_map_base)
+
+
+def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, Workings]) -> None:
+    _, result, workings = room
+    solved = workings.solved[0]
+    corners, start = corner_graph(solved.graph, solved.solution.state)
+    found = solve_corners(corners.problem, start)
+    assert found.converged
+    normals, _ = corners.problem.linearise(found.state)
+    n = corners.problem.columns.n
+    H = np.zeros((n + 1, n + 1))
+    for columns, normal in zip(corners.problem.kinds(), normals, strict=True):
+        np.add.at(H, (columns[:, :, None], columns[:, None, :]), normal.matrix)
+    inverse = np.linalg.inv(H[:n, :n])
+    of = corners.problem.columns
+    wanted = np.concatenate([of.poses[solved.graph.first_pose].ravel(), of.tags.ravel()])
+    expected = np.where((wanted >= 0)[:, None] & (wanted >= 0), inverse[np.ix_(wanted, wanted)], 0.0)
+    sigmas = np.sqrt(np.diag(expected)) + (wanted < 0)
+    np.testing.assert_allclose(
+        found.covariance(wanted) / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-4
+    )
+    tags = slice(3 * len(solved.graph.chains), None)
+    np.testing.assert_allclose(result.components[0].tag_covariance, expected[tags, tags], rtol=1e-2, atol=1e-8)
+
+
+def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult, Workings]) -> None:
+    _, result, workings = room
+    component, edges = result.components[0], result.components[0].edges
+    assert edges is not None
+    poses = np.concatenate([run.T_map_base for run in component.runs])
+    tags: FloatArray = np.array([tag.position_m for tag in component.tags])
+    np.testing.assert_allclose(se2.apply(poses[edges.pose], edges.place_m), tags[edges.tag], atol=1e-9)
+    np.testing.assert_allclose(se2.compose(poses[edges.first], edges.motion)[:, :2], poses[edges.first + 1, :2])
+    floor = edges_of(workings.solved[0].graph, workings.solved[0].solution)
+    np.testing.assert_array_equal(edges.place_information, floor.place_information)
+
+
+def test_the_command_offers_both_models(run: Program, short: Run, tmp_path: Path) -> None:
+    for model in MapModel:
+        outcome = run("map", short.log, "-o", tmp_path / model, "--model", model)
+        assert outcome.code == 0, outcome
+        assert read_map(tmp_path / model).components[0].model is model
+    assert run("map", short.log, "-o", tmp_path / "other", "--model", "3d").code == 2
