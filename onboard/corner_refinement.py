@@ -32,7 +32,9 @@ _LEAST_BAND_PX: Final = 1.2
 _CLEAR_OF_CORNER_PX: Final = 2.0
 _FARTHEST_PX: Final = 1.5  # that a side may lie from where the detector saw it
 _LEAST_CONTRAST: Final = 10.0  # grey levels: twice h
-_ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than one edge
+# Residuals' RMS over the contrast: 0.02 for an edge under a sensor's noise; from here on something else is there, and
+# in rendered drives what is refined is no better than what was detected.
+_ROUGHEST: Final = 0.07
 _LEAST_PIXELS: Final = 25  # five for each parameter
 
 
@@ -177,6 +179,8 @@ class _Sides:
         signs = np.sign(level[:, 1]).reshape(-1, 4)
         one_way = np.repeat(np.abs(signs.sum(axis=1)) == 4.0, 4)
         good = (n >= _LEAST_PIXELS) & (contrast > _LEAST_CONTRAST) & (rms < _ROUGHEST * contrast) & one_way
+        # A blur at its limit is one that light and blur trade places in: too few pixels tell them apart.
+        good &= p[:, 4] < np.log(_BLUR_PX[1]) - 1e-6
         return np.asarray(good & (np.abs(p[:, :2]).max(axis=1) < _FARTHEST_PX))
 
     def corners(self, moved: FloatArray) -> FloatArray:
