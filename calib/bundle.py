@@ -223,14 +223,13 @@ class _System:
         return _Blocks(residual, whitened, normal, gradient)
 
 
-def board_pose(
-    model: CameraModel, points_m: FloatArray, pixels: FloatArray, rank: int = 0
-) -> tuple[FloatArray, FloatArray] | None:
+def board_pose(points_m: FloatArray, rays: FloatArray, rank: int = 0) -> tuple[FloatArray, FloatArray] | None:
     """R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane; None where no pose explains them.
 
-    A plane has two poses that explain it nearly as well as each other: `rank` 0 is the better one.
+    A plane has two poses that explain it nearly as well as each other: `rank` 0 is the better one. Arguments
+    as in `planar_poses`.
     """
-    poses = planar_poses(points_m, model.unproject(pixels))
+    poses = planar_poses(points_m, rays)
     return poses[rank] if rank < len(poses) else None
 
 
@@ -276,9 +275,10 @@ def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) 
         np.tile([0.0, 0.0, 1.0], (views, 1)),
         np.zeros(views, bool),
     )
+    rays = model.unproject(seen.pixels)
     for view in range(views):
         own = seen.view == view
-        pose = board_pose(model, seen.points_m[own], seen.pixels[own], rank)
+        pose = board_pose(seen.points_m[own], rays[own], rank)
         if pose is not None:
             rotation[view], place[view], good[view] = *pose, True
     return Poses(rotation, place), good

@@ -17,7 +17,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyroots, polyval
 
 from calib.arrays import BoolArray, FloatArray
 
@@ -36,8 +36,8 @@ class Distortion:
     `limit` is the undistorted radius from which on there is no image, `distorted_limit` its image.
     """
 
-    numerator: Polynomial  # of s, or of t^2 for equidistant
-    denominator: Polynomial
+    numerator: FloatArray  # coefficients, the constant first, of a polynomial of s, or of t^2 for equidistant
+    denominator: FloatArray
     p1: float
     p2: float
     is_equidistant: bool
@@ -48,14 +48,14 @@ class Distortion:
     def of(cls, model: str, coefficients: tuple[float, ...]) -> "Distortion":
         """The lens of one of `COEFFICIENTS`, its coefficients in OpenCV's order."""
         if model == "equidistant":
-            numerator, denominator = Polynomial([1.0, *coefficients]), Polynomial([1.0])
+            numerator, denominator = np.array([1.0, *coefficients]), np.ones(1)
             p1, p2 = 0.0, 0.0
             # The angle t (1 + k1 t^2 + ...) must grow: d/dt = N + 2 u N' with u = t^2.
             angle = np.sqrt(_first_positive_root(_growth(numerator, denominator), float(_WIDEST_RAD) ** 2))
             limit = float(np.tan(angle))
         else:
             k1, k2, p1, p2, k3, *below = coefficients
-            numerator, denominator = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, *below])
+            numerator, denominator = np.array([1.0, k1, k2, k3]), np.array([1.0, *below])
             widest = float(np.tan(_WIDEST_RAD)) ** 2
             fold = _first_positive_root(_growth(numerator, denominator), widest)
             limit = float(np.sqrt(_first_positive_root(denominator, fold)))
@@ -65,14 +65,12 @@ class Distortion:
         return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
 
     @cached_property
-    def _numerator_slope(self) -> Polynomial:
-        slope: Polynomial = self.numerator.deriv()
-        return slope
+    def _numerator_slope(self) -> FloatArray:
+        return _slope(self.numerator)
 
     @cached_property
-    def _denominator_slope(self) -> Polynomial:
-        slope: Polynomial = self.denominator.deriv()
-        return slope
+    def _denominator_slope(self) -> FloatArray:
+        return _slope(self.denominator)
 
     def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
@@ -133,36 +131,42 @@ class Distortion:
         """g(s) and dg/ds."""
         if self.is_equidistant:
             return self._equidistant_factor(square)
-        above, below = self.numerator(square), self.denominator(square)
-        factor = above / below
-        return factor, (self._numerator_slope(square) - factor * self._denominator_slope(square)) / below
+        below = polyval(square, self.denominator)
+        factor = polyval(square, self.numerator) / below
+        slope = polyval(square, self._numerator_slope) - factor * polyval(square, self._denominator_slope)
+        return factor, slope / below
 
     def _equidistant_factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         radius = np.sqrt(square)
         angle = np.arctan(radius)
-        polynomial = self.numerator(angle * angle)
+        polynomial = polyval(angle * angle, self.numerator)
         near_axis = square < 1e-16
         safe = np.where(near_axis, 1.0, square)
         factor = np.where(near_axis, 1.0, angle * polynomial / np.sqrt(safe))
-        angle_slope = polynomial + 2 * angle * angle * self._numerator_slope(angle * angle)
+        angle_slope = polynomial + 2 * angle * angle * polyval(angle * angle, self._numerator_slope)
         slope = (angle_slope / (1.0 + safe) - factor) / (2.0 * safe)
         # Near the axis t = r - r^3/3, so g = 1 + (k1 - 1/3) s.
-        return factor, np.where(near_axis, self.numerator.coef[1] - 1.0 / 3.0, slope)
+        return factor, np.where(near_axis, self.numerator[1] - 1.0 / 3.0, slope)
 
 
-def _growth(numerator: Polynomial, denominator: Polynomial) -> Polynomial:
-    """Has the sign of d/dr of r N(r^2) / D(r^2), as a polynomial of r^2."""
-    s = Polynomial([0.0, 1.0])
-    grown: Polynomial = (numerator + 2 * s * numerator.deriv()) * denominator - 2 * s * numerator * denominator.deriv()
-    return grown
+def _slope(polynomial: FloatArray) -> FloatArray:
+    """Coefficients of the derivative."""
+    return np.asarray((np.arange(len(polynomial)) * polynomial)[1:] if len(polynomial) > 1 else np.zeros(1))
 
 
-def _first_positive_root(polynomial: Polynomial, bound: float) -> float:
+def _growth(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Has the sign of d/dr of r N(r^2) / D(r^2), as a polynomial of s = r^2: (N + 2 s N') D - N 2 s D'."""
+    doubled = 2.0 * np.arange(max(len(numerator), len(denominator)))
+    grown = np.convolve((1.0 + doubled[: len(numerator)]) * numerator, denominator)
+    return np.asarray(grown - np.convolve(numerator, doubled[: len(denominator)] * denominator))
+
+
+def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
     """The smallest root in (0, bound), else `bound`."""
-    trimmed = polynomial.trim()
-    if trimmed.degree() == 0:
+    trimmed = np.trim_zeros(polynomial, "b")
+    if len(trimmed) < 2:
         return bound
-    roots = trimmed.roots()
+    roots = polyroots(trimmed)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
     return float(min(real.min(initial=bound), bound))
 

@@ -118,9 +118,10 @@ def general_readings(
     n = len(corners_px)
     centres = np.full((n, 3), np.nan)
     chi2 = np.full(n, np.nan)
+    rays = camera.unproject(corners_px)
     for i in range(n):
         corners_m = np.column_stack([UNIT_CORNERS * sides_m[i], np.zeros(4)])
-        pose = board_pose(camera, corners_m, corners_px[i]) if np.isfinite(corners_px[i]).all() else None
+        pose = board_pose(corners_m, rays[i])
         if pose is not None:
             rotation, centre = pose
             centres[i] = R_base_camera @ centre

@@ -96,7 +96,7 @@ def test_a_board_far_off_the_axis_of_a_fisheye_has_a_pose() -> None:
     assert origins.min() < 0.0
     for index, view in enumerate(views):
         own = seen.view == index
-        pose = board_pose(FISHEYE, seen.points_m[own], seen.pixels[own])
+        pose = board_pose(seen.points_m[own], FISHEYE.unproject(seen.pixels[own]))
         assert pose is not None
         assert np.linalg.norm(pose[1] - view.T_camera_board[:3, 3]) < 0.01
 
