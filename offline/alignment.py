@@ -4,7 +4,9 @@ Hypotheses compare by their evidence: how much better they explain the shared ta
 sure if nothing else explains the tags almost as well.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from math import lgamma, log, pi
 from typing import Final
 
@@ -13,7 +15,7 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray
-from offline.alignment_search import Explanation, explanations, settled
+from offline.alignment_search import Explanation, explanations, settled, without
 from offline.condensed import CondensedMap, quarter_turned
 from offline.joint_fit import FALSE_ALARM, REACH_M, JointFit, hold
 from offline.measured import Placement
@@ -24,6 +26,11 @@ MARGIN_NATS: Final = log(100.0)
 # Tags that moved together fit together, whichever of two groups they are: no likelihood tells which one stayed. The
 # larger one did if it has this many times the tags of the other.
 GROUP_MARGIN: Final = 2.0
+# Other choices of tags count down to this much less evidence than the best has, up to so many tags fewer, and of each
+# number so many.
+_DOUBT_NATS: Final = 2.0 * MARGIN_NATS
+_MOST_DOUBTED: Final = 6
+_BEAM: Final = 12
 _AREA_M2: Final = REACH_M**2
 
 
@@ -104,22 +111,57 @@ class _Judge:
             return None
         if not any(self._agrees(each) for each in explained):
             self.placement = None  # a slip of the tape or of the pen: it tells none of them from the others
-        found = sorted(((self.evidence(each), each) for each in explained), key=lambda f: -f[0])
-        evidence, best = self._united(found)
-        rivals = [each for its, each in found if self._is_rival(its, each, evidence, best)]
-        told = tuple(self._told(rival, (), is_sure=False) for rival in rivals)
-        beats_chance = best.n == len(self.shared) or evidence > MARGIN_NATS
-        return self._told(best, told, is_sure=beats_chance and not rivals)
-
-    def _united(self, found: list[tuple[float, Explanation]]) -> tuple[float, Explanation]:
-        """The best, joined by others that have map b at the same place: groups of tags far from each other."""
+        found = self._united(explained)
         evidence, best = found[0]
-        for _, other in found[1:]:
-            if self._is_same_place(other, best) and (other.members & ~best.members).any():
-                together = settled(self.fit, best.linear.at, best.members | other.members)
-                if together is not None and self.evidence(together) > evidence:
-                    evidence, best = self.evidence(together), together
-        return evidence, best
+        each_once = {each.members.tobytes(): (its, each) for its, each in found + self._doubted(evidence, best)}
+        found = sorted(each_once.values(), key=lambda f: -f[0])
+        rivals: list[Explanation] = []
+        for its, each in found:
+            if self._is_rival(its, each, evidence, best) and not any(self._is_same_place(each, r) for r in rivals):
+                rivals.append(each)
+        told = tuple(self._told(rival, found, (), is_sure=False) for rival in rivals)
+        beats_chance = best.n == len(self.shared) or evidence > MARGIN_NATS
+        return self._told(best, found, told, is_sure=beats_chance and not rivals)
+
+    def _doubted(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
+        """The best without tags that it gains little from, several together too: two wrong ones bear each other out."""
+        found = last = [(evidence, best)]
+        for _ in range(_MOST_DOUBTED):
+            fewer: dict[bytes, tuple[float, Explanation]] = {}
+            for its, each in last:
+                if each.n < 3:
+                    continue
+                held = np.flatnonzero(each.members)
+                for tag in held[each.held.worth_nats() < its - evidence + _DOUBT_NATS]:
+                    less = without(each, tag)
+                    if (key := less.members.tobytes()) not in fewer:
+                        fewer[key] = self.evidence(less), less
+            last = sorted((f for f in fewer.values() if f[0] > evidence - _DOUBT_NATS), key=lambda f: -f[0])[:_BEAM]
+            found = found + last
+        return found
+
+    def _united(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
+        """Best first: what was found, and what becomes of groups of tags far from each other that agree on the place.
+
+        From two tags in one corner a tag in another is foretold too ill to be counted; with two there it is told.
+        """
+        found = {each.members.tobytes(): (self.evidence(each), each) for each in explained}
+        tried: set[bytes] = set()
+        while True:
+            ranked = sorted(found.values(), key=lambda f: -f[0])
+            for (its, one), (others, other) in combinations(ranked, 2):
+                members = one.members | other.members
+                if members.tobytes() in tried or members.tobytes() in found or not self._is_same_place(one, other):
+                    continue
+                tried.add(members.tobytes())
+                together = settled(self.fit, one.linear.at, members)
+                if together is None or together.members.tobytes() in found:
+                    continue
+                if (evidence := self.evidence(together)) > max(its, others):
+                    found[together.members.tobytes()] = evidence, together
+                    break
+            else:
+                return ranked
 
     def evidence(self, explanation: Explanation) -> float:
         """Log of the likelihood of the shared tags over that of all being wrong.
@@ -161,11 +203,24 @@ class _Judge:
     def _is_rival(self, evidence: float, other: Explanation, best_evidence: float, best: Explanation) -> bool:
         if evidence > best_evidence - MARGIN_NATS and not self._is_same_place(other, best):
             return True
-        own, best_own = other.members & ~best.fits, best.members & ~other.fits
-        if own.sum() < 2 or best_own.sum() >= GROUP_MARGIN * own.sum():
+        own, best_own = other.members & ~best.members, best.members & ~other.members
+        if (own & ~best.fits).sum() < 2 or (moved := self._as_group(own, other)) <= 0.0:
             return False
-        # A group that fits together better than chance would have it moved as one, whatever the numbers say.
-        return self.evidence(Explanation(own, other.linear, hold(other.linear, own))) > MARGIN_NATS
+        # A group that rather moved as one than each tag on its own, so it may as well be what stayed. What fits the
+        # group may be of it.
+        n_group = (other.fits & ~best.members).sum()
+        if best.n < GROUP_MARGIN * n_group:
+            return True
+        # The same where tags that fit both stayed too: these tell which.
+        best_moved = max(self._as_group(best_own, best), 0.0)
+        tells_little = evidence + best_moved > best_evidence + moved - MARGIN_NATS
+        return bool(best_own.sum() < GROUP_MARGIN * n_group and tells_little)
+
+    def _as_group(self, tags: BoolArray, explanation: Explanation) -> float:
+        """Evidence that these of its tags fit together."""
+        if tags.sum() < 2:
+            return 0.0
+        return self.evidence(Explanation(tags, explanation.linear, hold(explanation.linear, tags)))
 
     def _is_same_place(self, one: Explanation, other: Explanation) -> bool:
         off = se2.log(se2.between(one.T_a_b, other.T_a_b))
@@ -180,13 +235,34 @@ class _Judge:
         covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
         return covariance
 
-    def _told(self, explanation: Explanation, rivals: tuple[Alignment, ...], *, is_sure: bool) -> Alignment:
+    def _mixed_covariance(self, explanation: Explanation, found: Sequence[tuple[float, Explanation]]) -> FloatArray:
+        """(3, 3) of the right tangent of T_a_b, with the doubt of which tags fit.
+
+        A mixture of what other choices of tags make of the same place, each by its evidence; second moments about this
+        one.
+        """
+        near = [(its, each) for its, each in found if self._is_same_place(each, explanation)]
+        evidence = np.array([its for its, _ in near])
+        weight = np.exp(evidence - evidence.max())
+        off = np.array([se2.log(se2.between(explanation.T_a_b, each.T_a_b)) for _, each in near])
+        each = np.array([self._covariance(each) for _, each in near]) + off[:, :, None] * off[:, None, :]
+        mixed: FloatArray = np.tensordot(weight / weight.sum(), each, 1)
+        return mixed
+
+    def _told(
+        self,
+        explanation: Explanation,
+        found: Sequence[tuple[float, Explanation]],
+        rivals: tuple[Alignment, ...],
+        *,
+        is_sure: bool,
+    ) -> Alignment:
         off_m, squares = explanation.differences
         inlier = explanation.fits
         apart = self.fit.places_a[inlier] - se2.apply(explanation.T_a_b, self.fit.places_b[inlier])
         return Alignment(
             T_a_b=explanation.T_a_b,
-            covariance=self._covariance(explanation),
+            covariance=self._mixed_covariance(explanation, found),
             shared=self.shared,
             inlier=inlier,
             off_m=np.where(inlier, 0.0, np.linalg.norm(off_m, axis=1)),

@@ -43,7 +43,7 @@ class Explanation:
     @property
     def T_a_b(self) -> FloatArray:
         """(3,) pose of frame b in frame a."""
-        return self.linear.at.T_a_b
+        return self.held.T_a_b
 
     @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray]:
@@ -78,6 +78,13 @@ def explanations(fit: JointFit) -> list[Explanation]:
             together |= np.outer(explanation.members, explanation.members)
             most = max(most, explanation.n)
     return found
+
+
+def without(explanation: Explanation, tags: IntArray) -> Explanation:
+    """The same tags but for some."""
+    members = explanation.members.copy()
+    members[tags] = False
+    return Explanation(members, explanation.linear, hold(explanation.linear, members))
 
 
 def _draws_needed(share: float) -> float:

@@ -136,10 +136,8 @@ class JointFit:
         """The bend that the tags held ask for."""
         pull = np.zeros(2 * self.n)
         pull[held.rows] = held.pull
-        dx, dy, turn = held.motion
-        about = linear.centre - se2.apply([0.0, 0.0, turn], linear.centre)
         return Bend(
-            se2.compose([about[0] + dx, about[1] + dy, turn], linear.at.T_a_b),
+            held.T_a_b,
             -self.a.covariance @ (linear.by_a.T @ pull),
             -self.b.covariance @ (linear.by_b.T @ pull),
         )
@@ -180,6 +178,14 @@ class Held:
     left: FloatArray  # (2 m,) whitened
 
     @property
+    def T_a_b(self) -> FloatArray:
+        """(3,) pose of frame b in frame a once the motion is made."""
+        dx, dy, turn = self.motion
+        centre = self.linear.centre
+        about = centre - se2.apply([0.0, 0.0, turn], centre)
+        return se2.compose([about[0] + dx, about[1] + dy, turn], self.linear.at.T_a_b)
+
+    @property
     def rise(self) -> float:
         """In squared sigmas."""
         return float(self.left @ self.left)
@@ -207,45 +213,37 @@ class Held:
         spread += lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
         return off.reshape(n, 2), spread
 
-    def without_each(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def without_each(self) -> tuple[FloatArray, FloatArray]:
         """What the others make of each tag held: three tags at least.
 
         With P the inverse covariance freed of the motion, P_ii^-1 (P w)_i is the difference that the others leave, and
         P_ii^-1 the covariance that they foretell for it (Baarda's test).
 
         Returns:
-            (m, 2) differences, (m, 2, 2) their covariances, and (m, 3) by how much the motion changes without each.
+            (m, 2) differences, and (m, 2, 2) their covariances.
         """
         m = len(self.rows) // 2
         inverse_root = linalg.solve_triangular(self.root, np.eye(2 * m), lower=True, check_finite=False)
         lever = (inverse_root.T @ self.whitened).reshape(m, 2, 3)
         each = inverse_root.reshape(2 * m, m, 2)
         P = np.einsum("rma,rmb->mab", each, each)
-        by_lever = lever @ np.linalg.inv(self.information)
-        P -= by_lever @ lever.transpose(0, 2, 1)
+        P -= lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
         covariance = np.linalg.inv(P)
-        off = (covariance @ self.pull.reshape(m, 2, 1))[..., 0]
-        return off, covariance, np.einsum("mij,mi->mj", by_lever, off)
+        return (covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance
 
     def misfits(self) -> FloatArray:
         """(m,) how ill each tag held fits where the others want it, see `ill_fitting`; three tags at least."""
-        off, covariance, _ = self.without_each()
-        return ill_fitting(off, covariance)
+        return ill_fitting(*self.without_each())
+
+    def worth_nats(self) -> FloatArray:
+        """(m,) log of how much better each tag held fits than it would anywhere in reach; three tags at least."""
+        off, covariance = self.without_each()
+        worth: FloatArray = 0.5 * (_better_than_wrong(covariance) - squared_sigmas(off, covariance))
+        return worth
 
     def motion_covariance(self) -> FloatArray:
-        """(3, 3) of the motion, with what is in doubt of each tag: were it wrong, the motion would be another.
-
-        A mixture of the motion with and without each tag, by how much better a wrong tag, anywhere in reach, explains
-        it.
-        """
-        covariance = np.asarray(np.linalg.inv(self.information), dtype=np.float64)
-        if len(self.rows) < 6:
-            return covariance
-        off, spread, change = self.without_each()
-        gain_nats = 0.5 * (_better_than_wrong(spread) - squared_sigmas(off, spread))
-        doubt = 1.0 / (1.0 + np.exp(np.clip(gain_nats, -30.0, 30.0)))
-        mixed: FloatArray = covariance + (doubt[:, None] * change).T @ change
-        return mixed
+        """(3, 3) of the motion."""
+        return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
 
 
 @lru_cache

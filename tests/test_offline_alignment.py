@@ -1,15 +1,17 @@
 """The transform between two maps from the tags they share, and when it is sure."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import FloatArray
-from offline.alignment import Alignment, align, fit_transform
+from offline.alignment import MARGIN_NATS, Alignment, align, fit_transform
 from offline.condensed import CondensedMap
 from offline.measured import Placement
 from offline.run import TagKey
@@ -27,12 +29,12 @@ def named(points: FloatArray, first_id: int = 0) -> dict[TagKey, FloatArray]:
     return {TagKey("tag36h11", first_id + i): point for i, point in enumerate(points)}
 
 
-def seen(tags: Mapping[TagKey, FloatArray], name: str = "a") -> CondensedMap:
+def seen(tags: Mapping[TagKey, FloatArray], name: str = "a", sigma_m: float = SIGMA_M) -> CondensedMap:
     """A map whose tags were all read from its start, each with the same noise."""
     n = len(tags)
     keys = tuple(sorted(tags))
     covariance = np.zeros((5 * n, 5 * n))
-    covariance[3 * n :, 3 * n :] = SIGMA_M**2 * np.eye(2 * n)
+    covariance[3 * n :, 3 * n :] = sigma_m**2 * np.eye(2 * n)
     return CondensedMap(
         name, keys, np.zeros((n, 3)), np.array([tags[key] for key in keys]).reshape(-1, 2), covariance, 0
     )
@@ -186,6 +188,53 @@ def test_a_measured_start_settles_what_tags_leave_open() -> None:
         assert alignment is not None
         assert alignment.is_sure
         assert_same_transform(alignment.T_a_b, np.array([shift_m, 0.0, 0.0]), atol=1e-6)
+
+
+def two_moved_as_one(shift_m: float) -> Alignment:
+    """Five tags in one corner, which foretell two far ones to 1.3 m; these two moved sideways together."""
+    b = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0], [15.0, 0.0], [16.0, 2.0]])
+    a = b.copy()
+    a[5:] += [0.0, shift_m]
+    alignment = align(seen(named(a), sigma_m=0.4), seen(named(b), "b", sigma_m=0.4))
+    assert alignment is not None
+    return alignment
+
+
+def test_two_wrong_tags_that_bear_each_other_out_leave_doubt() -> None:
+    """Either alone is held by the other; only without both would the rest have map b elsewhere."""
+    alignment = two_moved_as_one(5.0)
+    assert alignment.n_inliers == 7
+    off = se2.log(alignment.T_a_b)
+    assert float(off @ np.linalg.solve(alignment.covariance, off)) < chi2.isf(1e-4, 3)
+    assert alignment.covariance[2, 2] > 9.0 * two_moved_as_one(0.0).covariance[2, 2]
+
+
+def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
+    """A corridor 40 m long that map a has bent, three tags at each end and two wrong ones near the first."""
+    near = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [5.0, 9.0], [8.0, -7.0]])
+    far = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0]])
+    n_near, n_far = len(near), len(far)
+    straight = seen(named(np.concatenate([near, far])), "b")
+    T_start_far = np.array([40.0, 0.0, 0.0])
+    b = replace(straight, T_start_anchor=np.concatenate([np.zeros((n_near, 3)), np.tile(T_start_far, (n_far, 1))]))
+    bend = np.array([6.0, -9.0, 0.6])
+    moved = near + np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [3.0, 2.0], [-4.0, 1.0]])
+    # What lies at the far end was read from poses there, which err together.
+    at_far_end = np.repeat([0.0, 1.0], [n_near, n_far])
+    covariance = b.covariance.copy()
+    n_poses = 3 * (n_near + n_far)
+    covariance[:n_poses, :n_poses] += np.kron(np.outer(at_far_end, at_far_end), np.diag([6.0, 6.0, 0.4]) ** 2)
+    a = replace(
+        b,
+        name="a",
+        T_start_anchor=se2.compose(b.T_start_anchor, np.outer(at_far_end, bend)),
+        tag_m=np.concatenate([moved, far]),
+        covariance=covariance,
+    )
+    alignment, by_near_end = align(a, b), align(seen(named(moved)), seen(named(near), "b"))
+    assert alignment is not None
+    assert by_near_end is not None
+    assert alignment.evidence_nats > by_near_end.evidence_nats + MARGIN_NATS
 
 
 @given(ANY, st.integers(0, 1000))
