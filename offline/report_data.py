@@ -12,7 +12,7 @@ from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.picture import RUN_COLOURS
 from offline.report_timeline import events_of, timeline
-from offline.report_words import advice_sentence, has_several_families, tag_label
+from offline.report_words import advice_sentence, has_several_families, tag_label, would_help
 from offline.workings import Solved, Workings
 
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
@@ -105,7 +105,7 @@ def _component(
             {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
             | dict(zip("xy", _rounded(np.array(each["way_m"])), strict=True))
             for each in document["advice"]
-            if each["component"] == index
+            if each["component"] == index and would_help(each)
         ],
     }
 

@@ -164,7 +164,7 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     """What to do, and what that would do to the worst tag; of an entry of `advice` in map.json."""
     now, then = _metres(advice["sigma_m"]), _metres(advice["sigma_then_m"])
     worst = f"the largest sigma, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
-    if now == then:
+    if not would_help(advice):
         return f"One more drive or tag would hardly help: {worst}, would stay at {now}."
     first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]
     if advice["kind"] == "pass":
@@ -178,6 +178,11 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
             "and the same drives again,"
         )
     return f"{what} would bring {worst}, from {now} to about {then}."
+
+
+def would_help(advice: dict[str, Any]) -> bool:
+    """Whether a person would see a difference."""
+    return _metres(advice["sigma_m"]) != _metres(advice["sigma_then_m"])
 
 
 def has_several_families(document: dict[str, Any]) -> bool:

@@ -95,7 +95,7 @@ def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
     known = known_of(scene.solution, gains["tag"])
     shares = [seen_shares(drives, view, each, known) for each in found.places]
     assert {float(each.max()) for each in shares} == {1.0}  # from the pose beside it
-    assert min(float(each.min()) for each in shares) < 0.5  # some may have passed too far away
+    assert min(float(each.min()) for each in shares) < 0.9  # some may have passed too far away
     gains["tag"] = [gain_of_place(drives, view, *each) for each in zip(found.places, shares, strict=True)]
     for each in told:
         known = known_of(scene.solution, gains[each.kind])
