@@ -1,12 +1,9 @@
 """The report says what the map says, whatever names are in it, and a browser draws it."""
 
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +14,14 @@ from offline.pipeline import map_logs
 from offline.report import write_report
 from offline.report_data import figures
 from offline.report_page import as_script_data, page
-from offline.report_tables import essential_tags, tables
-from offline.report_words import largest_sigma_m, sentences
+from offline.report_tables import tables
+from offline.report_words import sentences
 from offline.result import MapResult
 from offline.run import RunEvent
 from offline.workings import Workings
 from tests.browser import Page, browser, chromium
 from tests.made_drives import START_NS, MadeTag, S, made_drive, made_robot, write_drive
-from tests.made_maps import made_component, made_map
+from tests.read_report import Read, data_of
 
 pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
 
@@ -38,48 +35,6 @@ AHEAD = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
 
 Inside = tuple[MapResult, Workings]
-
-
-class Read(HTMLParser):
-    """Texts, tables by their section, and the elements of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-        self.tables: dict[str, list[list[str]]] = {}
-        self._section, self._cell = "", False
-        self._stack: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs)))
-        self._stack.append(tag)
-        if tag == "section":
-            self._section = dict(attrs).get("id") or ""
-        elif tag == "div" and dict(attrs).get("id") == "words":
-            self._section = "words"
-        elif tag == "tr":
-            self.tables.setdefault(self._section, []).append([])
-        elif tag in ("td", "th"):
-            self.tables[self._section][-1].append("")
-        elif tag == "p" and self._section == "words":
-            self.words.append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        while self._stack and self._stack.pop() != tag:
-            pass
-
-    def handle_data(self, data: str) -> None:
-        inner = self._stack[-1] if self._stack else ""
-        if inner in ("td", "th"):
-            self.tables[self._section][-1][-1] += data
-        elif inner == "p" and self._section == "words":
-            self.words[-1] += data
-
-    def rows(self, key: str) -> list[dict[str, str]]:
-        head, *rows = self.tables[key]
-        return [dict(zip(head, row, strict=True)) for row in rows]
 
 
 @pytest.fixture(scope="module")
@@ -112,13 +67,6 @@ def inside(logs: list[Path]) -> Inside:
 def written(inside: Inside, folder: Path) -> Read:
     write_report(*inside, folder / "report.html")
     return Read((folder / "report.html").read_text())
-
-
-def data_of(path: Path) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text())
-    assert found is not None
-    data: dict[str, Any] = json.loads(found[1])
-    return data
 
 
 def close(told: str, true: float) -> bool:
@@ -292,63 +240,6 @@ def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     assert [row["component"] for row in read.rows("runs")] == ["1", "1", "2"]
     plots = [attributes["class"] for _, attributes in read.elements if "plot" in (attributes.get("class") or "")]
     assert plots == ["plot map"] * 2 + ["plot before"] + ["plot timeline"] * 3
-
-
-# What the sentences make of a map.
-
-
-def words_of(**changes: Any) -> str:
-    return " ".join(sentences(map_as_json(made_map()) | changes))
-
-
-def test_doubts_are_said() -> None:
-    document = map_as_json(made_map())
-    calm = words_of(warnings=[])
-    assert "Nothing in it contradicts anything else" in calm
-    assert "comes with 1 warning" in words_of()
-    (check,) = document["checks"]
-    told = words_of(checks=[check | {"sigmas": 7.2}])
-    assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
-    suspect = {"tag_id": 3, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
-    assert "1 tag does not belong: 3 (moved)" in words_of(suspect_tags=[suspect])
-    (alignment,) = document["alignments"]
-    told = words_of(alignments=[alignment | {"is_sure": False}])
-    assert "1 alignment could not be told for sure and was left out: red_one with blue_two" in told
-    tags = [tag | {"n_observations": 2} for tag in document["tags"]]
-    assert "3 tags were read less than 3 times: 3, 7 and 3" in words_of(tags=tags)
-    taped = document["measurements"][0] | {"contradicts": True}
-    assert "1 measurement by hand does not fit to the rest" in words_of(measurements=[taped])
-
-
-def test_unknown_numbers_are_not_said() -> None:
-    unknown = replace(made_component(), joint_covariance=np.full((12, 12), np.nan))
-    tags = tuple(replace(tag, covariance=np.full((2, 2), np.nan)) for tag in unknown.tags)
-    document = map_as_json(made_map(replace(unknown, tags=tags)))
-    assert largest_sigma_m(document["tags"][0]["covariance"]) is None
-    assert "nan" not in " ".join(sentences(document))
-    (shown,) = [table for table in tables(document) if table.key == "tags"]
-    assert not any("nan" in cell for row in shown.rows for cell in row)
-
-
-def test_tags_without_which_runs_fall_apart() -> None:
-    document = map_as_json(made_map())
-    assert [tag["tag_id"] for tag in essential_tags(document, 0)] == [7, 3]
-    more = [tag | {"runs": ["red_one", "blue_two"]} for tag in document["tags"]]
-    assert essential_tags(document | {"tags": more}, 0) == []
-
-
-def test_fitted_noise_is_told(inside: Inside) -> None:
-    document = map_as_json(inside[0])
-    parameters = [
-        {"name": "sigma_corner_px", "value": 0.31, "low": 0.28, "high": 0.35, "redundancy": 200.0, "kept": ""},
-        {"name": "sigma_range_m", "value": 0.02, "low": None, "high": None, "redundancy": 0.0, "kept": "no reading"},
-    ]
-    fit = {"parameters": parameters, "runs": ["a_one"], "shared_range": 0.0, "shared_bearing": 0.0, "contradicting": []}
-    (noise,) = [table for table in tables(document | {"noise_fit": fit}) if table.key == "noise"]
-    rows = {row[0]: row for row in noise.rows}
-    assert rows["sigma_corner_px"][2:] == ("0.28 to 0.35", "fitted")
-    assert rows["sigma_range_m"][2:] == ("", "no reading")
-    assert "a_one" in noise.note
 
 
 # Size.
