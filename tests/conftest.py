@@ -1,6 +1,8 @@
 """What holds for every test."""
 
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -55,3 +57,38 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         return Outcome(int(caught.value.code or 0), captured.out, captured.err.replace(f"{COMPILING}\n", ""))
 
     return call
+
+
+@pytest.fixture
+def map_to(run: Run, tmp_path: Path) -> Run:
+    """`groundsbot-offline map ARGUMENTS -o OUT`."""
+
+    def call(*arguments: object, output: Path | None = None) -> Outcome:
+        return run("map", *arguments, "-o", output or tmp_path / "out")
+
+    return call
+
+
+@pytest.fixture
+def refused(map_to: Run, tmp_path: Path) -> Callable[..., str]:
+    """The one line of a refusal that leaves nothing behind."""
+
+    def call(*arguments: object, output: Path | None = None) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        outcome = map_to(*arguments, output=output)
+        assert outcome.code == 1
+        assert outcome.out == ""
+        assert outcome.err.startswith("error: ")
+        assert outcome.err.count("\n") == 1
+        assert sorted(tmp_path.rglob("*")) == before
+        return outcome.err
+
+    return call
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> dict[str, Path]:
+    """Two short drives for `map`, by robot."""
+    from tests.map_cases import made_logs
+
+    return made_logs(tmp_path / "logs")
