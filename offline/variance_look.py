@@ -159,7 +159,7 @@ class _Shares(NamedTuple):
     def expected(self, left: FloatArray) -> FloatArray:
         """(K,) traces of the shares times what the estimate leaves (M, n, n)."""
         found = np.zeros(self.n_variances)
-        found[self.of] = self.matrices.reshape(len(self.of), -1) @ left.reshape(-1)
+        found[self.of] = self.matrices.reshape(len(self.of), left.size) @ left.reshape(-1)
         return found
 
 
@@ -183,7 +183,7 @@ class _Kind:
         for share, unit, variance in zip(own, self._unit, variances[self._of].tolist(), strict=True):
             np.matmul(matrices @ unit, variance * turned, out=share)
         force = np.zeros((self._n_variances, residual.size))
-        force[self._of] = np.einsum("kmij,mj->kmi", own, residual).reshape(len(own), -1)
+        force[self._of] = np.einsum("kmij,mj->kmi", own, residual).reshape(len(own), residual.size)
         at_most = np.zeros(self._n_variances)
         at_most[self._of] = np.einsum("kmii->k", own)
         return _Shares(self._of, own, self._n_variances, force, at_most)
