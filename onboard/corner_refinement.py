@@ -32,9 +32,8 @@ _LEAST_BAND_PX: Final = 1.2
 _CLEAR_OF_CORNER_PX: Final = 2.0
 _FARTHEST_PX: Final = 1.5  # that a side may lie from where the detector saw it
 _LEAST_CONTRAST: Final = 10.0  # grey levels: twice h
-# Residuals' RMS over the contrast: 0.02 for an edge under a sensor's noise; from here on something else is there, and
-# in rendered drives what is refined is no better than what was detected.
-_ROUGHEST: Final = 0.07
+# Residuals' RMS over the contrast, 0.02 for an edge under a sensor's noise: beyond, something else is there too.
+_ROUGHEST: Final = 0.1
 _LEAST_PIXELS: Final = 25  # five for each parameter
 
 

@@ -57,6 +57,7 @@ class Case:
     side_px: float = 40.0
     angle_deg: float = 20.0
     smear_px: float = 0.0  # of motion during the exposure
+    wall: float = 0.6  # brightness of what the tag hangs on
     off_axis_px: float = 0.0  # that the picture is cut out of a larger one, down and right of the lens's axis
     settings: dict[str, float] = field(default_factory=dict)  # of fixtures.world.Pictures
 
@@ -69,7 +70,7 @@ CASES: Final = (
     *(Case(f"smear {smear} px", smear_px=smear) for smear in (1.0, 3.0)),
     Case("gamma 1.1", settings={"gamma": 1.1}),
     Case("overexposed, blooming", settings={"white": 1.3, "bloom": 0.3}),
-    Case("dim", settings={"white": 0.25, "black": 0.015, "full_well_electrons": 3000.0}),
+    Case("dim", wall=0.15, settings={"white": 0.2, "black": 0.012, "full_well_electrons": 3000.0}),
     Case("off the lens's axis", off_axis_px=400.0),
     Case("the same, side 160 px", side_px=160.0, off_axis_px=400.0),
 )
@@ -145,7 +146,8 @@ def _world(case: Case, towards: FloatArray) -> World:
     normal = np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
     along = np.array([-normal[1], normal[0]])
     on_wall = place[:2] - 0.002 * normal
-    wall = Wall(line_m=[(on_wall - 4.0 * along).tolist(), (on_wall + 4.0 * along).tolist()])
+    line_m = [(on_wall - 4.0 * along).tolist(), (on_wall + 4.0 * along).tolist()]
+    wall = Wall(line_m=line_m, brightness=case.wall)
     tag = WorldTag(tag_id=TAG_ID, position_m=place.tolist(), yaw_deg=float(yaw), size_m=SIDE_M, roll_deg=4.0)
     up_to_m = max(4.0, float(place[2]) + 3.0)
     update: dict[str, Any] = {"walls": [wall], "boxes": [], "tags": [tag], "ceiling_height_m": up_to_m}
