@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import sparse
 from scipy.linalg import hadamard
-from scipy.special import chdtri
+from scipy.special import chdtr, chdtri
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import Linearised, State, stacked, whitening
@@ -107,10 +107,11 @@ class Looker:
         solved = self.solution.factorisation.solve_many(inner)
         explained = np.asarray(jacobian @ solved[:, :_N_SIGNS])
         left = _own_blocks_left(self._signs, explained, self._n_odometry)
+        kept = [_kept_of_square(each) for each in residuals]
         return Seen(
             force @ np.concatenate([each.reshape(-1) for each in residuals]),
-            shares[0].expected(left[0]) + shares[1].expected(left[1]),
-            shares[0].at_most + shares[1].at_most,
+            kept[0] * shares[0].expected(left[0]) + kept[1] * shares[1].expected(left[1]),
+            kept[0] * shares[0].at_most + kept[1] * shares[1].at_most,
             _positive(2.0 * (force @ force.T - inner[:, _N_SIGNS:].T @ solved[:, _N_SIGNS:])),
             good,
         )
@@ -227,3 +228,13 @@ def _no_fault(residual: FloatArray) -> BoolArray:
     level = max(1.0, float(np.median(square)) / float(chdtri(n, 0.5)))
     good: BoolArray = square <= level * chdtri(n, _FAULT)
     return good if good.mean() > 1.0 - _MAX_FAULTS else np.ones(len(good), dtype=np.bool_)
+
+
+def _kept_of_square(residual: FloatArray) -> float:
+    """What is expected of the squares of good residuals (M, n), as a share, though the largest are taken for faults.
+
+    The mean of chi-square up to a bound, over the share of it that lies there: those left out would bring n times
+    P(chi-square with n + 2 degrees beyond the bound).
+    """
+    n = residual.shape[1]
+    return float(chdtr(n + 2, chdtri(n, _FAULT)) / (1.0 - _FAULT))

@@ -52,6 +52,11 @@ class Found:
         return self.found.low < self.true < self.found.high
 
     @property
+    def mark(self) -> str:
+        """A sign behind it in the table: not fitted, or truth outside of its interval."""
+        return "*" if self.found.kept else " " if self.inside else "!"
+
+    @property
     def close(self) -> bool | None:
         """Whether it is within 20 % of the truth; None where there is too little redundancy."""
         return None if self.found.redundancy < ENOUGH_REDUNDANCY else abs(self.ratio - 1.0) <= CLOSE
@@ -134,14 +139,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     _tell(f"not joined: {row}")
                     continue
                 rows.append(row)
-                ratios = " ".join(f"{each.ratio:7.3f}{'*' if each.found.kept else ' '}" for each in row.parameters)
+                ratios = " ".join(f"{each.ratio:7.3f}{each.mark}" for each in row.parameters)
                 _tell(f"{world:9s} {seed:4d} {row.factor:5g}  {ratios}  {row.nees_tags:6.2f} {row.nees_start:6.2f}")
     all_good = not apart
     for world in worlds:
         for factor in factors:
             lines, good = summary([row for row in rows if (row.world, row.factor) == (world, factor)])
             all_good &= good
-            _tell(f"{world}, from {factor:g} times the truth (* not fitted):")
+            _tell(f"{world}, from {factor:g} times the truth (* not fitted, ! truth outside):")
             for line in lines:
                 _tell("  " + line)
     return 0 if all_good else 1
