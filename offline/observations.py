@@ -119,7 +119,8 @@ def read_detections(
     """Turns corners into readings about the camera.
 
     Pictures that share a keyframe were taken from one standing pose: their corners are averaged, and the average keeps
-    the sigma of one picture, since what a detector gets wrong it gets wrong in each of them.
+    the sigma of one picture, since what a detector gets wrong it gets wrong in each of them. Two tags with one id in
+    one picture are two readings.
 
     Args:
         run: whose camera and tag sizes apply.
@@ -136,7 +137,9 @@ def read_detections(
         return _no_readings(), []
     # A corner that is no number would spoil the mean of its standing pose.
     known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
-    keyframe, tag, corners_px = _averaged(keyframe[known], detections.tag[known], detections.corners_px[known])
+    keyframe, tag, corners_px = _averaged(
+        keyframe[known], detections.tag[known], detections.corners_px[known], detections.stamps_ns[known]
+    )
     if not len(tag):
         return _no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
     found, is_askew, level = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
@@ -351,14 +354,41 @@ def _level(chi2: FloatArray) -> float:
     return level if len(finite) >= _READINGS_FOR_LEVEL else max(1.0, level)
 
 
-def _averaged(keyframe: IntArray, tag: IntArray, corners_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """One set of corners for each tag and keyframe."""
+def _averaged(
+    keyframe: IntArray, tag: IntArray, corners_px: FloatArray, stamps_ns: IntArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """One set of corners for each tag and keyframe; for each of several tags with one id that a picture shows."""
     n_tags = int(tag.max()) + 1
     pairs, group = np.unique(keyframe * n_tags + tag, return_inverse=True)
+    twin = np.zeros(len(tag), dtype=np.int64)
+    pictures, in_picture = np.unique(np.column_stack([group, stamps_ns]), axis=0, return_counts=True)
+    for pair in np.unique(pictures[in_picture > 1, 0]).tolist():
+        own = np.flatnonzero(group == pair)
+        twin[own] = _twins(corners_px[own], stamps_ns[own])
+    pairs = pairs[group] * (int(twin.max()) + 1) + twin
+    pairs, first, group, count = np.unique(pairs, return_index=True, return_inverse=True, return_counts=True)
     total = np.zeros((len(pairs), 4, 2))
     np.add.at(total, group, corners_px)
-    count = np.bincount(group, minlength=len(pairs))
-    return pairs // n_tags, pairs % n_tags, total / count[:, None, None]
+    return keyframe[first], tag[first], total / count[:, None, None]
+
+
+def _twins(corners_px: FloatArray, stamps_ns: IntArray) -> IntArray:
+    """(M,) which of several tags with one id each set of corners from one standing pose is of.
+
+    Printed squares do not overlap, so that centres nearer than half a side are one tag read twice.
+    """
+    centre_px = corners_px.mean(axis=1)
+    half_side_px = 0.5 * np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=1), axis=-1).max(axis=1)
+    found = np.zeros(len(corners_px), dtype=np.int64)
+    known: list[int] = []
+    _, picture, count = np.unique(stamps_ns, return_inverse=True, return_counts=True)
+    for each in np.argsort(-count, kind="stable").tolist():  # first a picture that shows all
+        for i in np.flatnonzero(picture == each).tolist():
+            away_px = np.linalg.norm(centre_px[known] - centre_px[i], axis=-1)
+            is_new = bool((away_px > half_side_px[i]).all())
+            found[i] = len(known) if is_new else int(np.argmin(away_px))
+            known += [i] * is_new
+    return found
 
 
 def _no_readings() -> Readings:

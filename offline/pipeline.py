@@ -38,6 +38,7 @@ from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import RunsAlone, joined, split_together, with_outliers_apart
 from offline.suspects_report import suspect_tags
+from offline.twins import told_apart
 from offline.weak_parts import weak_parts
 from offline.workings import Solved, Workings
 
@@ -120,7 +121,7 @@ def build_map(
     chains: list[Chain] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
-            chains += chains_of(run, noise or prior_noise)
+            chains += [told_apart(chain) for chain in chains_of(run, noise or prior_noise)]
             done()
     measurements = _measurements(tape, runs, chains)
     maps, broken = _local_maps(runs, chains, stages)

@@ -54,17 +54,19 @@ class Case:
         seen: for each chain that saw it, in that order, the places in order of time, as indices of stands, none twice
             in a row.
         is_ordered: whether no two of these chains were driven at the same time.
+        at_once: whether one of them saw it in two places at the same time.
     """
 
     tag: TagKey
     stands: tuple[Stand, ...]
     seen: dict[int, tuple[int, ...]]
     is_ordered: bool
+    at_once: bool
 
     def kind(self) -> str:
         """Moved, moving or duplicated, by who saw it where."""
         ways = list(self.seen.values())
-        if any(len(set(way)) < len(way) for way in ways):
+        if self.at_once or any(len(set(way)) < len(way) for way in ways):
             return DUPLICATED
         mixed = [way for way in ways if len(way) > 1]
         if self.is_ordered:
@@ -91,7 +93,8 @@ def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case
             c: _without_repeats([labels.index(int(label[s])) for s in own if sightings.chain[s] == c])
             for c in dict.fromkeys(sightings.chain[own].tolist())
         }
-        found.append(Case(tag, stands, seen, sightings.one_after_the_other(own)))
+        at_once = _in_two_places_at_once(sightings, own, label[own])
+        found.append(Case(tag, stands, seen, sightings.one_after_the_other(own), at_once))
     return found
 
 
@@ -142,6 +145,16 @@ def shift(case: Case, evidence: Evidence, places: Places, first: int = 0, second
     """Metres between two stands of a case, and sigmas."""
     off, covariance = places.apart(evidence, case.stands[first].label, case.stands[second].label)
     return float(np.hypot(*off)), float(np.sqrt(off @ np.linalg.solve(covariance, off)))
+
+
+def _in_two_places_at_once(sightings: Sightings, own: IntArray, label: IntArray) -> bool:
+    """Whether sightings (indices) of different places (of each) in one run overlap in time."""
+    return any(
+        p != q
+        and sightings.chain[s] == sightings.chain[t]
+        and max(sightings.first_ns[s], sightings.first_ns[t]) <= min(sightings.last_ns[s], sightings.last_ns[t])
+        for (s, p), (t, q) in combinations(zip(own.tolist(), label.tolist(), strict=True), 2)
+    )
 
 
 def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:

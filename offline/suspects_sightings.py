@@ -17,7 +17,7 @@ from offline.chain import Chain
 from offline.run import TagKey
 
 # Longer out of sight, by the way driven or by the clock, and it is another sighting.
-_GAP_M: Final = 2.0
+GAP_M: Final = 2.0
 _GAP_S: Final = 10.0
 _INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
 
@@ -111,9 +111,7 @@ def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:
     along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))[keyframe]
     stamps_ns = chain.stamps_ns[keyframe]
     begins = np.ones(len(order), dtype=np.bool_)
-    begins[1:] = (
-        cut[order][1:] | (np.diff(tag) != 0) | (np.diff(along_m) > _GAP_M) | (np.diff(stamps_ns) > _GAP_S * 1e9)
-    )
+    begins[1:] = cut[order][1:] | (np.diff(tag) != 0) | (np.diff(along_m) > GAP_M) | (np.diff(stamps_ns) > _GAP_S * 1e9)
     number = np.cumsum(begins) - 1
     starts = np.flatnonzero(begins)
     count = np.diff(np.append(starts, len(order)))

@@ -171,6 +171,18 @@ def test_a_standing_pose_gives_one_reading_with_the_sigma_of_one_picture() -> No
     np.testing.assert_allclose(many.covariance, one.covariance, rtol=1e-6)
 
 
+def test_two_tags_with_one_id_in_one_picture_are_two_readings() -> None:
+    one, other = corners_of(UPRIGHT[1]), corners_of(UPRIGHT[4])
+    # From one standing pose: both, both in the other order, one only, and one that the detector found twice.
+    corners_px = np.array([one, other, other, one, other, one, one + 0.5])
+    stamps_ns = np.array([0, 0, 1, 1, 2, 3, 3])
+    detections = Detections(stamps_ns, np.zeros(7, dtype=np.int64), corners_px)
+    readings, _ = read_detections(run_of(UPRIGHT), detections, np.full(7, 5), NO_TWIST, NOISE)
+    assert readings.keyframe.tolist() == [5, 5]
+    assert readings.tag.tolist() == [0, 0]
+    np.testing.assert_allclose(readings.value, [in_camera(UPRIGHT[1]), in_camera(UPRIGHT[4])], atol=0.01)
+
+
 def test_a_tag_in_the_lens_is_a_phantom() -> None:
     close = MadeTag(3, (0.2 + 0.08, 0.058, 0.396), np.pi + 0.1, size_m=0.03)
     robot = made_robot(mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.03}])

@@ -1,0 +1,63 @@
+"""Two tags with one id that one picture shows stay two, and the map says so."""
+
+import numpy as np
+
+from calib.noise import NoiseParameters
+from offline.chain import chains_of
+from offline.local_map import solve_local_map
+from offline.pipeline import build_map
+from offline.run import Detections, Run, TagKey
+from offline.twins import told_apart
+from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_robot, made_run, picture_stamps, seen_corners_px
+
+TWINS = (3.2, 0.9), (3.0, -0.8)
+TAGS = [
+    MadeTag(0, (*TWINS[0], 0.4), np.pi),
+    MadeTag(0, (*TWINS[1], 0.4), np.pi),
+    MadeTag(1, (3.6, 0.1, 0.4), np.pi),
+    MadeTag(2, (4.4, 1.4, 0.4), np.pi + 0.2),
+    MadeTag(3, (4.2, -1.5, 0.4), np.pi - 0.2),
+]
+SIGMA_PX = 0.2
+
+
+def drive_past(tags: list[MadeTag]) -> Run:
+    """Forward, back and forward again, all tags in view."""
+    drive = made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 3.0), (-0.3, -0.28, 3.0), (0.3, 0.3, 3.0)])
+    robot, rng = made_robot(), np.random.default_rng(1)
+    stamps_ns = picture_stamps(drive)
+    seen = []
+    for stamp, pose in zip(stamps_ns, drive.at(stamps_ns), strict=True):
+        for tag in rng.permutation(len(tags)):  # a detector's order says nothing
+            corners_px = seen_corners_px(tags[tag], pose, robot, CAMERA)
+            if corners_px is not None:
+                seen.append((stamp, tags[tag].tag_id, corners_px + SIGMA_PX * rng.standard_normal((4, 2))))
+    stamps, ids, corners = zip(*seen, strict=True)
+    detections = Detections(np.array(stamps), np.array(ids), np.array(corners))
+    keys = [TagKey(FAMILY, i) for i in range(4)]
+    return made_run([drive.track], robot=robot, tags=keys, pictures_ns=stamps_ns, detections=detections)
+
+
+def test_two_tags_in_one_picture_are_duplicated() -> None:
+    result = build_map([drive_past(TAGS)], NoiseParameters())
+    (suspect,) = result.suspects
+    assert (suspect.tag_id, suspect.kind) == (0, "duplicated")
+    places = [tag.position_m[:2] for tag in result.components[0].tags if tag.tag_id == 0]
+    assert len(places) == 2
+    for place in TWINS:
+        assert min(np.linalg.norm(np.array(found) - place) for found in places) < 0.1
+
+
+def test_each_keeps_its_readings_however_they_are_ordered() -> None:
+    (chain,) = (told_apart(each) for each in chains_of(drive_past(TAGS), NoiseParameters()))
+    first, second = (chain.readings.tag == i for i in (0, 1))
+    assert [tag.tag_id for tag in chain.tags] == [0, 0, 1, 2, 3]
+    assert first.sum() > 15 and second.sum() > 15  # noqa: PT018
+    bearing = chain.readings.value[:, 1]
+    assert (bearing[first] > 0.0).all() != (bearing[second] > 0.0).all()
+    assert solve_local_map(chain).goodness.fits
+
+
+def test_a_drive_past_one_of_each_id_is_left_as_it_is() -> None:
+    (chain,) = chains_of(drive_past(TAGS[1:]), NoiseParameters())
+    assert told_apart(chain) is chain
