@@ -7,15 +7,13 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray
 from calib.robot import Mount
+from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import CornerGraph, corner_graph
-from offline.corner_problem import CORNER_LOSS
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.factors import State
 from offline.graph import Graph, Parameter
 from offline.result import TagPose
-from offline.robust import losses_and_weights
 from offline.solver import Solution
 
 # Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
@@ -69,18 +67,16 @@ def refine(graph: Graph, solution: Solution) -> tuple[Refined | None, list[str]]
         return None, []  # the map says so already
     corners, start = corner_graph(graph, solution.state)
     found = solve_corners(corners.problem, start)
+    sigma = guessed_wobble(found.problem, found.state)
+    if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
+        found = solve_corners(with_wobble(found.problem, sigma), found.state)
+        sigma = fitted_wobble(found.problem, found.state)
+        found = solve_corners(with_wobble(found.problem, sigma), found.state)
     reason = "" if found.converged else found.reason
-    if not reason and (share := _outliers(found)) > _MOST_OUTLIERS:
+    if not reason and (share := found.problem.outliers(found.state)) > _MOST_OUTLIERS:
         reason = (
             f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
         )
     if reason:
         return None, [f"not refined on tag corners: {reason}; the map is that of tag positions on the floor"]
     return Refined(corners, found), []
-
-
-def _outliers(found: CornerSolution) -> float:
-    """Share of looks beyond where Huber's loss leaves the square."""
-    residual: FloatArray = found.problem.corners.residual(found.state)
-    _, weight = losses_and_weights(CORNER_LOSS, residual)
-    return float((weight < 1.0).mean())

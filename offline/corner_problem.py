@@ -177,6 +177,19 @@ class CornerProblem:
             losses, weight = losses_and_weights(CORNER_LOSS, residual)
         return Weighed(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
 
+    def log_spread(self, state: SpatialState) -> float:
+        """Logarithm of the determinant of the whitened corners' covariance I + J S J^T; 0 where all is level."""
+        linearised, wobble = self.corners.linearise(state, self.columns)
+        weight = self.weighed(linearised.residual, wobble).weight
+        own = self._by_picture(wobble.swapaxes(-1, -2) @ (weight[:, None, None] * wobble))
+        _, logarithms = np.linalg.slogdet(np.eye(3) + self.wobble_sigma**2 * own)
+        return float(np.sum(logarithms))
+
+    def outliers(self, state: SpatialState) -> float:
+        """Share of looks beyond where their loss leaves the square."""
+        linearised, wobble = self.corners.linearise(state, self.columns)
+        return float((self.weighed(linearised.residual, wobble).weight < 1.0).mean())
+
     def moved(self, state: SpatialState, step: FloatArray) -> SpatialState:
         """The state after a step (n,): tags move along with their anchors as on a rigid body, see `solver.Problem`."""
         padded, columns = np.append(step, 0.0), self.columns

@@ -118,6 +118,10 @@ class FrontFactor:
             x[own] = _solved(lower, x[own] - above @ x[up], transposed=True)
         return x
 
+    def log_determinant(self) -> float:
+        """Of H."""
+        return 2.0 * float(sum(np.log(np.diagonal(lower)).sum() for lower in self.lowers))
+
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns: their block of H^-1; 0 where held (-1).
 
