@@ -1,7 +1,7 @@
 """Drives whose wheels miss a part of the way, or count one that was not driven."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -94,8 +94,9 @@ def _joined(
     together = replace(
         first,
         **{
-            name: np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ("keyframe", "tag", "value", "covariance", "by_camera", "polar", "in_camera")
+            each.name: np.concatenate([getattr(first, each.name), getattr(second, each.name)])
+            for each in fields(first)
+            if each.name != "parts"
         },
         parts=_parts([first.parts, second.parts]),
     )
