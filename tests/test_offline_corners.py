@@ -1,6 +1,7 @@
 """Maps refined on tag corners: exact where corners are, honest where they are noisy, the floor where neither."""
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,6 +183,23 @@ def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path
     for refined, known in zip(component.start_to_start, floor.start_to_start, strict=True):
         assert np.linalg.det(refined.covariance) < np.linalg.det(known.covariance)
     np.testing.assert_array_equal(workings.solved[0].poses_of(1), component.runs[1].T_map_base)
+
+
+def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Workings]) -> None:
+    """Six numbers each against the truth, 99.99 %: what turns them is the map's heading, about the vertical of map."""
+    folder, result, _ = room
+    told = json.loads((folder / TRUTH_FILE).read_text())
+    frame = np.array(told["runs"][result.components[0].frame_run]["poses"][0][1:])
+    hung = {tag["tag_id"]: tag for tag in told["tags"]}
+    for tag in result.components[0].tags:
+        assert tag.pose is not None
+        true = hung[tag.tag_id]
+        place = se2.apply(se2.inverse(frame), np.array(true["position_m"][:2]))
+        turn = Rotation.from_euler("z", -frame[2]) * Rotation.from_quat(true["quaternion_xyzw"])
+        off = Rotation.from_quat(tag.pose.quaternion_xyzw) * turn.inv()
+        error = np.concatenate([tag.position_m - place, [tag.pose.height_m - true["position_m"][2]], off.as_rotvec()])
+        assert error @ np.linalg.solve(tag.pose.covariance, error) < chi2.isf(1e-4, 6)
+        assert tag.pose.covariance[5, 5] > 2.0 * max(tag.pose.covariance[3, 3], tag.pose.covariance[4, 4])
 
 
 def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, Workings]) -> None:
