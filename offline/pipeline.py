@@ -224,8 +224,9 @@ class _Found:
             self.measured += judged(graph, last, measurements, index)
             self.checks += checks_of(graph, solution, index)
             self.metres.append(metre_of(graph, index))
-        with stages.stage("advice"):
-            self.advice += advise(graph, solution, index)
+        if refined is None:  # else the map's sigmas are not those that advice is foretold from
+            with stages.stage("advice"):
+                self.advice += advise(graph, solution, index)
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"

@@ -83,6 +83,10 @@ def test_exact_corners_give_every_tag_back_as_it_hangs(exact: MapResult) -> None
     assert {number.name for number in exact.calibration} >= {"mount_z_m", "mount_roll_rad", "time_offset_s"}
 
 
+def test_a_refined_map_gives_no_advice_by_other_sigmas_than_its_own(exact: MapResult) -> None:
+    assert exact.advice == ()
+
+
 def test_a_refined_map_is_read_back_as_it_was_written(exact: MapResult, tmp_path: Path) -> None:
     write_map(exact, tmp_path)
     again = read_map(tmp_path)
