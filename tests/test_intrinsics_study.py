@@ -17,7 +17,7 @@ def test_a_fisheye_lies_in_the_region_that_its_calibration_names() -> None:
 
 
 def test_spoilt_views_harm_less_than_the_plain_way() -> None:
-    views = taken_views(NARROW, 2, 10, spoilt_share=0.2)
+    views = taken_views(NARROW, 2, 14, spoilt_share=0.15)
     model = calibrated(views, BoardFinder(DEFAULT_BOARD), "narrow", ["plumb_bob"]).model
     ours, plain = rms_px(difference_px(NARROW, model, PictureGrid.of(NARROW))), plain_error_px(NARROW, views)
     assert ours < plain
