@@ -162,10 +162,10 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_robot_yaml(made_robot("a"), folder / "robot.yaml")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},1.0\n" for i in range(0, 60, 3))
-    for drive in ("monday", "tuesday"):
-        (folder / drive).mkdir()
-        (folder / drive / "odometry.csv").write_text("t_s,v_m_s,omega_rad_s\n" + turning)
-        (folder / drive / "observations.csv").write_text("t_s,tag_id,x_m,y_m\n" + seen)
+    for day in ("monday", "tuesday"):
+        (folder / day).mkdir()
+        (folder / day / "odometry.csv").write_text("t_s,v_m_s,omega_rad_s\n" + turning)
+        (folder / day / "observations.csv").write_text("t_s,tag_id,x_m,y_m\n" + seen)
     hallway = folder / "paper" / "hallway"
     hallway.mkdir(parents=True)
     (hallway / "odom.csv").write_text("".join(f"{i + 1},0.10,0.10\n" for i in range(40)))
