@@ -17,7 +17,7 @@ from calib import se2
 from calib.arrays import BoolArray, FloatArray
 from offline.alignment_search import Explanation, explanations, settled, without
 from offline.condensed import CondensedMap, quarter_turned
-from offline.joint_fit import FALSE_ALARM, REACH_M, JointFit, hold
+from offline.joint_fit import FALSE_ALARM, REACH_M, Held, JointFit, hold
 from offline.measured import Placement
 from offline.run import TagKey
 
@@ -164,18 +164,8 @@ class _Judge:
                 return ranked
 
     def evidence(self, explanation: Explanation) -> float:
-        """Log of the likelihood of the shared tags over that of all being wrong.
-
-        A wrong tag is anywhere in reach, and so is map b where no tag fits, its heading anything; how many tags fit may
-        be any number, and which of them any choice.
-        """
-        held, n, k = explanation.held, len(self.shared), explanation.n
-        log_likelihood = -0.5 * (held.rise + held.log_determinant + 2 * k * log(2.0 * pi))
-        # Over all transforms, each as likely as any other.
-        log_likelihood += 0.5 * (3.0 * log(2.0 * pi) - float(np.linalg.slogdet(held.information)[1]))
-        log_likelihood -= log(2.0 * pi * _AREA_M2)
-        log_choices = lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)
-        return log_likelihood + k * log(_AREA_M2) - log_choices + self._evidence_of_placement(explanation)
+        """Log of the likelihood of the shared tags over that of all being wrong, with what was measured."""
+        return evidence_nats(explanation.held, len(self.shared)) + self._evidence_of_placement(explanation)
 
     def _evidence_of_placement(self, explanation: Explanation) -> float:
         """Log likelihood of the measured placement over that of it being anywhere."""
@@ -273,6 +263,21 @@ class _Judge:
             is_sure=is_sure,
             rivals=rivals,
         )
+
+
+def evidence_nats(held: Held, n: int) -> float:
+    """Log of the likelihood of n shared tags, of which some fit, over that of all being wrong.
+
+    A wrong tag is anywhere in reach, and so is map b where no tag fits, its heading anything; how many tags fit may be
+    any number, and which of them any choice.
+    """
+    k = len(held.rows) // 2
+    log_likelihood = -0.5 * (held.rise + held.log_determinant + 2 * k * log(2.0 * pi))
+    # Over all transforms, each as likely as any other.
+    log_likelihood += 0.5 * (3.0 * log(2.0 * pi) - float(np.linalg.slogdet(held.information)[1]))
+    log_likelihood -= log(2.0 * pi * _AREA_M2)
+    log_choices = lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)
+    return log_likelihood + k * log(_AREA_M2) - log_choices
 
 
 def fit_transform(a: FloatArray, b: FloatArray) -> FloatArray:

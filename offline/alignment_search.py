@@ -97,15 +97,20 @@ def _drawn_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
     first, second = np.triu_indices(fit.n, 1)
     order = np.random.default_rng(_SEED).permutation(len(first))[:_MOST_DRAWS]
     first, second = first[order], second[order]
-    length_a, variance_a = _distances(fit.places_a, fit.covariance_a, first, second)
-    length_b, variance_b = _distances(fit.places_b, fit.covariance_b, first, second)
-    variance = variance_a + variance_b + 2.0 * fit.unmodelled_m2
-    shorter = np.minimum(length_a, length_b)
-    fits = ((length_a - length_b) ** 2 < _DISTANCE_GATE * variance) & (variance < (_MOST_RELATIVE_SIGMA * shorter) ** 2)
+    length_a, variance_a = distances(fit.places_a, fit.covariance_a, first, second)
+    length_b, variance_b = distances(fit.places_b, fit.covariance_b, first, second)
+    fits = is_same_distance(length_a, length_b, variance_a + variance_b + 2.0 * fit.unmodelled_m2)
     return zip(first.tolist(), second.tolist(), fits.tolist(), strict=True)
 
 
-def _distances(
+def is_same_distance(length_a: FloatArray, length_b: FloatArray, variance: FloatArray) -> BoolArray:
+    """(P,) whether chance explains the difference, its variance (P,), and tells a heading besides."""
+    shorter = np.minimum(length_a, length_b)
+    same = (length_a - length_b) ** 2 < _DISTANCE_GATE * variance
+    return np.asarray(same & (variance < (_MOST_RELATIVE_SIGMA * shorter) ** 2))
+
+
+def distances(
     places: FloatArray, covariance: FloatArray, first: IntArray, second: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """(P,) distances between tags, and (P,) their variances. A map that turns as a whole keeps them."""
@@ -122,7 +127,8 @@ def _grown(fit: JointFit, i: int, j: int) -> Explanation | None:
     members = np.zeros(fit.n, dtype=np.bool_)
     members[[i, j]] = True
     tried = members.copy()
-    bend = fit.unbent(_through(fit, i, j))
+    pair = [i, j]
+    bend = fit.unbent(through(fit.places_a[pair], fit.places_b[pair]))
     for _ in range(_MOST_CHANGES):
         linear = fit.linearised(bend)
         held = hold(linear, members)
@@ -176,10 +182,8 @@ def _worst(held: Held, members: BoolArray) -> int | None:
     return int(which[worst]) if misfits[worst] > 1.0 else None
 
 
-def _through(fit: JointFit, i: int, j: int) -> FloatArray:
-    """T_a_b by two tags: their middles meet, and their directions."""
-    pair = [i, j]
-    a, b = fit.places_a[pair], fit.places_b[pair]
+def through(a: FloatArray, b: FloatArray) -> FloatArray:
+    """T_a_b by two tags (2, 2) in both maps: their middles meet, and their directions."""
     (ax, ay), (bx, by) = a[1] - a[0], b[1] - b[0]
     turn = np.arctan2(ay, ax) - np.arctan2(by, bx)
     middle = a.mean(axis=0) - se2.apply([0.0, 0.0, turn], b.mean(axis=0))

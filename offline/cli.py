@@ -124,6 +124,10 @@ def map_command(
         list[str] | None,
         typer.Option(help="Between two runs' starts or tags, as measured: A,B=metres,sigma_m; repeatable."),
     ] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(help="map.json of a map that is kept: its runs and the logs' in one new map, under its noise."),
+    ] = None,
     keep_suspects: Annotated[
         bool, typer.Option("--keep-suspects", help="Name tags that do not belong, but keep them as one tag each.")
     ] = False,
@@ -156,6 +160,7 @@ def map_command(
         distance or (),
         keep_suspects,
         corners=model is MapModel.CORNERS,
+        extend=extend,
     )
     result, costs = make_map(options)
     if json_output:
@@ -164,6 +169,39 @@ def map_command(
         for line in [*summary(result, output), *(stage_lines(costs) if verbose else [])]:
             typer.echo(line)
     raise typer.Exit(exit_code(result))
+
+
+@app.command()
+def localize(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder.")],
+    folder: Annotated[Path, typer.Option("--map", help="What `map -o DIR` wrote; it stays as it is.", metavar="DIR")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder of the trajectory.", metavar="OUT")
+    ] = None,
+    robot: Annotated[list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.")] = None,
+    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.")] = None,
+    component: Annotated[
+        int | None, typer.Option(min=0, help="Where to look, if the map has several. [default: where the tags fit]")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the trajectory in OUT.")] = False,
+    json_output: JsonFlag = False,
+) -> None:
+    """Tells where a new run drove in a finished map, wherever it started; with covariances, the map's included.
+
+    Tags that were moved since are named and not used. Exit 3: the place of some of it is ambiguous or not told, or the
+    log is damaged; it is said what.
+    """
+    import json
+
+    from offline.localize_command import LocalizeOptions, as_json, exit_code, localize_log, summary
+
+    found = localize_log(LocalizeOptions(log, folder, output, robot or (), noise, component, overwrite))
+    if json_output:
+        typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
+    else:
+        for line in summary(found, output):
+            typer.echo(line)
+    raise typer.Exit(exit_code(found))
 
 
 @app.command()

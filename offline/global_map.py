@@ -12,6 +12,7 @@ from offline.corner_solver import CornerSolution
 from offline.edges import edges_of
 from offline.factors import State
 from offline.graph import Graph, Parameter, build_graph
+from offline.kept import KeptCalibration, nominal_row
 from offline.local_map import LocalMap
 from offline.map_model import MapModel
 from offline.measured import Measurements
@@ -54,8 +55,10 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     last = refined.solution if refined else solution
     state, columns = last.state, last.problem.columns
     starts = graph.first_pose
-    joint = last.covariance(np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)]))
-    joint = _in_map_axes(joint, state.poses[starts, 2])
+    free = np.flatnonzero(columns.calibration >= 0)
+    places = np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)])
+    whole = last.covariance(np.concatenate([places, columns.calibration[free]]))
+    joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
     n_starts = 3 * len(starts)
     runs = tuple(
         _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mount_of(state, i))
@@ -75,6 +78,9 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         start_to_start=_start_to_start(runs, joint),
         edges=edges_of(graph, solution, refined.solution.state if refined else None),
         model=MapModel.CORNERS if refined else MapModel.FLOOR,
+        calibration=_kept_calibration(
+            [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
+        ),
     )
 
 
@@ -106,6 +112,21 @@ def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
         for parameter, value in member.calibration.items():
             values.setdefault(parameter, []).append(value)
     return {parameter: float(np.mean(found)) for parameter, found in values.items()}
+
+
+def _kept_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> KeptCalibration:
+    """Of the C numbers that the solve carried: their rows (C, 2 T + C) of the covariance of tags and calibration."""
+    n = rows.shape[1] - len(parameters)
+    return KeptCalibration(
+        owners=tuple(parameter.owner for parameter in parameters),
+        names=tuple(parameter.name for parameter in parameters),
+        nominal=np.array([nominal_row(parameter.nominal) for parameter in parameters]).reshape(
+            -1, len(nominal_row(()))
+        ),
+        values=values,
+        covariance=rows[:, n:],
+        with_tags=rows[:, :n],
+    )
 
 
 def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:

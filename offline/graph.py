@@ -1,7 +1,7 @@
 """From chains to one problem: which variables there are, which factor touches which, what is held."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -37,7 +37,7 @@ class Parameter(NamedTuple):
 
 
 # Takes the place of a calibration number where a reading depends on none; held at zero.
-_NONE: Final = Parameter("", "", (), 0.0)
+NO_PARAMETER: Final = Parameter("", "", (), 0.0)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Graph:
 
     def wheel_parameters(self, chain: int) -> IntArray:
         """(3,) indices of one chain's WHEEL_PARAMETERS."""
-        return _indices(self.parameters, _wheel_parameters(self.chains[chain].run.robot))
+        return _indices(self.parameters, parameters_of_wheels(self.chains[chain].run.robot))
 
     def mount_of(self, state: State, chain: int) -> Mount | None:
         """Where one chain's camera sits, as corrected; None for a log without a camera."""
@@ -119,7 +119,7 @@ def build_graph(chains: Sequence[Chain]) -> Graph:
     """All chains in one problem. The first chain's start is held: it is the frame."""
     tags = tuple(sorted({tag for chain in chains for tag in chain.tags}))
     parameters = tuple(sorted({p for chain in chains for p in _parameters(chain)}, key=lambda p: p[:3]))
-    parameters = (_NONE, *parameters)
+    parameters = (NO_PARAMETER, *parameters)
     lengths = np.array([len(chain.stamps_ns) for chain in chains])
     first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     readings = _reading_factors(chains, first_pose, tags, parameters)
@@ -131,6 +131,16 @@ def build_graph(chains: Sequence[Chain]) -> Graph:
         anchor=_middle_readings(readings, len(tags)),
     )
     return Graph(problem, tuple(chains), first_pose, tags, parameters)
+
+
+def unheld(graph: Graph) -> Graph:
+    """The same with the first start free too, for what is held by something else."""
+    columns = graph.problem.columns
+    poses, tags, calibration = (
+        np.where(each >= 0, each + 3, -1) for each in (columns.poses, columns.tags, columns.calibration)
+    )
+    poses[0] = np.arange(3)
+    return replace(graph, problem=replace(graph.problem, columns=Columns(poses, tags, calibration, columns.n + 3)))
 
 
 def _middle_readings(readings: ReadingFactors, n_tags: int) -> IntArray:
@@ -159,7 +169,7 @@ def _odometry_factors(
     for chain, start in zip(chains, first_pose, strict=True):
         n = len(chain.odometry)
         first.append(start + np.arange(n))
-        indices.append(np.tile(_indices(parameters, _wheel_parameters(chain.run.robot)), (n, 1)))
+        indices.append(np.tile(_indices(parameters, parameters_of_wheels(chain.run.robot)), (n, 1)))
     return OdometryFactors(
         first=np.concatenate(first),
         motion=np.concatenate([chain.odometry.motion for chain in chains]),
@@ -201,13 +211,13 @@ def _reading_factors(
 
 def _parameters(chain: Chain) -> list[Parameter]:
     robot = chain.run.robot
-    found = _wheel_parameters(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
+    found = parameters_of_wheels(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
     if chain.readings.in_camera.any():
         found += mount_parameters_of(robot) + camera_parameters_of(chain)
-    return [p for p in found if p != _NONE]
+    return [p for p in found if p != NO_PARAMETER]
 
 
-def _wheel_parameters(robot: Robot) -> list[Parameter]:
+def parameters_of_wheels(robot: Robot) -> list[Parameter]:
     """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent."""
     wheels = robot.wheels
     nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
@@ -233,8 +243,12 @@ def mount_parameters_of(robot: Robot) -> list[Parameter]:
 def camera_parameters_of(chain: Chain) -> list[Parameter]:
     """In the order of CAMERA_PARAMETERS; none of them is known to positions that somebody else worked out."""
     if not chain.readings.by_camera.any():
-        return [_NONE] * len(CAMERA_PARAMETERS)
-    robot = chain.run.robot
+        return [NO_PARAMETER] * len(CAMERA_PARAMETERS)
+    return parameters_of_camera(chain.run.robot)
+
+
+def parameters_of_camera(robot: Robot) -> list[Parameter]:
+    """In the order of CAMERA_PARAMETERS, for readings of corners."""
     mount = robot.mount
     nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
     sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
@@ -244,8 +258,12 @@ def camera_parameters_of(chain: Chain) -> list[Parameter]:
 
 
 def scale_parameter_of(chain: Chain, tag: TagKey) -> Parameter:
+    """Of the batch of a tag that a chain read."""
+    return parameter_of_scale(chain.run.robot, tag)
+
+
+def parameter_of_scale(robot: Robot, tag: TagKey) -> Parameter:
     """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
-    robot = chain.run.robot
     if not any(batch.family == tag.family for batch in robot.tags):
         return Parameter(f"imported {tag.family}", TAG_SCALE, (), RELATIVE_TAG_SIZE_SIGMA)
     size_m, sigma_m, batch = robot.tag_size_m(tag.family, tag.tag_id)

@@ -15,7 +15,7 @@ from calib.noise import read_noise_yaml
 from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
-from offline.map_io import JSON_FILE, advice_as_json, map_as_json, write_map
+from offline.map_io import JSON_FILE, advice_as_json, map_as_json, read_map, write_map
 from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
 from offline.picture import write_picture
@@ -45,6 +45,7 @@ class MapOptions:
     distances: Sequence[str] = ()
     keep_suspects: bool = False
     corners: bool = False
+    extend: Path | None = None
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -57,10 +58,11 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
         GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
     """
     logs = find_logs(list(options.logs))
-    _check_output(options.output, logs, overwrite=options.overwrite)
-    robot_files = _read_robot_files(options.robots)
+    check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
+    extending = None if options.extend is None else _read_extended(options.extend, options)
+    robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
-    with compilation_announced(_say), progress_bar() as show:
+    with compilation_announced(say), progress_bar() as show:
         stages, workings = Stages(show), Workings()
         tape = TapeOptions(options.starts, options.distances)
         result = map_logs(
@@ -72,6 +74,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             keep_suspects=options.keep_suspects,
             corners=options.corners,
             workings=workings,
+            extending=extending,
         )
         with folder_written_whole(options.output) as folder:
             _write_files(result, workings, folder, options.output, stages)
@@ -94,7 +97,16 @@ def _write_files(result: MapResult, workings: Workings, folder: Path, output: Pa
         raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
 
 
-def _read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
+def _read_extended(path: Path, options: MapOptions) -> MapResult:
+    """The map that is kept: its folder, or map.json in it."""
+    folder = path.parent if path.name == JSON_FILE else path
+    check_output(options.output, [folder], JSON_FILE, overwrite=options.overwrite)
+    if options.noise is not None:
+        raise OfflineError("--noise: a map is extended under its own noise; leave it out, or map all logs anew")
+    return read_map(folder)
+
+
+def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
     """By robot id, of which each file must have its own."""
     robot_files: dict[str, RobotFile] = {}
     for path in paths:
@@ -105,7 +117,8 @@ def _read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
     return robot_files
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """To a person, beside what the command prints."""
     sys.stderr.write(text + "\n")
 
 
@@ -223,18 +236,31 @@ def _advice_lines(result: MapResult) -> list[str]:
     return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]
 
 
-def _check_output(output: Path, logs: Sequence[Path], *, overwrite: bool) -> None:
-    """Refuses an output folder in which something could be lost."""
+def check_output(output: Path, inputs: Sequence[Path], own_file: str, *, overwrite: bool) -> None:
+    """Refuses an output folder in which something could be lost.
+
+    Args:
+        output: a folder.
+        inputs: logs and maps, which stay as they are.
+        own_file: what tells a folder that may be replaced.
+        overwrite: whether one may.
+
+    Raises:
+        OfflineError: one line that says what is in the way.
+    """
     if output.exists() and not output.is_dir():
         raise OfflineError(f"-o {output}: is a file; name a folder that is empty or not there yet")
-    for log in logs:
-        if output.resolve() in (log.resolve(), *log.resolve().parents) or log.resolve() in output.resolve().parents:
-            raise OfflineError(f"-o {output}: holds the log {log} or lies in it; name another folder, recordings stay")
+    for path in inputs:
+        if output.resolve() in (path.resolve(), *path.resolve().parents) or path.resolve() in output.resolve().parents:
+            raise OfflineError(
+                f"-o {output}: holds {path} or lies in it; name another folder, maps and recordings stay"
+            )
     if not output.is_dir() or not any(output.iterdir()):
         return
     if not overwrite:
         raise OfflineError(f"-o {output}: the folder is not empty; name another one, or give --overwrite")
-    if not (output / JSON_FILE).is_file():
+    if not (output / own_file).is_file():
         raise OfflineError(
-            f"-o {output}: --overwrite replaces maps only, and there is no {JSON_FILE} in it; name another folder"
+            f"-o {output}: --overwrite replaces what was written before, and there is no {own_file} in it; name "
+            "another folder"
         )

@@ -18,6 +18,7 @@ from calib.errors import CalibError
 from calib.files import written_whole
 from calib.noise import NoiseParameters
 from offline.errors import OfflineError
+from offline.kept import KeptChain, arrays_of, calibration_from, chain_from
 from offline.map_model import MapModel
 from offline.result import (
     AdviceResult,
@@ -93,6 +94,7 @@ def read_map(folder: Path) -> MapResult:
     try:
         with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
             components = tuple(_component(data, index, arrays, folder) for index in range(len(data["components"])))
+            kept = _kept(arrays)
         return MapResult(
             components=components,
             alignments=tuple(_alignment(entry) for entry in data["alignments"]),
@@ -106,6 +108,7 @@ def read_map(folder: Path) -> MapResult:
             losses=tuple(data.get("losses", ())),
             suspects=tuple(SuspectTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
             advice=tuple(_advice(entry) for entry in data.get("advice", ())),
+            kept=kept,
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
@@ -255,6 +258,10 @@ def _arrays(result: MapResult) -> dict[str, Any]:
         }
         if component.edges is not None:
             arrays |= {f"{key}edges_{name}": value for name, value in vars(component.edges).items()}
+        if component.calibration is not None:
+            arrays |= arrays_of(component.calibration, f"{key}calibration_")
+    for index, kept in enumerate(result.kept):
+        arrays |= arrays_of(kept, f"run{index}_")
     return arrays
 
 
@@ -328,7 +335,16 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         ),
         edges=_edges(f"{key}edges_", arrays),
         model=MapModel(entry.get("model", MapModel.FLOOR)),
+        calibration=calibration_from(arrays, f"{key}calibration_"),
     )
+
+
+def _kept(arrays: Mapping[str, Any]) -> tuple[KeptChain, ...]:
+    """All that there are; none in a map of an older program."""
+    found: list[KeptChain] = []
+    while (kept := chain_from(arrays, f"run{len(found)}_")) is not None:
+        found.append(kept)
+    return tuple(found)
 
 
 def _edges(key: str, arrays: Mapping[str, Any]) -> GraphEdges | None:

@@ -1,4 +1,4 @@
-"""What a person measured, as factors: residuals and Jacobians in the form of `factors`."""
+"""What is known from elsewhere, as factors in the form of `factors`: what a person measured, what a map holds."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -75,24 +75,60 @@ class DistanceFactors:
 
 
 @dataclass(frozen=True)
+class KnownPlaces:
+    """Tags and calibration as a finished map has them, jointly: r = W (x - mean).
+
+    Attributes:
+        tags: (K,) index of each tag, none twice; calibration: (C,) index of each number, none twice and none held.
+        mean: (2 K + C,)
+        whitening: (2 K + C, 2 K + C) W with W^T W the inverse of the joint covariance.
+    """
+
+    tags: IntArray
+    calibration: IntArray
+    mean: FloatArray
+    whitening: FloatArray
+
+    def off(self, state: State) -> FloatArray:
+        """(2 K + C,) from the mean."""
+        values = np.concatenate([state.tags[self.tags].reshape(-1), state.calibration[self.calibration]])
+        return values - self.mean
+
+    def residual(self, state: State) -> FloatArray:
+        """(2 K + C,), whitened."""
+        whitened: FloatArray = self.whitening @ self.off(state)
+        return whitened
+
+    def columns(self, columns: Columns) -> IntArray:
+        """(2 K + C,) of the tangent vector."""
+        return np.concatenate([columns.tags[self.tags].reshape(-1), columns.calibration[self.calibration]])
+
+
+_NONE: Final = np.zeros(0, dtype=np.int64)
+NOTHING_KNOWN: Final = KnownPlaces(_NONE, _NONE, np.zeros(0), np.zeros((0, 0)))
+
+
+@dataclass(frozen=True)
 class Measured:
-    """All that somebody measured."""
+    """All that somebody measured, or that a map holds."""
 
     starts: StartFactors
     distances: DistanceFactors
+    known: KnownPlaces = NOTHING_KNOWN
 
     def __len__(self) -> int:
-        """How many measurements there are."""
-        return len(self.starts.pose) + len(self.distances.distance_m)
+        """How many measurements there are, a map being one."""
+        return len(self.starts.pose) + len(self.distances.distance_m) + int(len(self.known.mean) > 0)
 
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are."""
-        return 3 * len(self.starts.pose) + len(self.distances.distance_m)
+        return 3 * len(self.starts.pose) + len(self.distances.distance_m) + len(self.known.mean)
 
     def sum_of_squares(self, state: State) -> float:
         """Of all residuals."""
-        return float((self.starts.residual(state) ** 2).sum() + (self.distances.residual(state) ** 2).sum())
+        kinds = (self.starts, self.distances, self.known)
+        return sum(float((kind.residual(state) ** 2).sum()) for kind in kinds)
 
     def linearise(self, state: State, columns: Columns) -> tuple[Linearised, Linearised]:
         """Of starts and of distances."""
@@ -100,8 +136,8 @@ class Measured:
 
     @property
     def tags(self) -> IntArray:
-        """Tags at which a distance ends."""
-        ends = np.concatenate([self.distances.tag_a, self.distances.tag_b])
+        """Tags at which a distance ends, or that a map holds."""
+        ends = np.concatenate([self.distances.tag_a, self.distances.tag_b, self.known.tags])
         return np.unique(ends[ends >= 0])
 
     def among(self, index: IntArray) -> "Measured":
@@ -110,10 +146,13 @@ class Measured:
             name: np.where(pose >= 0, index[pose], -1)
             for name, pose in (("pose_a", self.distances.pose_a), ("pose_b", self.distances.pose_b))
         }
-        return Measured(replace(self.starts, pose=index[self.starts.pose]), replace(self.distances, **ends))
+        return replace(
+            self,
+            starts=replace(self.starts, pose=index[self.starts.pose]),
+            distances=replace(self.distances, **ends),
+        )
 
 
-_NONE: Final = np.zeros(0, dtype=np.int64)
 NOTHING_MEASURED: Final = Measured(
     StartFactors(_NONE, np.zeros((0, 3)), np.zeros((0, 3, 3))),
     DistanceFactors(_NONE, _NONE, _NONE, _NONE, np.zeros(0), np.zeros(0)),

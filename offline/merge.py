@@ -83,13 +83,13 @@ def merge(
         variance_factors: by which each map's noise is larger than its solve was told; from what the solve left over
             where None, 1 at least.
     """
-    condensed = _condensed(maps, variance_factors or [_variance_factor(each) for each in maps])
+    condensed = _condensed(maps, variance_factors or [variance_factor(each) for each in maps])
     pairs = tuple(_aligned_pairs(maps, condensed, placements or {}))
     links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
     return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
 
 
-def _variance_factor(local_map: LocalMap) -> float:
+def variance_factor(local_map: LocalMap) -> float:
     """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that.
 
     Where a map's parts do not join within their noise, something that is in no covariance bends it, and by as much as

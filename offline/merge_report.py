@@ -61,23 +61,27 @@ def _nearness(pair: PairAlignment) -> tuple[float, int]:
 def _why_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
     """Why a pair is not joined; the first name is one of `told_of`."""
     a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
-    alignment = pair.alignment
+    if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
+        a, b = b, a
+    return why_not_joined(a, b, pair.shared, pair.alignment)
+
+
+def why_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
+    """Why run b is not joined to a, by name; they share a tag at least."""
     if alignment is not None and alignment.rivals:
         return _ambiguous(a, b, alignment)
-    if told_of is not None and b not in told_of:
-        a, b = b, a
-    if len(pair.shared) == 1:
-        return f"{b} shares only tag {pair.shared[0].tag_id} with {a}; one more shared tag would do"
+    if len(shared) == 1:
+        return f"{b} shares only tag {shared[0].tag_id} with {a}; one more shared tag would do"
     if alignment is not None and alignment.is_sure:
         return f"the alignment of {b} with {a} contradicts those of other runs"
     if alignment is not None:
         return (
-            f"of the {len(pair.shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} lie the same "
+            f"of the {len(shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} lie the same "
             "way in both maps, which chance may bring about; were tags moved between the runs? One more shared tag "
             "that stayed would do"
         )
     return (
-        f"{b} shares {len(pair.shared)} tags with {a}, but no two of them lie the same way in both maps: "
+        f"{b} shares {len(shared)} tags with {a}, but no two of them lie the same way in both maps: "
         "were tags moved between the runs? Two shared tags that stayed would do"
     )
 
@@ -143,7 +147,7 @@ def _ids(tags: Sequence[TagKey]) -> tuple[tuple[str, int], ...]:
 
 
 def _names(tags: Sequence[TagKey]) -> str:
-    named = ", ".join(str(tag.tag_id) for tag in tags[:_MOST_NAMED])
+    named = ", ".join(f"{tag.tag_id}{tag.instance}" for tag in tags[:_MOST_NAMED])
     return named if len(tags) <= _MOST_NAMED else f"{named} and {len(tags) - _MOST_NAMED} more"
 
 

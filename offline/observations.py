@@ -35,6 +35,8 @@ MIN_RANGE_M: Final = 0.1
 # Farther than this no tag is read; numbers beyond come from broken files.
 MAX_RANGE_M: Final = 1000.0
 _LEAST_VARIANCE: Final = 1e-12
+# One printed size, but for rounding.
+SAME_SIZE_M: Final = 1e-6
 # More than this share of readings left out is worth a sentence.
 MAX_SHARE_LEFT_OUT: Final = 0.05
 _UPRIGHT_DOF: Final = 2
@@ -314,7 +316,7 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
             except CalibError as error:
                 raise OfflineError(f"{run.log}: {error}") from error
             other_m, other = known.setdefault(key, (size_m, run))
-            if abs(other_m - size_m) > 1e-6:
+            if abs(other_m - size_m) > SAME_SIZE_M:
                 raise OfflineError(
                     f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
                     f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"

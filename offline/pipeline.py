@@ -14,6 +14,14 @@ from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
+from offline.kept_maps import (
+    check_can_be_extended,
+    check_sizes_in_map,
+    kept_of,
+    local_map_of,
+    tags_of,
+    tape_of,
+)
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured import Measurements, TapeOptions, parse_measurements
 from offline.measured_map import judged, measurement_warnings, unused
@@ -33,7 +41,7 @@ from offline.result import (
     SuspectTag,
 )
 from offline.run import RobotFile, Run, load_run
-from offline.run_noise import fit_and_weigh
+from offline.run_noise import fit_and_weigh, weighed_as
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import RunsAlone, joined, split_together, with_outliers_apart
@@ -54,6 +62,7 @@ def map_logs(
     keep_suspects: bool = False,
     corners: bool = False,
     workings: Workings | None = None,
+    extending: MapResult | None = None,
 ) -> MapResult:
     """Turns logs into one map in the frame of the first log's start.
 
@@ -67,6 +76,7 @@ def map_logs(
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
         corners: the solved map is refined on the tags' corners, where logs have them.
         workings: takes what the map was made from.
+        extending: a map that was kept, whose runs come first, and under whose noise all is solved.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -77,16 +87,33 @@ def map_logs(
         for log in logs:
             runs.append(load_run(log, robot_files))
             done()
+    check_robots(runs, robot_files or {})
+    return build_map(
+        runs,
+        noise,
+        stages,
+        tape,
+        prior_noise,
+        keep_suspects=keep_suspects,
+        corners=corners,
+        workings=workings,
+        extending=extending,
+    )
+
+
+def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:
+    """Refuses a robot.yaml that no log is of.
+
+    Raises:
+        OfflineError: naming it, and the robots of the logs.
+    """
     recorded = {run.robot_id for run in runs}
-    for robot_id in robot_files or {}:
+    for robot_id in robot_files:
         if robot_id not in recorded:
             raise OfflineError(
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
-    return build_map(
-        runs, noise, stages, tape, prior_noise, keep_suspects=keep_suspects, corners=corners, workings=workings
-    )
 
 
 def build_map(
@@ -99,6 +126,7 @@ def build_map(
     keep_suspects: bool = False,
     corners: bool = False,
     workings: Workings | None = None,
+    extending: MapResult | None = None,
 ) -> MapResult:
     """As `map_logs`, from runs already read.
 
@@ -111,6 +139,7 @@ def build_map(
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
         corners: the solved map is refined on the tags' corners, where logs have them.
         workings: takes what the map was made from.
+        extending: a map that was kept, whose runs come first, and under whose noise all is solved.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -118,18 +147,31 @@ def build_map(
     stages, tape = stages or Stages(), tape or TapeOptions()
     _check_distinct(runs)
     check_tag_sizes(runs)
+    known: list[LocalMap] = []
+    noise_fit = None
+    if extending is not None:
+        _check_new(runs, extending, noise)
+        if corners:
+            raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+        noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
     chains: list[Chain] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
             chains += [told_apart(chain) for chain in chains_of(run, noise or prior_noise)]
             done()
-    measurements = _measurements(tape, runs, chains)
-    maps, broken = _local_maps(runs, chains, stages)
-    chains = [each.chain for each in maps]
-    noise_fit = None
+    measurements = _measurements(tape, runs, chains, extending)
+    if extending is not None:
+        with stages.stage("the map that is extended"):
+            known = [local_map_of(each) for each in extending.kept]
+    maps, broken = local_maps_of(runs, chains, stages)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
+    elif known:
+        maps = known + weighed_as(maps, noise, noise_fit)
+    chains = [each.chain for each in maps]
+    runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
+    kept = tuple(kept_of(each) for each in maps)
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([chain.name for chain in chains]))
         maps = with_outliers_apart(maps, merged)
@@ -159,10 +201,11 @@ def build_map(
         suspects=tuple(found.suspects),
         noise_fit=noise_fit,
         advice=tuple(found.advice),
+        kept=kept,
     )
 
 
-def _local_maps(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) -> tuple[list[LocalMap], list[str]]:
+def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) -> tuple[list[LocalMap], list[str]]:
     """Each chain solved alone, parted where its wheels lost the way, and what to say of that."""
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
@@ -235,9 +278,14 @@ class _Found:
         return Solved(members, graph, solution, last.state.poses)
 
 
-def _measurements(tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain]) -> Measurements:
-    tags = sorted({tag for chain in chains for tag in chain.tags})
-    return parse_measurements(tape, [run.name for run in runs], tags)
+def _measurements(
+    tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain], extending: MapResult | None
+) -> Measurements:
+    names, tags = [run.name for run in runs], {tag for chain in chains for tag in chain.tags}
+    if extending is not None:
+        names = [*dict.fromkeys(each.run for each in extending.kept), *names]
+        tags |= {tag for each in extending.kept for tag in tags_of(each)}
+    return parse_measurements(tape, names, sorted(tags))
 
 
 def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, solution: Solution) -> list[str]:
@@ -259,6 +307,21 @@ def _check_distinct(runs: Sequence[Run]) -> None:
                 "leave one out, or a drive would count as two"
             )
         seen[run.name] = run
+
+
+def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None) -> None:
+    """Refuses runs that a map has already, such as say other sizes of its tags, and other noise."""
+    check_can_be_extended(extending)
+    if noise is not None:
+        raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
+    names = {each.run for each in extending.kept}
+    for run in runs:
+        if run.name in names:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out, or a drive "
+                "would count as two"
+            )
+        check_sizes_in_map(run, extending)
 
 
 def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:

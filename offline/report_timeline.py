@@ -68,6 +68,8 @@ def events_of(chains: Sequence[Chain]) -> dict[str, list[RunEvent]]:
 
 def _gaps(chain: Chain) -> list[list[float]]:
     """Begin and end in seconds where no wheel was read for longer than a gap may be."""
+    if not chain.run.stretches:  # of a map that was kept: its log alone knows
+        return []
     stamps_ns = np.concatenate([track.stamps_ns for track in chain.run.stretches])
     stamps_ns = stamps_ns[(stamps_ns >= chain.stamps_ns[0]) & (stamps_ns <= chain.stamps_ns[-1])]
     before = np.flatnonzero(np.diff(stamps_ns) > GAP_NS)

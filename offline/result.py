@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
+from offline.kept import KeptCalibration, KeptChain
 from offline.map_model import MapModel
 
 # What is right goes beyond this once in 16,000 times.
@@ -165,6 +166,7 @@ class Component:
     start_to_start: tuple[StartToStart, ...] = ()
     edges: GraphEdges | None = None
     model: MapModel = MapModel.FLOOR
+    calibration: KeptCalibration | None = None  # with its covariance, and that with the tags
 
     @property
     def tag_covariance(self) -> FloatArray:
@@ -324,6 +326,7 @@ class MapResult:
     suspects: tuple[SuspectTag, ...] = ()
     noise_fit: FittedNoise | None = None  # None: the noise was given
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
+    kept: tuple[KeptChain, ...] = ()  # each run's measurements, to solve them again together with another run's
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

@@ -77,6 +77,13 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
     )
 
 
+def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
+    """Maps solved under the noise of a map that is kept, with what readings share as it was found there."""
+    shared = np.zeros(2) if fitted is None else np.array([fitted.shared_range, fitted.shared_bearing])
+    # What the windows leave over is still a multiple of the same noise.
+    return [replace(_under(each, noise, shared, noise), goodness=each.goodness) for each in maps]
+
+
 def _is_sound(local_map: LocalMap) -> bool:
     """Whether what a map leaves over is noise."""
     return len(local_map.chain.tags) > 0 and local_map.goodness.fits

@@ -142,7 +142,7 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
                 group = {m: one if g == other else g for m, g in group.items()}
         for m, g in group.items():
             names[m, tag] = tag._replace(instance=f"like {maps[g].chain.name}")
-    return [_renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
+    return [renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
 
 
 def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
@@ -243,7 +243,7 @@ def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, 
     return {tag: places[tag] for tag, n in n_after.items() if n_before.get(tag) == n}
 
 
-def _renamed(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
+def renamed(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
     """The same map with some of its tags under other names."""
     if not names:
         return local_map

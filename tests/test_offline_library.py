@@ -21,21 +21,26 @@ TAGS = [
     MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
     MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
 ]
+DRIVES = [
+    ("carl", "monday", [1.0, 1.5, 0.3]),
+    ("dora", "monday", [4.0, 2.5, 2.9]),
+    ("carl", "evening", [2.0, 2.0, -1.0]),
+]
 LEGS = [(0.4, 0.4, 2.0), (-0.3, 0.3, 6.0), (0.4, 0.5, 2.0)]
 
 
 @pytest.fixture
 def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for robot, start in (("carl", [1.0, 1.5, 0.3]), ("dora", [4.0, 2.5, 2.9])):
+    for robot, run_id, start in DRIVES:
         drive = made_drive(start, LEGS, step_ns=20_000_000)
-        write_drive(tmp_path / "recordings", drive, TAGS, made_robot(robot), run_id="monday", corner_sigma_px=0.2)
+        write_drive(tmp_path / "recordings", drive, TAGS, made_robot(robot), run_id=run_id, corner_sigma_px=0.2)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "recordings"
 
 
 def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 6
     assert len([line for line in blocks[0].splitlines() if line]) <= 5
     names: dict[str, Any] = {}
     for block in blocks:

@@ -1,0 +1,176 @@
+"""Where a robot that has just been put down is in a finished map, looked for a little at each reading.
+
+As in `alignment_search`, pairs of tags are hypotheses; tags that a hypothesis foretells join it. Here the drive so far
+is short, and the map is taken in its own axes, so a hypothesis is one rigid fit. The verdict is given when all pairs
+have been looked at.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.alignment import GROUP_MARGIN, MARGIN_NATS, evidence_nats
+from offline.alignment_search import distances, is_same_distance, through
+from offline.condensed import quarter_turned
+from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Held, Linear, hold, ill_fitting
+from offline.known_map import KnownMap
+from offline.run import TagKey
+
+# Of pairs of tags, looked at in one call.
+_PAIRS_A_CALL: Final = 1
+_STEPS: Final = 4
+_NONE: Final = np.zeros(0)
+
+
+@dataclass(frozen=True)
+class SeenTags:
+    """Tags as the robot has them in the frame of its start.
+
+    Attributes:
+        tags: ids; places_m: (n, 2); covariance: (2 n, 2 n).
+    """
+
+    tags: tuple[TagKey, ...]
+    places_m: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the start lies.
+
+    Attributes:
+        T_map_start: (3,) nearly.
+        tags: index of each tag that fits among those seen, and the map's tag that it is.
+    """
+
+    T_map_start: FloatArray
+    tags: tuple[tuple[int, TagKey], ...]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    T: FloatArray
+    members: BoolArray
+    held: Held
+
+
+class StartSearch:
+    """Goes through the pairs of tags seen, and begins anew when there is another one."""
+
+    def __init__(self, known: KnownMap) -> None:
+        self._known = known
+        self._pairs: list[tuple[int, TagKey]] = []
+        self._left: list[tuple[int, int]] = []
+        self._found: list[_Fit] = []
+        self.reason = "no tag of the map was seen yet"
+
+    def look(self, seen: SeenTags) -> Start | None:
+        """Looks at some more pairs; the start when that is sure, else None and `reason`."""
+        pairs = [(i, tag) for i, own in enumerate(seen.tags) for tag in self._known.instances.get(own, ())]
+        begins = pairs != self._pairs or not self._left
+        self._pairs = pairs
+        if len({i for i, _ in pairs}) < 2:
+            self.reason = f"{'one tag' if pairs else 'no tag'} of the map was seen; two are needed"
+            return None
+        fit = _RigidFit(self._known, seen, pairs)
+        if begins:  # all of it anew: by now the places are better known
+            self._found, self._left = [], fit.same_distances()
+        for _ in range(_PAIRS_A_CALL):
+            if not self._left:
+                break
+            i, j = self._left.pop(0)
+            found = fit.grown(i, j)
+            if found is not None:
+                self._found.append(found)
+                known = np.flatnonzero(found.members).tolist()
+                self._left = [pair for pair in self._left if not set(pair) <= set(known)]
+        if self._left:
+            self.reason = "looking for the start"
+            return None
+        return self._verdict(len(pairs))
+
+    def _verdict(self, n: int) -> Start | None:
+        if not self._found:
+            self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
+            return None
+        found = sorted(self._found, key=lambda fit: -evidence_nats(fit.held, n))
+        best, evidence = found[0], evidence_nats(found[0].held, n)
+        if any(_is_rival(other, best, evidence, n) for other in found[1:]):
+            self.reason = "ambiguous, because two groups of tags put the start in different places"
+            return None
+        if best.members.sum() < n and evidence <= MARGIN_NATS:
+            self.reason = f"of {n} tags that may be the map's {best.members.sum()} fit, which chance may bring about"
+            return None
+        self.reason = ""
+        return Start(best.T, tuple(self._pairs[i] for i in np.flatnonzero(best.members)))
+
+
+def _is_rival(other: _Fit, best: _Fit, evidence: float, n: int) -> bool:
+    if evidence_nats(other.held, n) > evidence - MARGIN_NATS:
+        return True
+    own = (other.members & ~best.members).sum()  # may have moved as one, or have stayed
+    return bool(own >= 2 and best.members.sum() < GROUP_MARGIN * own)
+
+
+class _RigidFit:
+    """The map's tags against those seen, taken as pairs."""
+
+    def __init__(self, known: KnownMap, seen: SeenTags, pairs: Sequence[tuple[int, TagKey]]) -> None:
+        own = np.array([i for i, _ in pairs], dtype=np.int64)
+        rows: IntArray = (2 * own[:, None] + np.arange(2)).reshape(-1)
+        in_map = known.rows([tag for _, tag in pairs])
+        self._n, self._own = len(pairs), own
+        self._a, self._b = known.mean[in_map].reshape(-1, 2), seen.places_m[own]
+        self._covariance_a = known.covariance[np.ix_(in_map, in_map)]
+        self._covariance_b = seen.covariance[np.ix_(rows, rows)]
+
+    def same_distances(self) -> list[tuple[int, int]]:
+        """Which two pairs are of different tags that lie as far apart here as there."""
+        first, second = np.triu_indices(self._n, 1)
+        length_a, variance_a = distances(self._a, self._covariance_a, first, second)
+        length_b, variance_b = distances(self._b, self._covariance_b, first, second)
+        fits = is_same_distance(length_a, length_b, variance_a + variance_b + 2.0 * UNMODELLED_SIGMA_M**2)
+        fits &= self._own[first] != self._own[second]
+        return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
+
+    def grown(self, i: int, j: int) -> _Fit | None:
+        """What fits with two pairs; None where they do not themselves."""
+        members = np.zeros(self._n, dtype=np.bool_)
+        members[[i, j]] = True
+        T = through(self._a[[i, j]], self._b[[i, j]])
+        for _ in range(_STEPS):
+            held = hold(self._linear(T), members)
+            T = self._moved(T, held)
+            off, spread = held.others()
+            fitting = members | (ill_fitting(off, spread) < 1.0)
+            if (fitting == members).all():
+                break
+            members = fitting
+        held = hold(self._linear(T), members)
+        return _Fit(T, members, held) if held.closes else None
+
+    def _linear(self, T: FloatArray) -> Linear:
+        cos, sin = np.cos(T[2]), np.sin(T[2])
+        R = np.array([[cos, -sin], [sin, cos]])
+        n = self._n
+        turned = np.einsum("ab,ibjc,dc->iajd", R, self._covariance_b.reshape(n, 2, n, 2), R).reshape(2 * n, 2 * n)
+        in_a = se2.apply(T, self._b)
+        centre = in_a.mean(axis=0)
+        by_transform = np.zeros((n, 2, 3))
+        by_transform[:, :, :2] = -np.eye(2)
+        by_transform[:, :, 2] = -quarter_turned(in_a - centre)
+        covariance = self._covariance_a + turned
+        covariance[np.diag_indices(2 * n)] += UNMODELLED_SIGMA_M**2
+        unbent = Bend(T, _NONE, _NONE)
+        none = np.zeros((2 * n, 0))
+        return Linear(unbent, centre, (self._a - in_a).reshape(-1), covariance, by_transform.reshape(-1, 3), none, none)
+
+    def _moved(self, T: FloatArray, held: Held) -> FloatArray:
+        dx, dy, turn = held.motion
+        about = held.linear.centre - se2.apply([0.0, 0.0, turn], held.linear.centre)
+        return se2.compose([about[0] + dx, about[1] + dy, turn], T)
