@@ -1,4 +1,4 @@
-"""A robot in a finished map, one reading at a time, in under 2 ms each: for use while it drives.
+"""A robot in a finished map, one reading at a time: some 0.3 ms each, about 2 ms where a tag is seen first.
 
 Until it knows where in the map it is, the robot makes a small map of its own, in the frame of its start, and looks in
 it for tags that lie as the map has them (`online_start`). From then on everything is in the map's frame: each further
