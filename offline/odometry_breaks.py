@@ -12,7 +12,7 @@ from math import degrees, hypot
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 from calib import se2
 from calib.arrays import FloatArray
@@ -31,6 +31,7 @@ _MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's
 _MOST_PLACES: Final = 24
 # Half of what chance adds to a place once in a thousand times: with less, readings do not tell which it was.
 _SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
+_IN_A_ROW_M: Final = 2.5
 _FREED: Final = 1e-4  # of a motion's whitening: metres and turns for nothing
 
 
@@ -138,7 +139,7 @@ def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
 
 
 def _fits(local_map: LocalMap) -> bool:
-    """Whether the whole fits together, and no stretch between two readings strains the wheels beyond chance.
+    """Whether the whole fits together, no stretch between two readings strains the wheels beyond chance, nor a tag.
 
     What is between two readings is laid out as the wheels like it best, so that its squares add up to those of the
     motion from one reading to the next: chi-square with 3 degrees of freedom at most.
@@ -150,7 +151,23 @@ def _fits(local_map: LocalMap) -> bool:
     reads[problem.readings.pose] = True
     between = np.cumsum(reads)[problem.odometry.first]
     squares = np.bincount(between, (problem.odometry.residual(state) ** 2).sum(axis=1))
-    return local_map.goodness.fits and bool((squares <= chi2.isf(FALSE_ALARM / len(squares), 3)).all())
+    strained = squares > chi2.isf(FALSE_ALARM / len(squares), 3)
+    return local_map.goodness.fits and not strained.any() and not _wild_in_a_row(local_map)
+
+
+def _wild_in_a_row(local_map: LocalMap) -> bool:
+    """Whether more readings of a tag in a part of the way are wild than chance makes so.
+
+    The wheels are known so well that a solve may rather give up the readings around a slip, whose loss is bounded.
+    """
+    chain, readings = local_map.chain, local_map.graph.problem.readings
+    squares = (readings.residual(local_map.solution.state) ** 2).sum(axis=1)
+    squares /= max(1.0, local_map.goodness.reading_factor) ** 2
+    part = (np.append(0.0, np.cumsum(chain.odometry.distance_m))[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
+    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
+    by_chance = binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM)
+    return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
 
 
 def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
@@ -223,8 +240,10 @@ def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_P
     apart = solve(_freed(problem, *place), start)
     joined = min(local_map.solution.cost, solve(problem, apart.state).cost)
     factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
-    n_places = len(np.unique(chain.readings.keyframe))
-    bound = factor**2 * chi2.isf(FALSE_ALARM / n_places, 3 * (place.begin - place.end + 1))
+    reading = np.unique(chain.readings.keyframe)
+    # Between two readings all motions are one: freeing the others as well lets nothing else go.
+    n_freed = 3 * (1 + int(((reading >= place.end) & (reading < place.begin)).sum()))
+    bound = factor**2 * chi2.isf(FALSE_ALARM / len(reading), n_freed)
     chi_square = 2.0 * (joined - apart.cost)
     if chi_square <= bound:
         return None

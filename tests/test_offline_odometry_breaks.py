@@ -31,6 +31,14 @@ def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: flo
     assert found.chi_square > 10.0 * found.bound
 
 
+def test_a_slip_for_which_the_solve_gives_up_readings_is_found() -> None:
+    broken = broken_drive("slipped", 11)
+    found = find_break(solve_local_map(broken.drive.chain))
+    assert found is not None
+    assert found.reach[0] <= broken.end - 1
+    assert found.reach[1] >= broken.begin
+
+
 def test_the_map_is_as_good_as_that_of_two_runs() -> None:
     outcome = outcome_of("turned", 1)
     assert (outcome.can_be_told, outcome.n_stretches) == (True, 2)

@@ -5,7 +5,10 @@
 A quarter of a kilometre past tags 3 to 8 m apart; calibration drawn from its priors, noise as told. After 55 % of the
 way the robot is carried on by 2 m (`carried`) or round a corner (`turned`), or its wheels turn on the spot for 3 m
 (`slipped`); or nothing of the kind happens (`clean`). A break can be told by the drive's own tags where two of them are
-on both sides and agree: where the two parts, cut at the true place, align for sure. Map errors are RMS over the tags
+on both sides and agree, and contradict the wheels: where the two parts, cut at the true place, align for sure, and
+believing the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom, all
+readings counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
+nothing: headings wander by more. Map errors are RMS over the tags
 of the stretches laid over the truth, and the same of two runs, cut at the true place.
 """
 
@@ -16,17 +19,21 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.stats import chi2
 
 from calib import se2
 from offline.alignment import align, fit_transform
 from offline.condensed import condense
 from offline.global_map import solve_global_map
+from offline.grown_parts import FALSE_ALARM
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
 from offline.odometry_breaks import split_where_broken
+from offline.solver import solve
 from offline.stages import Stages
 from tests.made_breaks import BrokenDrive, carried, made_clean_drive, slipped
 
+_FREED: Final = 1e-4  # of a motion's whitening
 KINDS: Final = ("clean", "carried", "turned", "slipped")
 
 
@@ -35,7 +42,7 @@ class Outcome:
     """Of one drive.
 
     Attributes:
-        can_be_told: two tags agree on it.
+        can_be_told: two tags agree on it, and it costs more than chance.
         n_stretches: that came out.
         rms_m: of the tags; of those of two runs in `two_runs_rms_m`.
         said: the warnings.
@@ -72,11 +79,23 @@ def outcome_of(kind: str, seed: int) -> Outcome:
     if kind != "clean":
         ends = (0, broken.end), (broken.begin, len(chain.stamps_ns))
         two_runs = [solve_local_map(replace(chain.part(*part), name=f"{chain.name}{part[0]}")) for part in ends]
-        can_be_told = _align_for_sure(*two_runs)
+        can_be_told = _align_for_sure(*two_runs) and _costs_more_than_chance(whole, broken)
     return Outcome(
         kind, seed, can_be_told, len(mended.maps), _rms_m(mended.maps, broken), _rms_m(two_runs, broken),
         tuple(mended.warnings),
     )  # fmt: skip
+
+
+def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
+    """Whether the motion over the true place contradicts all else, whoever knows where it is."""
+    problem, state = whole.graph.problem, whole.solution.state
+    odometry = problem.odometry
+    inside = (odometry.first >= broken.end - 1) & (odometry.first < broken.begin)
+    weak = np.where(inside[:, None, None], _FREED, 1.0) * odometry.whitening
+    apart = solve(problem.reweighed(weak, problem.readings.whitening), state)
+    joined = min(whole.solution.cost, solve(problem, apart.state).cost)
+    n_places = len(np.unique(whole.chain.readings.keyframe))
+    return 2.0 * (joined - apart.cost) > float(chi2.isf(FALSE_ALARM / n_places, 3))
 
 
 def _align_for_sure(before: LocalMap, after: LocalMap) -> bool:
