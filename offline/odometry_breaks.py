@@ -166,7 +166,7 @@ def _wild_in_a_row(local_map: LocalMap) -> bool:
     part = (np.append(0.0, np.cumsum(chain.odometry.distance_m))[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
     _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
     n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
-    by_chance = binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM)
+    by_chance = np.asarray(binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM))
     return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
 
 
