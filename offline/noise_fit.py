@@ -23,7 +23,7 @@ _QUANTILE: Final = float(ndtri(0.995))
 # No wheel and no detector is so many times better or worse than the defaults: smaller residuals are made up, and larger
 # ones are no noise.
 PLAUSIBLE: Final = 20.0
-_ROUNDING: Final = 1e-6
+_LEAST: Final = (1.0 + 1e-6) / PLAUSIBLE  # where the search stops, with its rounding
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
     """Fits the noise of all runs at once.
 
     What the drives tell too little of stays where it began, or where they are more content with if that is more; what
-    comes out as nothing a robot has stays, and the others are fitted without it; all stay if the fit finds no end.
+    comes out smaller than any robot's stays, and the others are fitted without it; all stay if the fit finds no end, or
+    one comes out larger than any noise.
 
     Args:
         maps: solved under any noise.
@@ -82,22 +83,44 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
     kept: dict[str, FittedSigma] = {}
     while free:
         fitted = _fitted(maps, noise, free)
-        if not fitted.converged:
-            why = "the fit came to no end"
-            found = _sigmas(free, fitted, noise)
+        found = _sigmas(free, fitted)
+        why = _no_noise(found) if fitted.converged else "the fit came to no end"
+        if why:
             kept |= {each.name: replace(each, value=getattr(noise, each.name), kept=why) for each in found}
             break
-        found = _sigmas(free, fitted, noise)
-        odd = {each.name: each for each in found if "times the default" in each.kept}
-        if not odd:
+        small = {each.name: _left(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept}
+        if not small:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
             parts = zip(_beginnings(maps), fitted.solutions, strict=True)
             fitted_noise = noise.model_copy(update=values)
             return NoiseFit(fitted_noise, _in_order(told | kept), tuple(FittedPart(*part) for part in parts))
-        kept |= odd
-        free = tuple(name for name in free if name not in odd)
+        kept |= small
+        free = tuple(name for name in free if name not in small)
     return NoiseFit(noise, _in_order(kept))
+
+
+def _times_default(sigma: FittedSigma) -> float:
+    default: float = getattr(NoiseParameters(), sigma.name)
+    return sigma.value / default
+
+
+def _no_noise(found: Sequence[FittedSigma]) -> str:
+    """Why what the drives leave over is no noise; empty if it may be.
+
+    What one sigma cannot explain the others were stretched to as well, so none of them is believed then.
+    """
+    for each in found:
+        if not each.kept and _times_default(each) >= PLAUSIBLE:
+            return (
+                f"{each.name} came out at {_times_default(each):.3g} times the default: what is left over is no noise"
+            )
+    return ""
+
+
+def _left(sigma: FittedSigma, noise: NoiseParameters) -> FittedSigma:
+    why = f"it came out at {_times_default(sigma):.3g} times the default, which no robot has"
+    return replace(sigma, value=getattr(noise, sigma.name), kept=why)
 
 
 def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
@@ -152,18 +175,16 @@ def _rest(parts: CovarianceParts, noise: NoiseParameters, names: tuple[str, ...]
     )
 
 
-def _sigmas(names: Sequence[str], fitted: FittedVariances, noise: NoiseParameters) -> list[FittedSigma]:
+def _sigmas(names: Sequence[str], fitted: FittedVariances) -> list[FittedSigma]:
     low, high = fitted.interval(_QUANTILE)
     found = []
     for i, name in enumerate(names):
-        value, default = float(fitted.sigma[i]), getattr(NoiseParameters(), name)
         kept = ""
         if not fitted.told[i]:
             kept = (
                 f"the drives tell too little of it (redundancy {fitted.redundancy[i]:.1f}, {LEAST_REDUNDANCY:g} needed)"
             )
-        elif not (1.0 + _ROUNDING) / PLAUSIBLE < value / default < PLAUSIBLE:
-            kept = f"it came out at {value / default:.3g} times the default, which no robot has"
-            value = getattr(noise, name)
-        found.append(FittedSigma(name, value, float(low[i]), float(high[i]), float(fitted.redundancy[i]), kept))
+        found.append(
+            FittedSigma(name, float(fitted.sigma[i]), float(low[i]), float(high[i]), float(fitted.redundancy[i]), kept)
+        )
     return found

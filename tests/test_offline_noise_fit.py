@@ -105,6 +105,19 @@ def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     assert result.noise == PRIOR
 
 
+def test_what_no_noise_explains_leaves_all_as_it_was(maps: list[LocalMap]) -> None:
+    """Wheels that err a hundred times as much as they are taken to: no wheels do, so something else is wrong."""
+    odometry = maps[0].chain.odometry
+    parts = replace(odometry.parts, unit=odometry.parts.unit / 100.0**2)
+    odd = replace(maps[0].chain, odometry=replace(odometry, parts=parts))
+    found = fit_and_weigh([replace(maps[0], chain=odd)], PRIOR)
+    assert found.noise == PRIOR
+    told = {each.kept for each in found.fitted.parameters} - {NOT_NEEDED}
+    (why,) = told
+    assert why.startswith(ODOMETRY_NOISE)
+    assert why.endswith(" times the default: what is left over is no noise")
+
+
 def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
     """A bias that lasts for metres: corners look better than what they say of the tag's place."""
     simulate("nsh", 3, tmp_path / "nsh", ["hallway"], render=False)
