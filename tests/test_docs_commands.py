@@ -152,10 +152,13 @@ def test_what_is_not_run_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the pages take for granted: two recordings, drives of other programs, and a small world called nsh."""
+    """What the pages take for granted: recordings, drives of other programs, and a small world called nsh."""
     for i, (name, start) in enumerate({"a": [0.0, 0.0, 0.2], "b": [0.5, 1.0, -0.1]}.items()):
         drive = made_drive(start, AHEAD)
         write_drive(folder / "recordings", drive, TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
+    for i, day in enumerate(("friday", "saturday")):
+        drive = made_drive([0.2, -0.3, 0.1 * i], AHEAD)
+        write_drive(folder / day, drive, TAGS, made_robot("a"), corner_sigma_px=0.3, seed=5 + i, run_id=day)
     bag = BagOfLog.of(folder / "recordings" / "a" / "one").odometry().mount().camera_info()
     bag.picture("mono8", draw_tag("tag36h11", 7, CORNERS_PX, (720, 1280)), START_NS + S)
     bag.write(folder / "drive.bag")
