@@ -15,8 +15,9 @@ from offline.export_g2o import g2o_text
 from offline.export_geojson import geojson_of
 from offline.export_layout import fmap_of, frc_layout_of
 from offline.export_options import ExportFormat, ExportOptions
-from offline.map_io import read_map, tags_csv
+from offline.map_io import read_map
 from offline.result import Component, MapResult, RunResult
+from offline.tags_table import tags_csv
 from offline.trajectory_file import write_tum
 
 RUN_COLUMNS: Final = ("t_ns", "x_m", "y_m", "theta_rad")

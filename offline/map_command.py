@@ -15,7 +15,8 @@ from calib.noise import read_noise_yaml
 from calib.words import counted
 from offline.errors import OfflineError
 from offline.jit import compilation_announced
-from offline.map_io import JSON_FILE, advice_as_json, map_as_json, read_map, write_map
+from offline.map_io import JSON_FILE, read_map, write_map
+from offline.map_json import advice_as_json, map_as_json
 from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
 from offline.picture import write_picture

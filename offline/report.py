@@ -4,7 +4,7 @@ from pathlib import Path
 
 from calib.files import written_whole
 from calib.words import counted
-from offline.map_io import map_as_json
+from offline.map_json import map_as_json
 from offline.report_data import figures
 from offline.report_page import page
 from offline.report_tables import tables

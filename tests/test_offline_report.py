@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from offline.map_command import MapOptions, make_map
-from offline.map_io import map_as_json
+from offline.map_json import map_as_json
 from offline.pipeline import map_logs
 from offline.report import write_report
 from offline.report_data import figures

@@ -13,7 +13,8 @@ from offline.global_map import solve_global_map
 from offline.graph import build_graph
 from offline.local_map import solve_local_map
 from offline.map_command import exit_code, summary
-from offline.map_io import map_as_json, read_map, write_map
+from offline.map_io import read_map, write_map
+from offline.map_json import map_as_json
 from offline.merge import merge
 from offline.pipeline import build_map
 from offline.result import MapResult

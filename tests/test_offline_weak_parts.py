@@ -19,7 +19,7 @@ from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingF
 from offline.graph import Graph, build_graph
 from offline.import_robot import ImportOptions
 from offline.importers import import_folder
-from offline.map_io import map_as_json
+from offline.map_json import map_as_json
 from offline.pipeline import map_logs
 from offline.result import MapResult
 from offline.run import TagKey
