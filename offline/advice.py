@@ -15,7 +15,7 @@ from numpy.linalg import LinAlgError
 from calib.arrays import FloatArray, IntArray
 from offline.advice_gain import Gain, Known
 from offline.advice_passes import Pass, Sighting, gain_of_pass, passes_of, sightings_of, ways_m
-from offline.advice_seen import seen_shares
+from offline.advice_seen import expected_sigmas_m
 from offline.advice_tags import Drives, Place, View, drives_of, gain_of_place, places_of, view_of
 from offline.factors import State
 from offline.graph import Graph
@@ -74,8 +74,10 @@ def judged(graph: Graph, solution: Solution) -> list[Judged]:
     then = []
     for kind, candidate, gain in gains:
         if isinstance(candidate, Place):
-            gain = gain_of_place(drives, view, candidate, seen_shares(drives, view, candidate, known))
-        then.append(Judged(kind, candidate, now_m, known.sigmas_with_m(gain)))
+            then_m = expected_sigmas_m(drives, view, candidate, known)
+        else:
+            then_m = known.sigmas_with_m(gain)
+        then.append(Judged(kind, candidate, now_m, then_m))
     then.sort(key=lambda each: float(each.then_m.max()))
     return [next(each for each in then if each.kind == kind) for kind in dict.fromkeys(each.kind for each in then)]
 

@@ -11,7 +11,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.advice_gain import Known
-from offline.advice_tags import Drives, Place, View, is_in_view
+from offline.advice_tags import Drives, Place, View, gain_of_place, is_in_view
 
 # Points of equal weight on circles that hold 1/6, 1/2 and 5/6 of a normal distribution in the plane.
 _RADII: Final = np.sqrt(-2.0 * np.log1p(-np.array([1.0, 3.0, 5.0]) / 6.0))
@@ -41,6 +41,22 @@ def seen_shares(drives: Drives, view: View, place: Place, known: Known) -> Float
         sensors = np.column_stack([drives.sensors[viewer, :2] - off_m, np.full(len(off_m), drives.sensors[viewer, 2])])
         shares.append(is_in_view(sensors, place.position_m, face, view).mean())
     return np.array(shares)
+
+
+def expected_sigmas_m(drives: Drives, view: View, place: Place, known: Known) -> FloatArray:
+    """(T,) the tags' largest sigmas with a tag at the place, the mean over which of its viewers have it in view.
+
+    A single reading from a drive that nothing held is worth the most, so what counts is whether there is one: readings
+    that count by their probability would promise as good as all of it. What puts one viewer too far off mostly puts
+    those near it too far off as well, so they are taken to miss it in the order of their probabilities.
+    """
+    shares = seen_shares(drives, view, place, known)
+    levels = np.unique(shares)[::-1]
+    chances = -np.diff(np.append(levels, 0.0))
+    expected: FloatArray = (1.0 - levels[0]) * known.sigmas_m()
+    for level, chance in zip(levels, chances, strict=True):
+        expected = expected + chance * known.sigmas_with_m(gain_of_place(drives, view, place, shares >= level))
+    return expected
 
 
 def _moved(drives: Drives, pose: int, place: Place) -> FloatArray:

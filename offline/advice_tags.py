@@ -5,7 +5,6 @@ to the right, and faces the robot there; it is read from where the robots' camer
 tags of the map.
 """
 
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -29,7 +28,6 @@ MOST_SLANT_RAD: Final = np.radians(65.0)
 _WITHIN_SIGHTING: Final = np.array([0.25, 0.75])
 _MOST_SIGHTINGS: Final = 3
 _NEAREST_IN_RANGE: Final = 9
-_LEAST_CHANCE: Final = 1e-3
 
 
 class View(NamedTuple):
@@ -146,25 +144,21 @@ def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, vi
     return np.asarray(near_enough & (np.abs(bearing_rad) <= view.half_angle_rad) & (slant >= np.cos(MOST_SLANT_RAD)))
 
 
-def gain_of_place(drives: Drives, view: View, place: Place, shares: FloatArray | None = None) -> Gain:
+def gain_of_place(drives: Drives, view: View, place: Place, seen: BoolArray | None = None) -> Gain:
     """What a tag there would have told of the poses that read it, and of the calibration.
 
     Args:
         drives: of `drives_of`.
         view: of `view_of`.
         place: of `places_of`.
-        shares: (k,) with which probability each of its viewers has it in view; with certainty where None.
+        seen: (k,) which of its viewers have it in view; all where None.
     """
-    of_map, poses = drives.graph.problem.columns, place.viewers
+    of_map = drives.graph.problem.columns
+    poses = place.viewers if seen is None else place.viewers[seen]
     state = drives.state
     extended = State(state.poses, np.concatenate([state.tags, place.position_m[None]]), state.calibration)
-    tag = np.full(len(poses), len(state.tags))
     own, columns = _own_columns(of_map, poses)
-    readings = _readings(drives, view, place, tag)
-    if shares is not None:
-        readings = replace(
-            readings, whitening=np.sqrt(np.maximum(shares, _LEAST_CHANCE))[:, None, None] * readings.whitening
-        )
+    readings = _readings(drives, view, place, poses)
     return condensed((readings.linearise(extended, own),), 2, columns)
 
 
@@ -182,17 +176,18 @@ def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
     return Columns(by_pose, by_tag, by_calibration, 2 + len(columns)), columns
 
 
-def _readings(drives: Drives, view: View, place: Place, tag: IntArray) -> ReadingFactors:
+def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> ReadingFactors:
     """As their like were read: so many of each passing by, with the sigmas of readings at that range."""
-    readings, like = drives.graph.problem.readings, drives.example[place.viewers]
-    sight = se2.apply(se2.inverse(drives.sensors[place.viewers]), place.position_m)
+    readings, like = drives.graph.problem.readings, drives.example[poses]
+    sight = se2.apply(se2.inverse(drives.sensors[poses]), place.position_m)
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
     at = np.searchsorted(view.range_m, value[:, 0])
     first = np.clip(at - _NEAREST_IN_RANGE // 2, 0, max(len(view.range_m) - _NEAREST_IN_RANGE, 0))
     variance = np.array([view.variance[i : i + _NEAREST_IN_RANGE].mean(axis=0) for i in first])
-    n_each = view.n_a_sighting * place.n_sightings / len(tag)
+    n_each = view.n_a_sighting * place.n_sightings / len(place.viewers)
+    tag = np.full(len(poses), len(drives.state.tags))
     return ReadingFactors(
-        pose=place.viewers,
+        pose=poses,
         tag=tag,
         value=value,
         polar=np.ones(len(tag), dtype=np.bool_),

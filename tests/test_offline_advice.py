@@ -9,7 +9,7 @@ from calib.arrays import FloatArray
 from offline.advice import advise, candidates_of, judged, known_of
 from offline.advice_gain import Known
 from offline.advice_passes import gain_of_pass, most_length_m
-from offline.advice_seen import seen_shares
+from offline.advice_seen import expected_sigmas_m, seen_shares
 from offline.advice_tags import Place, gain_of_place
 from offline.chain import Chain
 from offline.factors import State
@@ -96,11 +96,13 @@ def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
     shares = [seen_shares(drives, view, each, known) for each in found.places]
     assert {float(each.max()) for each in shares} == {1.0}  # from the pose beside it
     assert min(float(each.min()) for each in shares) < 0.9  # some may have passed too far away
-    gains["tag"] = [gain_of_place(drives, view, *each) for each in zip(found.places, shares, strict=True)]
+    expected = [expected_sigmas_m(drives, view, each, known).max() for each in found.places]
+    for certain, doubtful in zip(gains["tag"], expected, strict=True):
+        assert known.sigmas_with_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
+    by_pass = known_of(scene.solution, gains["pass"])
+    foretold = {"tag": expected, "pass": [by_pass.sigmas_with_m(gain).max() for gain in gains["pass"]]}
     for each in told:
-        known = known_of(scene.solution, gains[each.kind])
-        foretold = [known.sigmas_with_m(gain).max() for gain in gains[each.kind]]
-        assert each.sigma_then_m == pytest.approx(min(foretold))
+        assert each.sigma_then_m == pytest.approx(min(foretold[each.kind]))
     (advised,) = [each for each in told if each.kind == "pass"]
     assert advised.length_m is not None
     assert 0.0 < advised.length_m <= most_length_m(found.drives.ways) <= 50.0
@@ -163,3 +165,19 @@ def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
     outcome = trial(scene, 0, 3)
     assert outcome.n_beaten(0, ["pass", "tag"]) >= 5
     assert outcome.found_m[0] == pytest.approx(outcome.foretold_m[0], rel=0.15)
+
+
+def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(scene: Scene) -> None:
+    """Readings that count by their probability would promise as good as all of what certain ones do."""
+    found = candidates_of(scene.graph, scene.solution.state)
+    drives, view = found.drives, found.view
+    known = known_of(scene.solution, [gain_of_place(drives, view, each) for each in found.places])
+    shares = [seen_shares(drives, view, each, known) for each in found.places]
+    place, share = min(zip(found.places, shares, strict=True), key=lambda each: float(each[1].min()))
+    without = known.sigmas_with_m(gain_of_place(drives, view, place, share > share.min()))
+    with_it = known.sigmas_with_m(gain_of_place(drives, view, place))
+    expected = expected_sigmas_m(drives, view, place, known)
+    worst = int(np.argmax(without - with_it))
+    assert with_it[worst] < expected[worst] < known.sigmas_m()[worst]
+    # Where not all see it, those that may have been farthest off do not.
+    assert expected[worst] >= share.min() * with_it[worst] + (1.0 - share.min()) * without[worst] - 1e-9
