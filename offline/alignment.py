@@ -94,12 +94,62 @@ def align(a: CondensedMap, b: CondensedMap, placement: Placement | None = None) 
     return _Judge(a, b, shared, placement).verdict()
 
 
-class _Judge:
+class Rivalry:
+    """Which explanations of some shared tags leave it open which of them is true."""
+
+    def __init__(self, n_shared: int) -> None:
+        """Of so many."""
+        self.n_shared = n_shared
+
+    def evidence(self, explanation: Explanation) -> float:
+        """Log of the likelihood of the shared tags over that of all being wrong."""
+        return evidence_nats(explanation.held, self.n_shared)
+
+    def is_rival(self, evidence: float, other: Explanation, best_evidence: float, best: Explanation) -> bool:
+        """Whether another explanation leaves it open that the best is true."""
+        if evidence > best_evidence - MARGIN_NATS and not self.is_same_place(other, best):
+            return True
+        own, best_own = other.members & ~best.members, best.members & ~other.members
+        if (own & ~best.fits).sum() < 2 or (moved := self._as_group(own, other)) <= 0.0:
+            return False
+        # A group that rather moved as one than each tag on its own, so it may as well be what stayed. What fits the
+        # group may be of it.
+        n_group = (other.fits & ~best.members).sum()
+        if best.n < GROUP_MARGIN * n_group:
+            return True
+        # The same where tags that fit both stayed too: these tell which.
+        best_moved = max(self._as_group(best_own, best), 0.0)
+        tells_little = evidence + best_moved > best_evidence + moved - MARGIN_NATS
+        return bool(best_own.sum() < GROUP_MARGIN * n_group and tells_little)
+
+    def _as_group(self, tags: BoolArray, explanation: Explanation) -> float:
+        """Evidence that these of its tags fit together."""
+        if tags.sum() < 2:
+            return 0.0
+        return self.evidence(Explanation(tags, explanation.linear, hold(explanation.linear, tags)))
+
+    def is_same_place(self, one: Explanation, other: Explanation) -> bool:
+        """Whether chance explains how far apart they put the other map."""
+        off = se2.log(se2.between(one.T_a_b, other.T_a_b))
+        covariance = self.covariance(one) + self.covariance(other)
+        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
+
+    def covariance(self, explanation: Explanation) -> FloatArray:
+        """(3, 3) of the right tangent of T_a_b."""
+        by_motion = np.eye(3)
+        by_motion[:2, 2] = -quarter_turned(explanation.linear.centre)
+        by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
+        covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
+        return covariance
+
+
+class _Judge(Rivalry):
     """Weighs what the shared tags of two maps say."""
 
     def __init__(
         self, a: CondensedMap, b: CondensedMap, shared: tuple[TagKey, ...], placement: Placement | None
     ) -> None:
+        super().__init__(len(shared))
         self.fit = JointFit(a.tree(shared), b.tree(shared))
         self.shared = shared
         self.placement = placement
@@ -117,7 +167,7 @@ class _Judge:
         found = sorted(each_once.values(), key=lambda f: -f[0])
         rivals: list[Explanation] = []
         for its, each in found:
-            if self._is_rival(its, each, evidence, best) and not any(self._is_same_place(each, r) for r in rivals):
+            if self.is_rival(its, each, evidence, best) and not any(self.is_same_place(each, r) for r in rivals):
                 rivals.append(each)
         told = tuple(self._told(rival, found, (), is_sure=False) for rival in rivals)
         beats_chance = best.n == len(self.shared) or evidence > MARGIN_NATS
@@ -151,7 +201,7 @@ class _Judge:
             ranked = sorted(found.values(), key=lambda f: -f[0])
             for (its, one), (others, other) in combinations(ranked, 2):
                 members = one.members | other.members
-                if members.tobytes() in tried or members.tobytes() in found or not self._is_same_place(one, other):
+                if members.tobytes() in tried or members.tobytes() in found or not self.is_same_place(one, other):
                     continue
                 tried.add(members.tobytes())
                 together = settled(self.fit, one.linear.at, members)
@@ -165,7 +215,7 @@ class _Judge:
 
     def evidence(self, explanation: Explanation) -> float:
         """Log of the likelihood of the shared tags over that of all being wrong, with what was measured."""
-        return evidence_nats(explanation.held, len(self.shared)) + self._evidence_of_placement(explanation)
+        return super().evidence(explanation) + self._evidence_of_placement(explanation)
 
     def _evidence_of_placement(self, explanation: Explanation) -> float:
         """Log likelihood of the measured placement over that of it being anywhere."""
@@ -186,44 +236,9 @@ class _Judge:
     def _from_placement(self, placement: Placement, explanation: Explanation) -> tuple[FloatArray, FloatArray]:
         """How far off an explanation is (3,), and the covariance of that."""
         back = se2.adjoint(se2.inverse(placement.T_a_b))
-        covariance = placement.covariance + self._covariance(explanation)
+        covariance = placement.covariance + self.covariance(explanation)
         covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
         return se2.log(se2.between(placement.T_a_b, explanation.T_a_b)), covariance
-
-    def _is_rival(self, evidence: float, other: Explanation, best_evidence: float, best: Explanation) -> bool:
-        if evidence > best_evidence - MARGIN_NATS and not self._is_same_place(other, best):
-            return True
-        own, best_own = other.members & ~best.members, best.members & ~other.members
-        if (own & ~best.fits).sum() < 2 or (moved := self._as_group(own, other)) <= 0.0:
-            return False
-        # A group that rather moved as one than each tag on its own, so it may as well be what stayed. What fits the
-        # group may be of it.
-        n_group = (other.fits & ~best.members).sum()
-        if best.n < GROUP_MARGIN * n_group:
-            return True
-        # The same where tags that fit both stayed too: these tell which.
-        best_moved = max(self._as_group(best_own, best), 0.0)
-        tells_little = evidence + best_moved > best_evidence + moved - MARGIN_NATS
-        return bool(best_own.sum() < GROUP_MARGIN * n_group and tells_little)
-
-    def _as_group(self, tags: BoolArray, explanation: Explanation) -> float:
-        """Evidence that these of its tags fit together."""
-        if tags.sum() < 2:
-            return 0.0
-        return self.evidence(Explanation(tags, explanation.linear, hold(explanation.linear, tags)))
-
-    def _is_same_place(self, one: Explanation, other: Explanation) -> bool:
-        off = se2.log(se2.between(one.T_a_b, other.T_a_b))
-        covariance = self._covariance(one) + self._covariance(other)
-        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
-
-    def _covariance(self, explanation: Explanation) -> FloatArray:
-        """(3, 3) of the right tangent of T_a_b."""
-        by_motion = np.eye(3)
-        by_motion[:2, 2] = -quarter_turned(explanation.linear.centre)
-        by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
-        covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
-        return covariance
 
     def _mixed_covariance(self, explanation: Explanation, found: Sequence[tuple[float, Explanation]]) -> FloatArray:
         """(3, 3) of the right tangent of T_a_b, with the doubt of which tags fit.
@@ -231,11 +246,11 @@ class _Judge:
         A mixture of what other choices of tags make of the same place, each by its evidence; second moments about this
         one.
         """
-        near = [(its, each) for its, each in found if self._is_same_place(each, explanation)]
+        near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
         evidence = np.array([its for its, _ in near])
         weight = np.exp(evidence - evidence.max())
         off = np.array([se2.log(se2.between(explanation.T_a_b, each.T_a_b)) for _, each in near])
-        each = np.array([self._covariance(each) for _, each in near]) + off[:, :, None] * off[:, None, :]
+        each = np.array([self.covariance(each) for _, each in near]) + off[:, :, None] * off[:, None, :]
         mixed: FloatArray = np.tensordot(weight / weight.sum(), each, 1)
         return mixed
 

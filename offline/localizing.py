@@ -200,18 +200,7 @@ def _home(found: Sequence[_Stretch]) -> int:
 
 
 def _held(here: Sequence[Located], known: KnownMap) -> HeldRun:
-    names = [each.names() for each in here]
-    maybe = []
-    for each, fitting in zip(here, names, strict=True):
-        of_one = [seen for seen, _ in each.pairs]
-        taken = set(fitting.values())
-        maybe.append(
-            {
-                seen: tag
-                for seen, tag in each.pairs
-                if seen not in fitting and tag not in taken and of_one.count(seen) == 1
-            }
-        )
+    names, maybe = [each.names() for each in here], [each.others() for each in here]
     starts = np.array([_transform(each) for each in here])
     return solve_held([each.local_map for each in here], starts, names, maybe, known)
 

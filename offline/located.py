@@ -49,6 +49,16 @@ class Located:
         own, known = ([pair[side] for pair in fitting] for side in (0, 1))
         return {seen: tag for seen, tag in fitting if own.count(seen) == 1 and known.count(tag) == 1}
 
+    def others(self) -> dict[TagKey, TagKey]:
+        """That of those that may be one of the map's, and do not fit."""
+        fitting, of_one = self.names(), [seen for seen, _ in self.pairs]
+        taken = set(fitting.values())
+        return {
+            seen: tag
+            for seen, tag in self.pairs
+            if seen not in fitting and tag not in taken and of_one.count(seen) == 1
+        }
+
 
 def locate(local_map: LocalMap, known: KnownMap, component: int) -> Located | None:
     """Looks for the run's place; None where it saw none of the map's tags."""

@@ -15,12 +15,14 @@ from offline.graph import Parameter, build_graph
 from offline.held_run import solve_held
 from offline.kept_maps import measured_chain, run_without_log
 from offline.known_map import KnownMap
-from offline.local_map import LocalMap
+from offline.local_map import LocalMap, solve_local_map
+from offline.located import Located, locate
 from offline.online_filter import OnlineFilter
 from offline.run import TagKey
 from offline.solver import Solution
 
 _NAME: Final = "the drive"
+_COMPONENT: Final = 0  # there is one only
 _UNJUDGED: Final = Goodness(0.0, 0, 0.0, 1.0, 1.0)
 
 
@@ -77,6 +79,7 @@ class Drive:
         tags: Sequence[TagKey],
         held: Mapping[TagKey, TagKey],
         loose: Mapping[TagKey, TagKey],
+        placed: Located | None = None,
     ) -> dict[TagKey, TagKey]:
         """Solves it all, tags that were moved apart, and gives the filter what comes of it.
 
@@ -87,12 +90,16 @@ class Drive:
             tags: of the filter, in its order.
             held: the map's tag of each of those that hold the robot.
             loose: likewise of those that do not.
+            placed: where the drive lies by `judged`, which the solve then starts from; else from where the filter is.
 
         Returns:
             The map's tag of each that holds it now.
         """
-        start = self._poses[0]
-        member = self._local_map(state, tags, parameters, start)
+        if placed is None or placed.alignment is None:
+            start = self._poses[0]
+            member = self._local_map(state, tags, parameters, start)
+        else:
+            start, member = placed.alignment.T_a_b, placed.local_map
         found = solve_held([member], start[None], [dict(held)], [dict(loose)], known)
         solution, columns = found.solution, found.graph.problem.columns
         self._poses = list(solution.state.poses)
@@ -105,6 +112,13 @@ class Drive:
         covariance = solution.covariance(wanted)
         state.set_to(self._poses[-1], np.array(values), solution.state.tags[where], covariance, of_numbers >= 0)
         return {tag: name for tag, name in found.called[0].items() if name in known.index}
+
+    def judged(self, known: KnownMap) -> Located | None:
+        """Where it lies in the map as `localize` would say, whatever the filter holds; None without tags of the map."""
+        tags = {tag for _, tag, _ in self._readings}
+        if not tags & known.instances.keys():
+            return None
+        return locate(solve_local_map(self._chain(sorted(tags))), known, _COMPONENT)
 
     def _local_map(
         self, state: OnlineFilter, tags: Sequence[TagKey], parameters: Sequence[Parameter], start: FloatArray

@@ -15,6 +15,7 @@ from scipy.special import chdtri
 
 from calib.arrays import FloatArray, IntArray
 from calib.robot import Robot
+from offline.alignment import GROUP_MARGIN
 from offline.errors import OfflineError
 from offline.factors import ReadingFactors, whitening
 from offline.graph import (
@@ -27,6 +28,8 @@ from offline.graph import (
 )
 from offline.joint_fit import TAG_GATE, UNMODELLED_SIGMA_M
 from offline.known_map import KnownMap, known_map
+from offline.located import Located
+from offline.merge_report import why_not_joined
 from offline.online_drive import Drive, TagReading
 from offline.online_filter import OnlineFilter
 from offline.online_held import HeldTags
@@ -39,6 +42,7 @@ _FALSE_ALARM: Final = 1e-6
 # A tag that was moved may be anywhere about.
 _ANYWHERE_M: Final = 10.0
 _MOST_COUNTED: Final = 200
+_DOUBTFUL: Final = "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
 
 
 @dataclass(frozen=True)
@@ -79,11 +83,13 @@ class OnlineLocalizer:
         self._drive = Drive(robot)
         self._surprise: dict[TagKey, tuple[float, int]] = {}
         self._moved: dict[TagKey, TagKey] = {}
+        self._doubt = ""
+        self._judged: frozenset[TagKey] = frozenset()  # do not hold, and `settle` knew of them
 
     @property
     def pose(self) -> OnlinePose | None:
-        """Where the robot is; None while that is not known, and `reason` says why."""
-        if not self._is_located:
+        """Where the robot is; None while that is not known or in doubt, and `reason` says why."""
+        if self.reason:
             return None
         cos, sin = np.cos(self._filter.pose[2]), np.sin(self._filter.pose[2])
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -93,7 +99,7 @@ class OnlineLocalizer:
     def reason(self) -> str:
         """Why the robot's place is not known; empty when it is."""
         if self._is_located:
-            return ""
+            return self._doubt or (_DOUBTFUL if self._is_in_doubt() else "")
         return self._search.reason or "found, and told after the next motion or reading"
 
     @property
@@ -131,18 +137,40 @@ class OnlineLocalizer:
     def settle(self) -> OnlinePose | None:
         """Solves all motions and readings so far again, as `localize` does, and goes on from there.
 
-        A filter takes each motion and reading as it looked when it came; where the robot drove for metres without a
-        tag, that is worth some of its sigmas. This takes as long as it takes to solve the drive, some 20 ms for 100 m:
-        for moments in which there is time. Does nothing before the robot knows where it is.
+        A filter takes each motion and reading as it looked when it came, and each tag as held or moved when it was seen
+        first. Here a tag that does not hold the robot puts all to the question: the drive is placed anew by what all
+        its tags say together, and where that is not sure, `pose` is None. This takes as long as it takes to solve the
+        drive, some 20 ms for 100 m, and some 200 ms where the question is put: for moments in which there is time.
         """
-        if self._is_located:
-            loose = {tag: each for tag, each in self._moved.items() if not self._is_held(tag)}
-            held = self._drive.settle(
-                self._filter, self._known, self._parameters, list(self._index), self._held.own, loose
-            )
-            self._held.set_to(held)
-            self._moved = self._moved_of(held)
+        if self._is_located and not self._doubt and not self._contradicting():
+            self._settle(self._held.own, {}, None)
+        if not self._is_located or self._doubt or self._contradicting():
+            placed = self._drive.judged(self._known)
+            if placed is not None and placed.is_sure:
+                self._settle(placed.names(), placed.others(), placed)
+            elif self._is_located and placed is not None:
+                self._doubt = why_not_joined("the map", "the drive", placed.shared, placed.alignment)
         return self.pose
+
+    def _settle(self, held: dict[TagKey, TagKey], loose: dict[TagKey, TagKey], placed: Located | None) -> None:
+        tags = list(self._index)
+        held = self._drive.settle(self._filter, self._known, self._parameters, tags, held, loose, placed)
+        self._held.set_to(held)
+        self._moved = self._moved_of(held)
+        self._is_located, self._doubt = True, ""
+        self._judged = frozenset(self._contradicting())
+
+    def _contradicting(self) -> list[TagKey]:
+        """Tags seen that may be the map's, and do not lie where it has them."""
+        return [tag for tag in self._index if tag in self._known.instances and tag not in self._held.own]
+
+    def _is_in_doubt(self) -> bool:
+        """Whether the tags that contradict since all was judged may as well be those that stayed.
+
+        As of two groups of tags in `alignment`, one that moved as one and one that stayed.
+        """
+        others = len(set(self._contradicting()) - self._judged)
+        return others > 1 and len(self._held.own) < GROUP_MARGIN * others
 
     def _take(self, tag: TagKey, factors: ReadingFactors) -> None:
         if tag not in self._index:

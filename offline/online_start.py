@@ -12,17 +12,20 @@ from typing import Final
 import numpy as np
 
 from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.alignment import GROUP_MARGIN, MARGIN_NATS, evidence_nats
-from offline.alignment_search import distances, is_same_distance, through
+from calib.arrays import FloatArray, IntArray
+from offline.alignment import MARGIN_NATS, Rivalry
+from offline.alignment_search import Explanation, distances, is_same_distance, through
 from offline.condensed import quarter_turned
-from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Held, Linear, hold, ill_fitting
+from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold, ill_fitting
 from offline.known_map import KnownMap
 from offline.run import TagKey
 
 # Of pairs of tags, looked at in one call.
 _PAIRS_A_CALL: Final = 1
 _STEPS: Final = 4
+# Two tags are held against each other by their distance alone, which a tag that was moved aside keeps: nothing
+# contradicts a place that is off by as much. Any one of three is told by the others.
+LEAST_FITTING: Final = 3
 _NONE: Final = np.zeros(0)
 
 
@@ -52,13 +55,6 @@ class Start:
     tags: tuple[tuple[int, TagKey], ...]
 
 
-@dataclass(frozen=True)
-class _Fit:
-    T: FloatArray
-    members: BoolArray
-    held: Held
-
-
 class StartSearch:
     """Goes through the pairs of tags seen, and begins anew when there is another one."""
 
@@ -66,7 +62,7 @@ class StartSearch:
         self._known = known
         self._pairs: list[tuple[int, TagKey]] = []
         self._left: list[tuple[int, int]] = []
-        self._found: list[_Fit] = []
+        self._found: list[Explanation] = []
         self.reason = "no tag of the map was seen yet"
 
     def look(self, seen: SeenTags) -> Start | None:
@@ -98,23 +94,21 @@ class StartSearch:
         if not self._found:
             self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
             return None
-        found = sorted(self._found, key=lambda fit: -evidence_nats(fit.held, n))
-        best, evidence = found[0], evidence_nats(found[0].held, n)
-        if any(_is_rival(other, best, evidence, n) for other in found[1:]):
+        rivalry = Rivalry(n)
+        found = sorted(((rivalry.evidence(each), each) for each in self._found), key=lambda f: -f[0])
+        evidence, best = found[0]
+        if any(rivalry.is_rival(its, other, evidence, best) for its, other in found[1:]):
             self.reason = "ambiguous, because two groups of tags put the start in different places"
             return None
-        if best.members.sum() < n and evidence <= MARGIN_NATS:
-            self.reason = f"of {n} tags that may be the map's {best.members.sum()} fit, which chance may bring about"
+        fitting = {self._pairs[i][0] for i in np.flatnonzero(best.members)}
+        if len(fitting) < LEAST_FITTING:
+            self.reason = f"{len(fitting)} tags fit the map, {LEAST_FITTING} must, as any one may have been moved"
+            return None
+        if best.n < n and evidence <= MARGIN_NATS:
+            self.reason = f"of {n} tags that may be the map's {best.n} fit, which chance may bring about"
             return None
         self.reason = ""
-        return Start(best.T, tuple(self._pairs[i] for i in np.flatnonzero(best.members)))
-
-
-def _is_rival(other: _Fit, best: _Fit, evidence: float, n: int) -> bool:
-    if evidence_nats(other.held, n) > evidence - MARGIN_NATS:
-        return True
-    own = (other.members & ~best.members).sum()  # may have moved as one, or have stayed
-    return bool(own >= 2 and best.members.sum() < GROUP_MARGIN * own)
+        return Start(best.T_a_b, tuple(self._pairs[i] for i in np.flatnonzero(best.members)))
 
 
 class _RigidFit:
@@ -138,21 +132,21 @@ class _RigidFit:
         fits &= self._own[first] != self._own[second]
         return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
 
-    def grown(self, i: int, j: int) -> _Fit | None:
+    def grown(self, i: int, j: int) -> Explanation | None:
         """What fits with two pairs; None where they do not themselves."""
         members = np.zeros(self._n, dtype=np.bool_)
         members[[i, j]] = True
         T = through(self._a[[i, j]], self._b[[i, j]])
         for _ in range(_STEPS):
             held = hold(self._linear(T), members)
-            T = self._moved(T, held)
+            T = held.T_a_b
             off, spread = held.others()
             fitting = members | (ill_fitting(off, spread) < 1.0)
             if (fitting == members).all():
                 break
             members = fitting
         held = hold(self._linear(T), members)
-        return _Fit(T, members, held) if held.closes else None
+        return Explanation(members, held.linear, held) if held.closes else None
 
     def _linear(self, T: FloatArray) -> Linear:
         cos, sin = np.cos(T[2]), np.sin(T[2])
@@ -169,8 +163,3 @@ class _RigidFit:
         unbent = Bend(T, _NONE, _NONE)
         none = np.zeros((2 * n, 0))
         return Linear(unbent, centre, (self._a - in_a).reshape(-1), covariance, by_transform.reshape(-1, 3), none, none)
-
-    def _moved(self, T: FloatArray, held: Held) -> FloatArray:
-        dx, dy, turn = held.motion
-        about = held.linear.centre - se2.apply([0.0, 0.0, turn], held.linear.centre)
-        return se2.compose([about[0] + dx, about[1] + dy, turn], T)
