@@ -7,8 +7,9 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
-from offline.observations import Readings, joined, read_detections, read_positions
+from offline.observations import read_detections, read_positions
 from offline.odometry import ChainOdometry, WheelTrack, compose_odometry
+from offline.readings import Readings, joined
 from offline.run import Detections, Positions, Run, TagKey
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;

@@ -18,8 +18,8 @@ from offline.factors import (
     State,
     whitening,
 )
-from offline.observations import CAMERA_PARAMETERS
 from offline.odometry import WHEEL_PARAMETERS
+from offline.readings import CAMERA_PARAMETERS
 from offline.run import TagKey
 from offline.solver import Problem
 

@@ -24,8 +24,9 @@ from offline.graph import build_graph
 from offline.kept import KeptChain
 from offline.local_map import LocalMap
 from offline.measured import TapeOptions
-from offline.observations import SAME_SIZE_M, Readings
+from offline.observations import SAME_SIZE_M
 from offline.odometry import ChainOdometry
+from offline.readings import Readings
 from offline.result import MapResult
 from offline.run import Detections, Positions, Run, TagKey
 from offline.solver import solve

@@ -1,10 +1,7 @@
-"""Detections and imported positions of one run -> tag readings in metres, each with its covariance.
-
-A reading is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
-"""
+"""Detections and imported positions of one run -> tag readings in metres, each with its covariance."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,17 +13,15 @@ from calib.camera_model import CameraModel
 from calib.errors import CalibError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
-from offline.covariance_parts import CovarianceParts, concatenated
+from offline.covariance_parts import CovarianceParts
 from offline.errors import OfflineError
+from offline.readings import CAMERA_PARAMETERS, Readings, no_readings
 from offline.run import Detections, Positions, Run
+from offline.standing_corners import averaged
 from offline.tag_pose import TagReadings, general_readings, upright_readings
 
 # What the covariance of an imported position without one is made of.
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
-
-# What a robot's camera adds to its readings besides place and yaw of the mount, to first order: how its corners are
-# read with another roll or pitch, and where its tags were when the stamps are late.
-CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", "time_offset_s")
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -50,71 +45,6 @@ _READINGS_FOR_LEVEL: Final = 100
 _ASKEW_FACTOR: Final = 2.5
 
 
-@dataclass(frozen=True)
-class Readings:
-    """M tag readings.
-
-    Attributes:
-        keyframe: (M,) index of the pose it was taken from.
-        tag: (M,) index into the tags of the run.
-        value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
-        covariance: (M, 2, 2) of the value.
-        parts: what the covariance is made of.
-        by_camera: (M, 2, 3) derivative of the value by CAMERA_PARAMETERS.
-        polar: (M,)
-        in_camera: (M,) about the camera's place and yaw, else about base.
-        corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
-        corner_sigmas: (M,) how many times the noise's sigma such corners count with.
-    """
-
-    keyframe: IntArray
-    tag: IntArray
-    value: FloatArray
-    covariance: FloatArray
-    parts: CovarianceParts
-    by_camera: FloatArray
-    polar: BoolArray
-    in_camera: BoolArray
-    corners_px: FloatArray
-    corner_sigmas: FloatArray
-
-    def __len__(self) -> int:
-        """Number of readings."""
-        return len(self.tag)
-
-    def where(self, mask: BoolArray | IntArray) -> "Readings":
-        """Those of a mask, or of indices."""
-        return Readings(
-            self.keyframe[mask],
-            self.tag[mask],
-            self.value[mask],
-            self.covariance[mask],
-            self.parts.where(mask),
-            self.by_camera[mask],
-            self.polar[mask],
-            self.in_camera[mask],
-            self.corners_px[mask],
-            self.corner_sigmas[mask],
-        )
-
-    def weighed(self, noise: NoiseParameters) -> "Readings":
-        """The same readings under other noise."""
-        return replace(self, covariance=self.parts.under(noise))
-
-    def spread(self, sigmas: FloatArray) -> "Readings":
-        """The same readings with the sigmas of their whitened components (M, 2) so many times as large."""
-        root = np.linalg.cholesky(self.covariance)
-        turn = root @ (sigmas[..., None] * np.linalg.inv(root))
-        back = turn.swapaxes(-1, -2)
-        parts = replace(self.parts, unit=turn @ self.parts.unit @ back, rest=turn @ self.parts.rest @ back)
-        return replace(
-            self,
-            covariance=turn @ self.covariance @ back,
-            parts=parts,
-            corner_sigmas=self.corner_sigmas * sigmas.max(axis=-1),
-        )
-
-
 def read_detections(
     run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Readings, list[str]]:
@@ -136,14 +66,14 @@ def read_detections(
     """
     camera = run.camera
     if camera is None or not len(detections.tag):
-        return _no_readings(), []
+        return no_readings(), []
     # A corner that is no number would spoil the mean of its standing pose.
     known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
-    keyframe, tag, corners_px = _averaged(
+    keyframe, tag, corners_px = averaged(
         keyframe[known], detections.tag[known], detections.corners_px[known], detections.stamps_ns[known]
     )
     if not len(tag):
-        return _no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
+        return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
     found, is_askew, level = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
@@ -248,23 +178,6 @@ def _are_covariances(matrices: FloatArray) -> BoolArray:
     return np.asarray(smallest > _LEAST_VARIANCE)
 
 
-def joined(a: Readings, b: Readings) -> Readings:
-    """Both, ordered by keyframe."""
-    both = Readings(
-        np.concatenate([a.keyframe, b.keyframe]),
-        np.concatenate([a.tag, b.tag]),
-        np.concatenate([a.value, b.value]),
-        np.concatenate([a.covariance, b.covariance]),
-        concatenated(a.parts, b.parts),
-        np.concatenate([a.by_camera, b.by_camera]),
-        np.concatenate([a.polar, b.polar]),
-        np.concatenate([a.in_camera, b.in_camera]),
-        np.concatenate([a.corners_px, b.corners_px]),
-        np.concatenate([a.corner_sigmas, b.corner_sigmas]),
-    )
-    return both.where(np.argsort(both.keyframe, kind="stable"))
-
-
 def _by_camera(robot: Robot, range_bearing: FloatArray, by_turn: FloatArray, twist: FloatArray) -> FloatArray:
     """(M, 2, 3) derivative of readings by CAMERA_PARAMETERS.
 
@@ -354,52 +267,3 @@ def _level(chi2: FloatArray) -> float:
         return 1.0
     level = float(np.median(finite)) / _MEDIAN_CHI2
     return level if len(finite) >= _READINGS_FOR_LEVEL else max(1.0, level)
-
-
-def _averaged(
-    keyframe: IntArray, tag: IntArray, corners_px: FloatArray, stamps_ns: IntArray
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """One set of corners for each tag and keyframe; for each of several tags with one id that a picture shows."""
-    n_tags = int(tag.max()) + 1
-    pairs, group = np.unique(keyframe * n_tags + tag, return_inverse=True)
-    twin = np.zeros(len(tag), dtype=np.int64)
-    pictures, in_picture = np.unique(np.column_stack([group, stamps_ns]), axis=0, return_counts=True)
-    for pair in np.unique(pictures[in_picture > 1, 0]).tolist():
-        own = np.flatnonzero(group == pair)
-        twin[own] = _twins(corners_px[own], stamps_ns[own])
-    pairs = pairs[group] * (int(twin.max()) + 1) + twin
-    pairs, first, group, count = np.unique(pairs, return_index=True, return_inverse=True, return_counts=True)
-    total = np.zeros((len(pairs), 4, 2))
-    np.add.at(total, group, corners_px)
-    return keyframe[first], tag[first], total / count[:, None, None]
-
-
-def _twins(corners_px: FloatArray, stamps_ns: IntArray) -> IntArray:
-    """(M,) which of several tags with one id each set of corners from one standing pose is of.
-
-    Printed squares do not overlap, so that centres nearer than half a side are one tag read twice.
-    """
-    centre_px = corners_px.mean(axis=1)
-    half_side_px = 0.5 * np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=1), axis=-1).max(axis=1)
-    found = np.zeros(len(corners_px), dtype=np.int64)
-    known: list[int] = []
-    _, picture, count = np.unique(stamps_ns, return_inverse=True, return_counts=True)
-    for each in np.argsort(-count, kind="stable").tolist():  # first a picture that shows all
-        for i in np.flatnonzero(picture == each).tolist():
-            away_px = np.linalg.norm(centre_px[known] - centre_px[i], axis=-1)
-            is_new = bool((away_px > half_side_px[i]).all())
-            found[i] = len(known) if is_new else int(np.argmin(away_px))
-            known += [i] * is_new
-    return found
-
-
-def _no_readings() -> Readings:
-    empty_int = np.zeros(0, dtype=np.int64)
-    empty_bool = np.zeros(0, dtype=np.bool_)
-    none = np.zeros((0, 2, 2))
-    parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
-    by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
-    corners_px, sigmas = np.zeros((0, 4, 2)), np.zeros(0)
-    return Readings(
-        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, sigmas
-    )

@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.chain import Chain
-from offline.observations import Readings
 from offline.odometry import chained
+from offline.readings import Readings
 from offline.suspects_sightings import GAP_M
 
 # Beside its covariance, how far a reading is off from what the last one made expect.

@@ -14,7 +14,7 @@ from offline.advice_tags import Place, gain_of_place
 from offline.chain import Chain
 from offline.factors import State
 from offline.graph import Graph, build_graph
-from offline.observations import joined
+from offline.readings import joined
 from offline.report_words import advice_sentence
 from offline.run import TagKey
 from offline.solver import Solution

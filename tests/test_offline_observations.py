@@ -11,7 +11,8 @@ from calib.arrays import FloatArray
 from calib.errors import GroundsbotError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
-from offline.observations import Readings, check_tag_sizes, read_detections, read_positions
+from offline.observations import check_tag_sizes, read_detections, read_positions
+from offline.readings import Readings
 from offline.run import Detections, Positions, Run, TagKey
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, seen_corners_px
 

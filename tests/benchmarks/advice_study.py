@@ -31,7 +31,7 @@ from offline.global_map import solve_global_map
 from offline.graph import Graph, build_graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
-from offline.observations import joined
+from offline.readings import joined
 from offline.run import TagKey
 from offline.solver import Solution
 from offline.stages import Stages
