@@ -20,7 +20,7 @@ from offline.map_json import advice_as_json, map_as_json
 from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
 from offline.picture import write_picture
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.progress import progress_bar
 from offline.report_words import advice_sentence
 from offline.result import AlignmentResult, Component, FittedNoise, MapResult, MeasurementResult, MetreResult
@@ -65,13 +65,11 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     noise = read_noise_yaml(options.noise) if options.noise else None
     with compilation_announced(say), progress_bar() as show:
         stages, workings = Stages(show), Workings()
-        tape = TapeOptions(options.starts, options.distances)
-        result = map_logs(
-            logs,
-            robot_files,
+        result = build_map(
+            read_runs(logs, robot_files, stages),
             noise,
             stages,
-            tape,
+            TapeOptions(options.starts, options.distances),
             keep_suspects=options.keep_suspects,
             corners=options.corners,
             workings=workings,

@@ -25,7 +25,7 @@ from offline.kept_maps import (
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured import Measurements, TapeOptions, parse_measurements
 from offline.measured_map import judged, measurement_warnings, unused
-from offline.merge import Group, merge
+from offline.merge import Group, Merge, merge
 from offline.merge_report import alignment_results, merge_warnings
 from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
@@ -51,54 +51,26 @@ from offline.weak_parts import weak_parts
 from offline.workings import Solved, Workings
 
 
-def map_logs(
-    logs: Sequence[Path],
-    robot_files: Mapping[str, RobotFile] | None = None,
-    noise: NoiseParameters | None = None,
-    stages: Stages | None = None,
-    tape: TapeOptions | None = None,
-    prior_noise: NoiseParameters = NoiseParameters(),
-    *,
-    keep_suspects: bool = False,
-    corners: bool = False,
-    workings: Workings | None = None,
-    extending: MapResult | None = None,
-) -> MapResult:
-    """Turns logs into one map in the frame of the first log's start.
+def read_runs(
+    logs: Sequence[Path], robot_files: Mapping[str, RobotFile] | None = None, stages: Stages | None = None
+) -> list[Run]:
+    """Reads logs for `build_map`, which sets the map in the frame of the first one's start.
 
     Args:
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
-        noise: sigmas of wheels and readings; None: they are fitted to the runs.
         stages: told what is being done, and keeps what it took.
-        tape: what somebody measured.
-        prior_noise: where the fit begins, and what stays where the runs tell nothing.
-        keep_suspects: tags that do not belong are named only, not told apart from what they were.
-        corners: the solved map is refined on the tags' corners, where logs have them.
-        workings: takes what the map was made from.
-        extending: a map that was kept, whose runs come first, and under whose noise all is solved.
 
     Raises:
-        GroundsbotError: one line that says why there can be no map.
+        GroundsbotError: one line that says what is wrong with a log, or which robot has none.
     """
-    stages = stages or Stages()
     runs = []
-    with stages.stage("reading logs", len(logs)) as done:
+    with (stages or Stages()).stage("reading logs", len(logs)) as done:
         for log in logs:
             runs.append(load_run(log, robot_files))
             done()
     check_robots(runs, robot_files or {})
-    return build_map(
-        runs,
-        noise,
-        stages,
-        tape,
-        prior_noise,
-        keep_suspects=keep_suspects,
-        corners=corners,
-        workings=workings,
-        extending=extending,
-    )
+    return runs
 
 
 def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:
@@ -128,10 +100,10 @@ def build_map(
     workings: Workings | None = None,
     extending: MapResult | None = None,
 ) -> MapResult:
-    """As `map_logs`, from runs already read.
+    """Turns runs into one map in the frame of the first run's start.
 
     Args:
-        runs: of `load_run`; the frame is the start of the first.
+        runs: of `load_run` or `read_runs`.
         noise: sigmas of wheels and readings; None: they are fitted to the runs.
         stages: told what is being done, and keeps what it took.
         tape: what somebody measured.
@@ -147,12 +119,9 @@ def build_map(
     stages, tape = stages or Stages(), tape or TapeOptions()
     _check_distinct(runs)
     check_tag_sizes(runs)
-    known: list[LocalMap] = []
     noise_fit = None
     if extending is not None:
-        _check_new(runs, extending, noise)
-        if corners:
-            raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+        _check_new(runs, extending, noise, corners=corners)
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
     chains: list[Chain] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
@@ -160,6 +129,7 @@ def build_map(
             chains += [told_apart(chain) for chain in chains_of(run, noise or prior_noise)]
             done()
     measurements = _measurements(tape, runs, chains, extending)
+    known: list[LocalMap] = []
     if extending is not None:
         with stages.stage("the map that is extended"):
             known = [local_map_of(each) for each in extending.kept]
@@ -169,11 +139,9 @@ def build_map(
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
     elif known:
         maps = known + weighed_as(maps, noise, noise_fit)
-    chains = [each.chain for each in maps]
-    runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     kept = tuple(kept_of(each) for each in maps)
     with stages.stage("aligning local maps"):
-        merged = merge(maps, measurements.placements([chain.name for chain in chains]))
+        merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
     workings = workings or Workings()
     workings.maps += maps
@@ -182,21 +150,17 @@ def build_map(
         workings.solved.append(
             found.add(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
         )
-    named = {(each.family, each.tag_id) for each in found.suspects}
-    measured = found.measured + unused(measurements, found.measured)
-    warnings = [w for run in runs for w in run.warnings] + broken + [w for chain in chains for w in chain.warnings]
-    warnings += found.warnings + measurement_warnings(measured) + check_warnings(found.checks)
-    warnings += _calibration_warnings(found.calibration, found.checks)
-    warnings += _chain_warnings(chains) + merge_warnings(maps, merged, named)
+    found.measured += unused(measurements, found.measured)
+    runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     return MapResult(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged),
         noise=noise,
         calibration=tuple(found.calibration),
-        measurements=tuple(measured),
+        measurements=tuple(found.measured),
         checks=tuple(found.checks),
         metres=tuple(found.metres),
-        warnings=tuple(dict.fromkeys(warnings)),
+        warnings=_warnings(runs, maps, broken, merged, found),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
         suspects=tuple(found.suspects),
         noise_fit=noise_fit,
@@ -278,6 +242,18 @@ class _Found:
         return Solved(members, graph, solution, last.state.poses)
 
 
+def _warnings(
+    runs: Sequence[Run], maps: Sequence[LocalMap], broken: Sequence[str], merged: Merge, found: _Found
+) -> tuple[str, ...]:
+    """All that a person must be told, in the order in which it came up, each sentence once."""
+    chains = [each.chain for each in maps]
+    warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
+    warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
+    warnings += _calibration_warnings(found.calibration, found.checks)
+    named = {(each.family, each.tag_id) for each in found.suspects}
+    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named)))
+
+
 def _measurements(
     tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain], extending: MapResult | None
 ) -> Measurements:
@@ -309,9 +285,11 @@ def _check_distinct(runs: Sequence[Run]) -> None:
         seen[run.name] = run
 
 
-def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None) -> None:
-    """Refuses runs that a map has already, such as say other sizes of its tags, and other noise."""
+def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool) -> None:
+    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, and corners."""
     check_can_be_extended(extending)
+    if corners:
+        raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
     names = {each.run for each in extending.kept}

@@ -23,7 +23,7 @@ def write(_result, folder):
     (folder / "map.json").write_text("half")
     time.sleep(60)
 map_command.find_logs = lambda logs: logs
-map_command.map_logs = lambda *_, **__: None
+map_command.read_runs = map_command.build_map = lambda *_, **__: None
 map_command.write_map = write
 cli.main()
 """

@@ -13,7 +13,7 @@ from offline.bag_import import import_bag
 from offline.bag_topics import BagOptions
 from offline.import_robot import ImportOptions
 from offline.imported_run import ImportReport
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.run import load_run
 from onboard.log_reader import read_log
@@ -64,12 +64,12 @@ def bare_position_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def corner_map(corner_log: Path) -> MapResult:
-    return map_logs([corner_log])
+    return build_map(read_runs([corner_log]))
 
 
 @pytest.fixture(scope="module")
 def position_map(position_log: Path) -> MapResult:
-    return map_logs([position_log])
+    return build_map(read_runs([position_log]))
 
 
 def _position_log(folder: Path, *, with_covariances: bool = True) -> Path:
@@ -138,7 +138,7 @@ def test_a_bag_of_corners_gives_the_map_of_its_log(
         (bag,) = bag.glob("*.mcap")
     options = replace(OPTIONS, wheel_radius_m=0.1) if form == "joints" else OPTIONS
     report = imported(bag, tmp_path, options)
-    assert_same_map(corner_map, map_logs([report.run_folder]))
+    assert_same_map(corner_map, build_map(read_runs([report.run_folder])))
 
 
 @pytest.mark.parametrize("form", ["apriltag_ros", "isaac"])
@@ -150,7 +150,7 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
     made = made.apriltag_ros() if form == "apriltag_ros" else made.isaac_poses()
     bag = made.write(tmp_path / ("drive.bag" if form == "apriltag_ros" else "drive"))
     report = imported(bag, tmp_path, bag_options=BagOptions())
-    assert_same_map(position_map, map_logs([report.run_folder]))
+    assert_same_map(position_map, build_map(read_runs([report.run_folder])))
     n_without = sum(not each.covariance for message in made.observations for each in message.observations)
     assert any(f"those of {n_without} readings of {report.n_observations} are zeros" in each for each in report.remarks)
 
@@ -158,7 +158,7 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
 def test_a_bag_with_tags_in_tf_gives_the_map_of_its_log(tmp_path: Path, bare_position_log: Path) -> None:
     bag = BagOfLog.of(bare_position_log).mount().odometry().tag_transforms().write(tmp_path / "drive")
     report = imported(bag, tmp_path, bag_options=BagOptions())
-    assert_same_map(map_logs([bare_position_log]), map_logs([report.run_folder]))
+    assert_same_map(build_map(read_runs([bare_position_log])), build_map(read_runs([report.run_folder])))
 
 
 def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: Path, corner_map: MapResult) -> None:
@@ -168,8 +168,8 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
     bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulated(made.poses, steps))
     report = imported(bag.write(tmp_path / "drive"), tmp_path)
     assert "covariances of the odometry are used: by how much each step adds to those of the pose" in report.remarks
-    expected = map_logs([_with_covariances(corner_log, made.poses, steps, tmp_path / "expected")])
-    found = map_logs([report.run_folder])
+    expected = build_map(read_runs([_with_covariances(corner_log, made.poses, steps, tmp_path / "expected")]))
+    found = build_map(read_runs([report.run_folder]))
     assert_same_map(expected, found)
     (plain,), (given,) = corner_map.components, found.components
     assert not np.allclose(plain.tags[0].covariance, given.tags[0].covariance, rtol=0.05)

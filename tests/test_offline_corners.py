@@ -25,7 +25,7 @@ from offline.evaluation import evaluate
 from offline.global_map import component_of
 from offline.map_io import read_map, write_map
 from offline.map_model import MapModel
-from offline.pipeline import build_map, map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.run import Detections, Run, load_run
 from offline.truth import read_truth
@@ -58,7 +58,7 @@ def drive_of(name: str) -> MadeDrive:
 def exact(tmp_path_factory: pytest.TempPathFactory) -> MapResult:
     folder = tmp_path_factory.mktemp("exact")
     logs = [write_drive(folder, drive_of(name), TAGS, made_robot(name)) for name in STARTS]
-    return map_logs(logs, noise=NOISE, corners=True)
+    return build_map(read_runs(logs), noise=NOISE, corners=True)
 
 
 def assert_hang_as_made(result: MapResult, atol: float) -> None:
@@ -171,7 +171,7 @@ def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Workings]:
     folder, workings = tmp_path_factory.mktemp("drives") / "room", Workings()
     simulate("room", 3, folder, render=False)
-    return folder, map_logs(find_logs([folder]), corners=True, workings=workings), workings
+    return folder, build_map(read_runs(find_logs([folder])), corners=True, workings=workings), workings
 
 
 def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Workings]) -> None:

@@ -96,12 +96,12 @@ def test_what_no_condition_joins_fits() -> None:
 def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tags = [MadeTag(i, (4.0, 1.5 * i - 1.5, 0.5), np.pi) for i in range(3)]
     log = write_drive(tmp_path, made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
-    assert pipeline.map_logs([log]).warnings == ()
+    assert pipeline.build_map(pipeline.read_runs([log])).warnings == ()
 
     def contradictory(chain: Chain, _: Effort) -> LocalMap:
         return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
 
     monkeypatch.setattr(pipeline, "solve_local_map", contradictory)
-    (warning,) = pipeline.map_logs([log]).warnings
+    (warning,) = pipeline.build_map(pipeline.read_runs([log])).warnings
     assert warning.startswith("carl_one: its readings contradict each other")
     assert "(chi-square 300, expected 40, at most 80)" in warning

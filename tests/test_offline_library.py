@@ -52,11 +52,12 @@ def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.C
 
 
 def test_the_library_gives_what_the_command_does(recordings: Path) -> None:
-    from offline.pipeline import map_logs
+    from offline.map_command import MapOptions, make_map
 
     logs = offline.find_logs([recordings])
     by_hand = offline.build_map([offline.load_run(log) for log in logs])
-    np.testing.assert_array_equal(by_hand.components[0].joint_covariance, map_logs(logs).components[0].joint_covariance)
+    by_command, _ = make_map(MapOptions(logs, recordings.parent / "map"))
+    np.testing.assert_array_equal(by_hand.components[0].joint_covariance, by_command.components[0].joint_covariance)
 
 
 def test_every_name_is_there_and_others_are_not() -> None:

@@ -11,7 +11,7 @@ from fixtures.simulate import simulate
 from offline.chain import chains_of
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import ODOMETRY_NOISE
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.run import load_run
 from offline.run_noise import NOT_NEEDED, fit_and_weigh
 from onboard.log_reader import find_logs
@@ -55,7 +55,7 @@ def test_noise_is_found_from_ten_times_too_large_and_too_small() -> None:
 
 
 def test_what_is_fitted_is_used_and_told(room: Path) -> None:
-    result = map_logs(find_logs([room]))
+    result = build_map(read_runs(find_logs([room])))
     assert result.noise_fit is not None
     assert result.noise_fit.runs == ("a_seed3", "b_seed3", "c_seed3")
     by_name = {each.name: each for each in result.noise_fit.parameters}
@@ -74,7 +74,7 @@ def test_what_is_fitted_is_used_and_told(room: Path) -> None:
 
 def test_noise_that_is_given_is_fitted_no_more(room: Path) -> None:
     given = PRIOR.model_copy(update={"sigma_corner_px": 0.4})
-    result = map_logs(find_logs([room / "a"]), noise=given)
+    result = build_map(read_runs(find_logs([room / "a"])), noise=given)
     assert result.noise == given
     assert result.noise_fit is None
 
@@ -99,7 +99,7 @@ def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     """Readings without any error: less noise than the best of encoders and lenses leave."""
     legs = [(0.4, 0.4, 4.0), (0.5, 0.3, 4.0), (-0.3, 0.3, 3.0), (0.4, 0.4, 3.0)]
     log = write_drive(tmp_path, made_drive([1.0, 1.5, 0.3], legs), HALL, made_robot("a"))
-    result = map_logs([log])
+    result = build_map(read_runs([log]))
     assert result.noise_fit is not None
     assert all(each.kept for each in result.noise_fit.parameters)
     assert result.noise == PRIOR

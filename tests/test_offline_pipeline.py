@@ -18,7 +18,7 @@ from offline.chain import chains_of
 from offline.errors import OfflineError
 from offline.evaluation import evaluate
 from offline.local_map import solve_local_map
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import Component, MapResult
 from offline.run import load_run
 from offline.truth import read_truth
@@ -53,7 +53,7 @@ def exact_log(folder: Path, name: str, tags: Sequence[MadeTag] = tuple(HALL)) ->
 
 
 def map_of(*logs: Path) -> MapResult:
-    return map_logs(logs)
+    return build_map(read_runs(logs))
 
 
 def in_frame_of(component: Component, T_frame_map: FloatArray) -> dict[object, FloatArray]:
@@ -114,7 +114,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def room_map(room: Path) -> MapResult:
-    return map_logs(find_logs([room]))
+    return build_map(read_runs(find_logs([room])))
 
 
 def test_three_runs_merge_as_two_do(room: Path, room_map: MapResult) -> None:
@@ -126,8 +126,8 @@ def test_three_runs_merge_as_two_do(room: Path, room_map: MapResult) -> None:
     assert errors.tags_rmse_m < 0.15
     # Under the same noise: what is fitted to three runs differs from what two tell.
     same_noise = room_map.noise
-    (two,) = map_logs(find_logs([room / "a", room / "c"]), noise=same_noise).components
-    (three,) = map_logs(find_logs([room]), noise=same_noise).components
+    (two,) = build_map(read_runs(find_logs([room / "a", room / "c"])), noise=same_noise).components
+    (three,) = build_map(read_runs(find_logs([room])), noise=same_noise).components
     with_two, with_three = two.start_to_start[0], three.start_to_start[1]
     assert (with_two.a, with_two.b) == (with_three.a, with_three.b)
     spread_m = np.sqrt(np.trace(with_two.covariance))
@@ -136,7 +136,7 @@ def test_three_runs_merge_as_two_do(room: Path, room_map: MapResult) -> None:
 
 
 def test_runs_that_share_no_tag_are_joined_through_a_third(room: Path, room_map: MapResult) -> None:
-    apart = map_logs(find_logs([room / "a", room / "b"]))
+    apart = build_map(read_runs(find_logs([room / "a", room / "b"])))
     assert len(apart.components) == 2
     assert any("b_seed3 shares no tag" in warning for warning in apart.warnings)
     assert len(room_map.components) == 1
@@ -146,7 +146,7 @@ def test_runs_that_share_no_tag_are_joined_through_a_third(room: Path, room_map:
 def test_the_order_of_logs_changes_nothing_but_the_frame(
     room: Path, room_map: MapResult, order: tuple[str, ...]
 ) -> None:
-    (component,) = map_logs(find_logs([room / name for name in order])).components
+    (component,) = build_map(read_runs(find_logs([room / name for name in order]))).components
     (reference,) = room_map.components
     assert [run.robot_id for run in component.runs] == list(order)
     first = next(run for run in reference.runs if run.name == component.frame_run)
@@ -160,7 +160,7 @@ def test_the_order_of_logs_changes_nothing_but_the_frame(
 
 
 def test_the_same_logs_give_the_same_map(room: Path, room_map: MapResult) -> None:
-    again = map_logs(find_logs([room]))
+    again = build_map(read_runs(find_logs([room])))
     first, second = (in_frame_of(each.components[0], np.zeros(3)) for each in (room_map, again))
     assert_same(first, second, atol=0.0)
 
@@ -175,14 +175,14 @@ def test_every_tag_seen_is_in_the_map_once(tmp_path: Path) -> None:
         if isinstance(entry.message, TagDetections)
         for detection in entry.message.detections
     }
-    (component,) = map_logs(logs).components
+    (component,) = build_map(read_runs(logs)).components
     assert len(component.tags) > 40
     assert sorted((tag.family, tag.tag_id) for tag in component.tags) == sorted(seen)
 
 
 def test_one_log_alone_gives_its_local_map(room: Path) -> None:
     (log,) = find_logs([room / "b"])
-    result = map_logs([log], noise=NoiseParameters())
+    result = build_map(read_runs([log]), noise=NoiseParameters())
     (component,) = result.components
     local = solve_local_map(chains_of(load_run(log), result.noise)[0])
     np.testing.assert_array_equal(component.runs[0].T_map_base, local.T_start_base)

@@ -10,7 +10,7 @@ import pytest
 
 from offline.map_command import MapOptions, make_map
 from offline.map_json import map_as_json
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.report import write_report
 from offline.report_data import figures
 from offline.report_page import as_script_data, page
@@ -20,18 +20,12 @@ from offline.result import MapResult
 from offline.run import RunEvent
 from offline.workings import Workings
 from tests.browser import Page, browser, chromium
-from tests.made_drives import START_NS, MadeTag, S, made_drive, made_robot, write_drive
+from tests.made_drives import START_NS, S, made_robot, write_drive
+from tests.map_cases import DRIVES, TAGS
 from tests.read_report import Read, data_of
 
 pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
 
-TAGS = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 2.0, 0.4), np.pi),
-    MadeTag(2, (6.0, -1.0, 0.6), np.pi - 0.2),
-    MadeTag(3, (5.0, 3.0, 0.45), -2.2),
-]
-AHEAD = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
 
 Inside = tuple[MapResult, Workings]
@@ -44,10 +38,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def logs(folder: Path) -> list[Path]:
-    starts = {"a": [0.0, 0.0, 0.2], "b": [0.5, 1.0, -0.1]}
     return [
-        write_drive(folder / "logs", made_drive(start, AHEAD), TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
-        for i, (name, start) in enumerate(starts.items())
+        write_drive(folder / "logs", drive, TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
+        for i, (name, drive) in enumerate(DRIVES.items())
     ]
 
 
@@ -61,7 +54,7 @@ def made(folder: Path, logs: list[Path]) -> Path:
 @pytest.fixture(scope="module")
 def inside(logs: list[Path]) -> Inside:
     workings = Workings()
-    return map_logs(logs, workings=workings), workings
+    return build_map(read_runs(logs), workings=workings), workings
 
 
 def written(inside: Inside, folder: Path) -> Read:
@@ -212,7 +205,7 @@ def test_nothing_is_fetched(made: Path) -> None:
 
 def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
     workings = Workings()
-    read = written((map_logs(logs[:1], workings=workings), workings), tmp_path)
+    read = written((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
     assert read.words[0].startswith("One run, a_one, drove ")
     assert read.words[0].endswith("nothing was to be joined.")
     assert "before" not in {attributes.get("id") for _, attributes in read.elements}
@@ -221,18 +214,18 @@ def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
 
 
 def test_a_run_without_tags(tmp_path: Path) -> None:
-    log = write_drive(tmp_path / "logs", made_drive([0.0, 0.0, 0.2], AHEAD), [], made_robot("a"))
+    log = write_drive(tmp_path / "logs", DRIVES["a"], [], made_robot("a"))
     workings = Workings()
-    read = written((map_logs([log], workings=workings), workings), tmp_path)
+    read = written((build_map(read_runs([log]), workings=workings), workings), tmp_path)
     assert "It places no tag, so that nothing corrects what the wheels say." in read.words
     assert data_of(tmp_path / "report.html")["components"][0]["tags"] == []
 
 
 def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
-    alone = write_drive(tmp_path / "logs", made_drive([0.0, 0.0, 0.2], AHEAD), far, made_robot("c"))
+    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
     workings = Workings()
-    read = written((map_logs([*logs, alone], workings=workings), workings), tmp_path)
+    read = written((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
     assert "3 runs" in read.words[0]
     assert "fall into 2 components" in read.words[0]
     assert "the largest holds 2 runs and 4 tags" in read.words[0]

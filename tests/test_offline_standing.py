@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from fixtures.simulate import TRUTH_FILE, simulate
 from fixtures.world import World
 from offline.evaluation import evaluate
-from offline.pipeline import build_map, map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import Component
 from offline.run import load_run
 from offline.truth import read_truth
@@ -73,7 +73,7 @@ def past_five_tags(stop_s: float) -> World:
 def stopped(folder: Path, stop_s: float) -> tuple[Component, float]:
     """The map of a rendered drive, and its tags NEES per dimension."""
     simulate(past_five_tags(stop_s), 1, folder, frame_rate_hz=2.0)
-    result = map_logs(find_logs([folder]))
+    result = build_map(read_runs(find_logs([folder])))
     (component,) = result.components
     nees = evaluate(result, read_truth(folder / TRUTH_FILE)).components[0].nees_tags_per_dim
     assert nees is not None

@@ -20,7 +20,7 @@ from offline.graph import Graph, build_graph
 from offline.import_robot import ImportOptions
 from offline.importers import import_folder
 from offline.map_json import map_as_json
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.run import TagKey
 from offline.solver import PLAIN_SQUARES, Problem, Solution, solve
@@ -203,7 +203,7 @@ def mapped(folder: Path, runs: dict[str, tuple[str, list[tuple[float, ...]], str
         (csv / "observations.csv").write_text("\n".join([f"t_s,tag_id,x_m,y_m{sigmas}", *lines]) + "\n")
         import_folder(csv, folder / "logs", ImportOptions(run_id=name, robot_id=name, track_width_m=0.5))
         logs.append(folder / "logs" / name)
-    return map_logs(logs)
+    return build_map(read_runs(logs))
 
 
 WEAVE, POSES = drive_csv()

@@ -21,7 +21,7 @@ from calib.arrays import FloatArray
 from fixtures.simulate import TRUTH_FILE, simulate
 from fixtures.world import World
 from offline.evaluation import evaluate
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
@@ -58,7 +58,7 @@ def study_seed(seed: int, world: World | str | Path, *, exact_calibration: bool,
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "drives"
         simulate(world, seed, output, render=render, exact_calibration=exact_calibration)
-        return figures_of(seed, map_logs(find_logs([output])), read_truth(output / TRUTH_FILE))
+        return figures_of(seed, build_map(read_runs(find_logs([output]))), read_truth(output / TRUTH_FILE))
 
 
 def figures_of(seed: int, result: MapResult, truth: Truth) -> Figures:

@@ -20,7 +20,7 @@ import numpy as np
 from calib.noise import NoiseParameters
 from fixtures.simulate import TRUTH_FILE, simulate
 from offline.evaluation import evaluate
-from offline.pipeline import map_logs
+from offline.pipeline import build_map, read_runs
 from offline.result import FittedParameter
 from offline.run_noise import NOT_NEEDED
 from offline.truth import read_truth
@@ -84,7 +84,7 @@ def study_seed(world: str, seed: int, factors: Sequence[float]) -> list[Mapped |
         truth = read_truth(output / TRUTH_FILE)
         for factor in factors:
             prior = NoiseParameters(**{name: factor * getattr(true, name) for name in NoiseParameters.model_fields})
-            result = map_logs(find_logs([output]), prior_noise=prior)
+            result = build_map(read_runs(find_logs([output])), prior_noise=prior)
             if len(result.components) > 1 or result.noise_fit is None:
                 rows.append(f"{world}, seed {seed}, from {factor:g} times: {'; '.join(result.warnings)}")
                 continue
