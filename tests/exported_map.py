@@ -5,16 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from offline.map_command import MapOptions, make_map
-from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, made_drive, made_robot, write_drive
 
-TAGS = (
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
-    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
-    MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
-)
+TAGS = [HALL[i] for i in (0, 1, 2, 4, 6, 7)]
 STARTS = {"carl": np.array([1.0, 1.5, 0.3]), "dora": np.array([4.0, 2.5, 2.9])}
 _LEGS = [(0.4, 0.4, 2.0), (-0.3, 0.3, 6.0), (0.4, 0.5, 2.0)]
 

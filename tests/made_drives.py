@@ -63,6 +63,19 @@ class MadeTag:
         return face
 
 
+# A hall of six by four metres, the tags on its walls and one in the middle, facing two ways at once.
+HALL = [
+    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
+    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
+    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
+    MadeTag(3, (0.0, 2.9, 0.6), -0.1, roll_rad=0.4),
+    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
+    MadeTag(5, (4.5, 0.0, 0.5), np.pi / 2, roll_rad=np.pi),
+    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
+    MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
+]
+
+
 @dataclass(frozen=True)
 class MadeDrive:
     """Wheel readings of a drive, and where the robot truly was at them."""

@@ -31,19 +31,14 @@ from offline.run import Detections, Run, load_run
 from offline.truth import read_truth
 from offline.workings import Workings
 from onboard.log_reader import find_logs
-from tests.made_drives import MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
+from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
 from tests.programs import Run as Program
 
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
 STARTS = {"a": [1.0, 1.5, 0.3], "b": [1.4, 2.2, -0.2]}
 # Upright, rolled, and leaning: the last two are read badly by whoever takes them for upright.
 TAGS = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(3, (0.0, 2.9, 0.6), -0.1, roll_rad=0.4),
-    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
-    MadeTag(5, (4.5, 0.0, 0.5), np.pi / 2, roll_rad=np.pi),
+    *HALL[:6],
     MadeTag(6, (4.3, 4.0, 0.7), -np.pi / 2, pitch_rad=-0.5),
 ]
 NOISE = NoiseParameters()

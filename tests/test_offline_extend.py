@@ -13,15 +13,10 @@ from offline.measured import TapeOptions
 from offline.pipeline import build_map
 from offline.result import MapResult
 from offline.run import Run
-from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, MadeTag, made_drive, made_robot, write_drive
 from tests.programs import Run as Program
 
-TAGS = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
-]
+TAGS = [HALL[i] for i in (0, 1, 2, 6)]
 MOVED = [*TAGS[:3], MadeTag(6, (2.4, 4.0, 0.45), -np.pi / 2)]
 NOISE = NoiseParameters(sigma_corner_px=0.3)
 TAPE = TapeOptions(["b_one=3.15,0.1,2.6,0.05,0.05,0.05"], ["0,1=2.02,0.02"])

@@ -10,17 +10,10 @@ import numpy as np
 import pytest
 
 import offline
-from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, made_drive, made_robot, write_drive
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "library.md"
-TAGS = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
-    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
-    MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
-]
+TAGS = [HALL[i] for i in (0, 1, 2, 4, 6, 7)]
 DRIVES = [
     ("carl", "monday", [1.0, 1.5, 0.3]),
     ("dora", "monday", [4.0, 2.5, 2.9]),

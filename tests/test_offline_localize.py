@@ -15,7 +15,7 @@ from offline.localizing import localize
 from offline.map_io import read_map, write_map
 from offline.result import Component, MapResult
 from offline.run import Run, TagKey
-from tests.made_drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
+from tests.made_drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Run as Program
 
 LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
@@ -164,12 +164,7 @@ def moved_component(component: Component, by: int) -> Component:
     return replace(component, tags=tuple(replace(tag, tag_id=tag.tag_id + by) for tag in component.tags))
 
 
-TAGS = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
-]
+TAGS = [HALL[i] for i in (0, 1, 2, 6)]
 
 
 @pytest.fixture(scope="module")

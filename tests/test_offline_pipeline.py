@@ -25,19 +25,8 @@ from offline.truth import read_truth
 from onboard.log_reader import find_logs, read_log
 from onboard.messages import TagDetections
 from tests.benchmarks.accuracy_study import medians, missed_bounds, run_study, study_seed
-from tests.made_drives import MadeDrive, MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, write_drive
 
-# A hall of six by four metres, the tags on its walls and one in the middle, facing two ways at once.
-HALL = [
-    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
-    MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2),
-    MadeTag(2, (0.0, 1.2, 0.45), 0.1),
-    MadeTag(3, (0.0, 2.9, 0.6), -0.1, roll_rad=0.4),
-    MadeTag(4, (2.0, 0.0, 0.4), np.pi / 2),
-    MadeTag(5, (4.5, 0.0, 0.5), np.pi / 2, roll_rad=np.pi),
-    MadeTag(6, (1.8, 4.0, 0.45), -np.pi / 2),
-    MadeTag(7, (4.3, 4.0, 0.35), -np.pi / 2),
-]
 ROUND = [(0.4, 0.4, 3.0), (0.5, 0.3, 4.0), (-0.2, 0.2, 5.0), (0.3, 0.5, 3.0), (0.4, 0.4, 1.5), (0.2, -0.2, 6.0)]
 BACK = [(0.0, 0.0, 1.0), (-0.25, 0.25, 4.0), (0.4, 0.5, 4.0), (0.45, 0.35, 4.0), (-0.3, -0.3, 1.0), (-0.25, 0.25, 4.0)]
 STARTS = {"a": [1.0, 1.5, 0.3], "b": [4.5, 2.5, 2.9], "c": [2.5, 3.0, -1.2]}
