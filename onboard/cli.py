@@ -36,19 +36,15 @@ def record(
     """
     import contextlib
     import os
-    import signal
-    import threading
 
+    from onboard.ending import told_to_end
     from onboard.housekeeping import Housekeeper
     from onboard.live_recorder import LiveRecorder
     from onboard.robot_files import RobotFiles
     from onboard.status import STATUS_SUFFIX
     from onboard.systemd import Notifier
 
-    stop = threading.Event()
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(each) is not signal.SIG_IGN:
-            signal.signal(each, lambda *_: stop.set())
+    stop = told_to_end()
     with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
@@ -124,9 +120,6 @@ def capture(
 
     Exit code 3: it was ended before there were enough.
     """
-    import signal
-    import threading
-
     from rich.console import Console
 
     from calib.board import parse_board
@@ -135,6 +128,7 @@ def capture(
     from onboard.capture_guide import CaptureGuide
     from onboard.capture_view import CaptureView
     from onboard.clock import RunClock
+    from onboard.ending import told_to_end
     from onboard.robot_files import capture_settings
 
     guide = CaptureGuide(parse_board(board), views)
@@ -143,10 +137,7 @@ def capture(
     view = CaptureView(Console())
     looked_at = picture or robot.with_name("capture.jpg")
     taking = Capture(camera, clock, guide, output, looked_at, view.show, view.say)
-    stop = threading.Event()
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(each) is not signal.SIG_IGN:
-            signal.signal(each, lambda *_: stop.set())
+    stop = told_to_end()
     try:
         with view.shown():
             taking.run(stop)

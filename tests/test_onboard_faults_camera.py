@@ -76,17 +76,19 @@ def test_row_33_bad_pictures_are_skipped_and_counted(tmp_path: Path, both: Path)
 def test_row_34_a_stamp_that_cannot_be_is_replaced_and_the_source_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lie: str, believed: int
 ) -> None:
-    first_ms, n = time.monotonic_ns() / MS, 0
+    first_ms = time.monotonic_ns() / MS
+    n, newest_ms = 0, 0.0
 
     def stamp_ms() -> float:
-        nonlocal n
+        nonlocal n, newest_ms
         n += 1
         now_ms = time.monotonic_ns() / MS
+        newest_ms = now_ms - 20.0 if n % 2 else newest_ms
         return {
             "none": now_ms - 20.0,
             "zero": 0.0,
             "stands still": first_ms,
-            "backwards": now_ms - (20.0 if n % 2 else 60.0),
+            "backwards": newest_ms if n % 2 else newest_ms - 10.0,
             "of the wall clock": time.time_ns() / MS,
             "from the future": now_ms + 50.0,
         }[lie]
