@@ -306,9 +306,11 @@ def compare(
     """
     import json
 
-    from offline.evaluation import MapErrors, evaluate
+    from offline.evaluation import evaluate
+    from offline.map_errors import MapErrors
     from offline.map_io import read_map
-    from offline.survey import SurveyErrors, judge_survey, read_survey
+    from offline.survey import judge_survey, read_survey
+    from offline.survey_errors import SurveyErrors
     from offline.truth import read_truth
 
     errors: MapErrors | SurveyErrors

@@ -1,0 +1,124 @@
+"""How far a map is off the truth, in figures and in words."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class StartError:
+    """From the start of run `a` to the start of run `b`: found and true."""
+
+    a: str
+    b: str
+    distance_m: float
+    true_distance_m: float
+    vector_error_m: float
+
+    @property
+    def distance_error_m(self) -> float:
+        """How wrong the distance is, without sign."""
+        return abs(self.distance_m - self.true_distance_m)
+
+    @property
+    def percent(self) -> float | None:
+        """The distance's error as a share of the true distance; None where that is nothing."""
+        return 100.0 * self.distance_error_m / self.true_distance_m if self.true_distance_m > 1e-9 else None
+
+
+@dataclass(frozen=True)
+class TagError:
+    """How far one tag is off, in the frame of its component."""
+
+    family: str
+    tag_id: int
+    instance: str
+    error_m: float
+    sigma_m: float  # predicted for the error's length: square root of the covariance's trace
+
+
+@dataclass(frozen=True)
+class ComponentErrors:
+    """Figures of one component. None: nothing to measure it by (one run, no tag, no truth)."""
+
+    frame_run: str
+    runs: tuple[str, ...]
+    n_tags: int
+    starts: tuple[StartError, ...]
+    tags: tuple[TagError, ...]
+    tags_rmse_m: float | None
+    tags_rmse_aligned_m: float | None
+    trajectory_rmse_m: float | None
+    nees_tags_per_dim: float | None
+    nees_start_per_dim: float | None
+    notes: tuple[str, ...]
+
+    @property
+    def worst_start(self) -> StartError | None:
+        """The pair of starts whose vector is off most: with two runs, the one pair."""
+        return max(self.starts, key=lambda pair: pair.vector_error_m, default=None)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; the start figures are those of the worst pair, all pairs stand in `starts`."""
+        worst = self.worst_start
+        starts = [
+            asdict(pair) | {"distance_error_m": pair.distance_error_m, "percent": pair.percent} for pair in self.starts
+        ]
+        return {
+            "frame_run": self.frame_run,
+            "runs": list(self.runs),
+            "n_tags": self.n_tags,
+            "start_to_start_vector_error_m": worst.vector_error_m if worst else None,
+            "start_to_start_distance_error_m": worst.distance_error_m if worst else None,
+            "start_to_start_percent": worst.percent if worst else None,
+            "tags_rmse_m": self.tags_rmse_m,
+            "tags_rmse_aligned_m": self.tags_rmse_aligned_m,
+            "trajectory_rmse_m": self.trajectory_rmse_m,
+            "nees_tags_per_dim": self.nees_tags_per_dim,
+            "nees_start_per_dim": self.nees_start_per_dim,
+            "starts": starts,
+            "tags": [asdict(tag) for tag in self.tags],
+            "notes": list(self.notes),
+        }
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        lines = [f"frame: start of {self.frame_run}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
+        for pair in self.starts:
+            percent = "" if pair.percent is None else f" ({pair.percent:.2f} %)"
+            lines.append(
+                f"  start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m found, "
+                f"{pair.true_distance_m:.3f} m true, off by {pair.distance_error_m:.3f} m{percent}; "
+                f"vector off by {pair.vector_error_m:.3f} m"
+            )
+        for what, value, unit in (
+            ("tags RMSE, as the map stands", self.tags_rmse_m, " m"),
+            ("tags RMSE, aligned", self.tags_rmse_aligned_m, " m"),
+            ("trajectory RMSE, as the map stands", self.trajectory_rmse_m, " m"),
+            ("tags NEES per dimension (1 is honest)", self.nees_tags_per_dim, ""),
+            ("start NEES per dimension (1 is honest)", self.nees_start_per_dim, ""),
+        ):
+            lines.append(f"  {what}: {'nothing to judge by' if value is None else f'{value:.3f}{unit}'}")
+        worst = max(self.tags, key=lambda tag: tag.error_m, default=None)
+        if worst is not None:
+            name = f"{worst.family} {worst.tag_id}{worst.instance}"
+            lines.append(f"  worst tag: {name}, off by {worst.error_m:.3f} m (sigma {worst.sigma_m:.3f} m)")
+        return lines + [f"  {note}" for note in self.notes]
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """Figures of a whole map: each component in its own frame, largest first."""
+
+    components: tuple[ComponentErrors, ...]
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        lines = [line for component in self.components for line in component.lines()]
+        if len(self.components) > 1:
+            lines.insert(0, f"{len(self.components)} components, each judged in its own frame, largest first")
+        return lines
+
+    def as_json(self) -> dict[str, Any]:
+        """The largest component's figures on top, and each component's in `components`."""
+        parts = [component.as_json() for component in self.components]
+        return parts[0] | {"components": parts}
