@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.board import Board
-from calib.corner_fit import Corners, Surroundings, bends, fitted_corners
+from calib.corner_fit import FIRST_RADIUS_PX, RADIUS_PX, Corners, Surroundings, bends, fitted_corners
 
 _LOCAL_SQUARES: Final = 1.2  # sigma: how far around a corner others tell the direction of its edges
 _LEAST_CORNERS: Final = 6  # a homography takes four; two more to test it
@@ -44,7 +44,8 @@ class BoardFinder:
         if np.size(ids) < _LEAST_CORNERS:  # None where there are none at all
             return None
         numbers, pixels = ids.ravel().astype(np.int64), found.reshape(-1, 2).astype(np.float64)
-        around = self._surroundings(numbers, pixels, self._local_squares(numbers, pixels), np.zeros((len(numbers), 2)))
+        squares, straight = self._local_squares(numbers, pixels), np.zeros((len(numbers), 2))
+        around = self._surroundings(numbers, pixels, squares, straight, FIRST_RADIUS_PX)
         corners = fitted_corners(picture, numbers, around)
         return View(name, picture, corners) if len(corners.ids) >= _LEAST_CORNERS else None
 
@@ -59,9 +60,8 @@ class BoardFinder:
         squares = np.stack([right - left, below - above], axis=-1) / (2.0 * _BEND_STEP)
         bend = np.stack([bends(left, at, right), bends(above, at, below)], axis=-1)
         ids = np.arange(len(at))
-        return View(
-            view.name, view.picture, fitted_corners(view.picture, ids, self._surroundings(ids, at, squares, bend))
-        )
+        around = self._surroundings(ids, at, squares, bend, RADIUS_PX)
+        return View(view.name, view.picture, fitted_corners(view.picture, ids, around))
 
     def places_around_m(self) -> FloatArray:
         """(K, 5, 3) in the board's frame, each corner, a quarter of a square before and behind it along x, then y."""
@@ -69,8 +69,10 @@ class BoardFinder:
         steps = step_m * np.array([[0, 0, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]], dtype=np.float64)
         return np.asarray(self.corners_m[:, None] + steps)
 
-    def _surroundings(self, ids: IntArray, pixels: FloatArray, squares: FloatArray, bend: FloatArray) -> Surroundings:
-        return Surroundings(pixels, squares, self._white_diagonal[ids], bend, self._clear)
+    def _surroundings(
+        self, ids: IntArray, pixels: FloatArray, squares: FloatArray, bend: FloatArray, radius_px: int
+    ) -> Surroundings:
+        return Surroundings(pixels, squares, self._white_diagonal[ids], bend, self._clear, radius_px)
 
     def _local_squares(self, ids: IntArray, pixels: FloatArray) -> FloatArray:
         """(N, 2, 2) how far one square leads near each corner: an affine map fitted to the corners around it."""

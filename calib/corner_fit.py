@@ -2,13 +2,16 @@
 
 Around a corner the light is modelled as
 
-    a + b erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2)),
+    (1 + g . (x - c)) (a + b erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2))),
     l_k(x) = n_k . (x - c) - kappa_k / 2 (t_k . (x - c))^2
 
 two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
 shutter was open. Their bends kappa_k are given: a lens bends lines, and a bend left out moves corners. Whatever makes
 black grow or shrink (too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and
-the corner not at all.
+the corner not at all. Light that grows along an edge (g: the lens's falloff, a lamp) would move both halves alike.
+
+What the light's noise moves a corner by falls with the root of the edges' length, so they are followed to the middle
+of the squares, where those of the next corner begin: no pixel tells of two corners.
 
 The fit gives each corner's covariance too, from the residuals themselves, and its blur.
 """
@@ -23,9 +26,12 @@ from scipy.special import erf
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 
-_RADIUS_PX: Final = 6
+FIRST_RADIUS_PX: Final = 6  # about a corner whose edges' bends are not known yet
+RADIUS_PX: Final = 16  # with bends; time grows with its square, what is gained ends with half a square
 _ROUNDS: Final = 15
-_N: Final = 8  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2)
+_N: Final = 10  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2), g (2)
+_BLURS: Final = slice(6, 8)
+_SLOPE: Final = slice(8, 10)  # share of the light over the radius
 _ARRIVED_PX: Final = 1e-4
 _FIRST_BLUR_PX: Final = 0.7
 _CLEAR_OF_PX: Final = 1.5  # of the blur of what else is printed
@@ -33,7 +39,7 @@ _FARTHEST_SQUARES: Final = 0.3  # that a corner may lie from where it was though
 _LEAST_CONTRAST: Final = 16.0  # grey levels between black and white: markers are hardly read below
 _ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than two edges
 _MOST_BLUR_SQUARES: Final = 0.25
-_LEAST_PIXELS: Final = 40  # five for each parameter
+_LEAST_PIXELS: Final = 50  # five for each parameter
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Surroundings:
         white_diagonal: (N,) whether white lies where x and y both grow.
         bend: (N, 2) curvature (1/px) of the edges along x and along y, see `bends`.
         clear: how far in squares a white square is clear of its marker.
+        radius_px: how far from a corner pixels are looked at.
     """
 
     pixels: FloatArray
@@ -76,19 +83,21 @@ class Surroundings:
     white_diagonal: BoolArray
     bend: FloatArray
     clear: float
+    radius_px: int
 
 
 def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
     """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
     inside = np.isfinite(around.pixels).all(axis=1) & np.isfinite(around.squares_px).all(axis=(1, 2))
     size = np.array(picture.shape[::-1])
-    inside &= ((around.pixels > _RADIUS_PX) & (around.pixels < size - 1 - _RADIUS_PX)).all(axis=1)
+    inside &= ((around.pixels > FIRST_RADIUS_PX) & (around.pixels < size - 1 - FIRST_RADIUS_PX)).all(axis=1)
     kept = Surroundings(
         around.pixels[inside],
         around.squares_px[inside],
         around.white_diagonal[inside],
         around.bend[inside],
         around.clear,
+        around.radius_px,
     )
     if not inside.any():
         none = np.zeros((0, 2))
@@ -97,28 +106,21 @@ def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundin
 
 
 class _Patches:
-    """The picture around each of N corners, P pixels each."""
+    """The picture around each of N corners, P pixels each: as many as the one has that has most."""
 
     def __init__(self, picture: NDArray[np.uint8], around: Surroundings) -> None:
-        offsets = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
+        offsets = np.arange(-around.radius_px, around.radius_px + 1)
         dx, dy = (each.ravel() for each in np.meshgrid(offsets, offsets))
         middle = np.rint(around.pixels).astype(np.int64)
-        columns, rows = middle[:, :1] + dx, middle[:, 1:] + dy
+        places = np.stack([middle[:, :1] + dx, middle[:, 1:] + dy], axis=-1)
         self._around = around
-        self._places = np.stack([columns, rows], axis=-1).astype(np.float64)  # (N, P, 2)
+        seen = _own_squares(around, places.astype(np.float64), np.array(picture.shape[::-1]))
+        kept = np.argsort(~seen, axis=1, kind="stable")[:, : int(seen.sum(axis=1).max())]
+        self._seen = np.take_along_axis(seen, kept, axis=1).astype(np.float64)  # (N, P) 1.0 where it counts
+        places = np.take_along_axis(places, kept[..., np.newaxis], axis=1)
+        columns, rows = np.moveaxis(places.clip(0, np.array(picture.shape[::-1]) - 1), -1, 0)
         self._light = picture[rows, columns].astype(np.float64)  # (N, P)
-        self._seen = self._own_squares()
-
-    def _own_squares(self) -> FloatArray:
-        """(N, P) 1.0 where nothing is printed but the corner's own four squares."""
-        around = self._around
-        into_squares = np.linalg.inv(around.squares_px)
-        place = np.abs(np.einsum("nij,npj->npi", into_squares, self._places - around.pixels[:, None]))
-        sign = np.einsum("nij,npj->npi", into_squares, self._places - around.pixels[:, None]).prod(axis=-1) > 0.0
-        blur = _CLEAR_OF_PX / np.linalg.norm(around.squares_px, axis=1)  # (N, 2) in squares
-        near = (place < 1.0 - blur[:, None]).all(axis=-1)
-        in_marker = (place > around.clear - blur[:, None]).all(axis=-1) & (sign == around.white_diagonal[:, None])
-        return np.asarray(near & ~in_marker, dtype=np.float64)
+        self._places = places.astype(np.float64)  # (N, P, 2)
 
     def fitted(self, ids: IntArray) -> Corners:
         """The corners that look right."""
@@ -138,7 +140,7 @@ class _Patches:
             damped = normal + (damping[moving, None] * diagonal + 1e-9)[:, :, None] * np.eye(_N)
             step = np.linalg.solve(damped, gradient[..., None])[..., 0]
             tried = p[moving] - step
-            tried[:, 6:] = np.clip(tried[:, 6:], np.log(0.2), np.log(5.0))
+            tried[:, _BLURS] = np.clip(tried[:, _BLURS], np.log(0.2), np.log(5.0))
             new_residual, new_jacobian = self._linearise(tried, moving)
             new_cost = (new_residual**2).sum(axis=1)
             better = new_cost < cost[moving]
@@ -158,7 +160,7 @@ class _Patches:
         along_x, along_y = around.squares_px[:, :, 0], around.squares_px[:, :, 1]
         p[:, 2] = np.arctan2(along_x[:, 0], -along_x[:, 1])  # normals: the directions turned by 90 degrees
         p[:, 3] = np.arctan2(along_y[:, 0], -along_y[:, 1])
-        p[:, 6:] = np.log(_FIRST_BLUR_PX)
+        p[:, _BLURS] = np.log(_FIRST_BLUR_PX)
         p[:, 5] = 1.0
         residual, _ = self._linearise(p)
         shape = residual + self._seen * self._light  # the light of a = 0, b = 1
@@ -170,7 +172,7 @@ class _Patches:
         return p
 
     def _linearise(self, p: FloatArray, of: IntArray | slice = slice(None)) -> tuple[FloatArray, FloatArray]:
-        """Residuals (N, P), model minus light, and their derivatives (N, P, 8), of some patches."""
+        """Residuals (N, P), model minus light, and their derivatives (N, P, 10), of some patches."""
         off = self._places[of] - p[:, None, :2]
         edges, slopes, by_centre, by_turn = [], [], [], []
         for k in (0, 1):
@@ -192,8 +194,12 @@ class _Patches:
         jacobian[..., 2], jacobian[..., 3] = first * by_turn[0], second * by_turn[1]
         jacobian[..., 4], jacobian[..., 5] = 1.0, edges[0] * edges[1]
         jacobian[..., 6], jacobian[..., 7] = first * by_centre[0][2], second * by_centre[1][2]
-        seen = self._seen[of]
-        return seen * (a + b * edges[0] * edges[1] - self._light[of]), seen[..., None] * jacobian
+        reflected = a + b * edges[0] * edges[1]
+        away = (self._places[of] - self._around.pixels[of, None]) / self._around.radius_px
+        falling = self._seen[of] * (1.0 + np.einsum("npi,ni->np", away, p[:, _SLOPE]))
+        jacobian *= falling[..., None]
+        jacobian[..., _SLOPE] = (self._seen[of] * reflected)[..., None] * away
+        return falling * reflected - self._seen[of] * self._light[of], jacobian
 
     def _looks_right(self, p: FloatArray) -> BoolArray:
         """(N,) whether two edges that cross near enough explain the light."""
@@ -206,10 +212,10 @@ class _Patches:
         moved_px = np.linalg.norm(p[:, :2] - self._around.pixels, axis=1)
         return np.asarray(
             (count > _LEAST_PIXELS)
-            & (moved_px < np.minimum(_FARTHEST_SQUARES * side_px, _RADIUS_PX))
+            & (moved_px < np.minimum(_FARTHEST_SQUARES * side_px, FIRST_RADIUS_PX))
             & (contrast > _LEAST_CONTRAST)
             & (rms < _ROUGHEST * contrast)
-            & (np.exp(p[:, 6:]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
+            & (np.exp(p[:, _BLURS]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
         )
 
     def _judged(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
@@ -220,8 +226,22 @@ class _Patches:
         square = residual**2 * (count / np.maximum(count - _N, 1.0))[:, None]
         covariance = gain @ np.einsum("npi,np,npj->nij", jacobian, square, jacobian) @ gain
         return Corners(
-            ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, 6:]).max(axis=1), 2.0 * np.abs(p[good, 5])
+            ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5])
         )
+
+
+def _own_squares(around: Surroundings, places: FloatArray, size: IntArray) -> BoolArray:
+    """(N, P) whether nothing is printed there but the corner's own four squares, and it is nearest to this corner."""
+    place = np.einsum("nij,npj->npi", np.linalg.inv(around.squares_px), places - around.pixels[:, None])
+    side_px = np.linalg.norm(around.squares_px, axis=1)[:, None]  # (N, 1, 2)
+    blur = _CLEAR_OF_PX / side_px  # in squares
+    # Where squares are small, some pixels are shared: too few would be left.
+    own = np.maximum(0.5, FIRST_RADIUS_PX / side_px)
+    near = (np.abs(place) < np.minimum(own, 1.0 - blur)).all(axis=-1)
+    white = (place.prod(axis=-1) > 0.0) == around.white_diagonal[:, None]
+    in_marker = (np.abs(place) > around.clear - blur).all(axis=-1) & white
+    in_picture = ((places >= 0.0) & (places < size)).all(axis=-1)
+    return np.asarray(near & ~in_marker & in_picture)
 
 
 def bends(before_px: FloatArray, at_px: FloatArray, after_px: FloatArray) -> FloatArray:
