@@ -30,7 +30,9 @@ WINDOW_M: Final = 10.0
 _CELL_M: Final = WINDOW_M / 4.0
 # Once in a thousand good maps.
 FALSE_ALARM: Final = 1e-3
-# The sigmas that the estimate was told count like this many measurements of each kind.
+# The sigmas that the estimate was told count like this many measurements of each kind, but not where measurements say
+# that they are ten times off: what counts is drawn to the measurements first, in the same proportion (a prior of which
+# the scale is uncertain too: Gelman et al., "Bayesian Data Analysis", 2013, chapter 5).
 _TOLD: Final = 4.0
 # Fits end where a factor changes by less than this share; far below what the factors' own uncertainty moves the bound.
 _FACTOR_TOLERANCE: Final = 0.02
@@ -141,7 +143,9 @@ def fitted_windows(
         if effort:
             effort.spend(solution)
         squares, redundancy = _left_over(solution)
-        before, factors = factors, np.sqrt((squares * factors**2 + _TOLD) / (redundancy + _TOLD))
+        squares = squares * factors**2
+        believed = (squares + _TOLD) / (redundancy + _TOLD)
+        before, factors = factors, np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD))
         state = solution.state
         del solution  # and what it takes, before the next one
         if left <= 0 or np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:

@@ -1,7 +1,8 @@
 """One chain solved alone, in the frame of its start.
 
 A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
-from there does not fit together, the drive is built up again with other draws of the wheels' noise, until one fits.
+from there does not fit together, the drive is built up again under the noise that its windows show, with other draws of
+the wheels' errors, until one fits.
 
 Readings that contradict each other everywhere make each of these solves take a hundred steps, where those of a drive
 take four. So that a small file of them does not take minutes, all of it shares the effort that the log is worth: solves
@@ -107,7 +108,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
                 break
         if effort.left < 0.0:
             break
-        known = _built_up(_redrawn(coarse, rng), effort)
+        known = _built_up(_redrawn(_as_shown(coarse, best.goodness), rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
     return best
@@ -126,6 +127,15 @@ class _Check:
     def judge(self, solution: Solution) -> Goodness:
         state = solution.state
         return self._windows.judge(replace(state, poses=state.poses[self._keyframes]))
+
+
+def _as_shown(chain: Chain, goodness: Goodness) -> Chain:
+    """The chain under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
+    return replace(
+        chain,
+        odometry=replace(chain.odometry, covariance=goodness.odometry_factor**2 * chain.odometry.covariance),
+        readings=chain.readings.spread(np.full((len(chain.readings), 2), goodness.reading_factor)),
+    )
 
 
 def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:

@@ -1,6 +1,7 @@
 """One chain solved alone: a long drive ends where it would from the truth, and soon."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,25 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
     _first_from_dead_reckoning(monkeypatch)
     found = solve_local_map(drive.chain)
     assert not found.goodness.fits
+
+
+@pytest.mark.parametrize(("seed", "length_m"), [(3, 500.0), (24, 2000.0)])
+def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
+    """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
+    drive = made_long_drive(seed, length_m)
+    odometry, readings = drive.chain.odometry, drive.chain.readings
+    chain = replace(
+        drive.chain,
+        odometry=replace(odometry, covariance=100.0 * odometry.covariance),
+        readings=readings.spread(np.full((len(readings), 2), 10.0)),
+    )
+    graph = build_graph([chain])
+    found = solve_local_map(chain)
+    assert is_right(found.solution, solve(graph.problem, drive.true_state(graph)))
+    assert found.goodness.fits
+    # Drives are made with 0.7 to 1.4 times their noise, and a factor is known to some 10 % at least.
+    assert 0.05 < found.goodness.odometry_factor < 0.2
+    assert 0.05 < found.goodness.reading_factor < 0.2
 
 
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
