@@ -1,5 +1,7 @@
 """Cameras that take pictures of the default board, and their views, found."""
 
+from collections.abc import Sequence
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -40,11 +42,38 @@ def spoilt(view: Taken, camera: CameraModel, rng: np.random.Generator) -> Taken:
 
 
 def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.0) -> list[View]:
-    """Pictures of the default board as `drawn_views` has them, and the board found in them."""
+    """Pictures of the default board as `drawn_views` has them, some spoilt, and the board found in them."""
+    drawn, worse = _drawn(camera, seed, count, spoilt_share)
+    return _seen([_found(camera, worse.get(index, view), seed, index) for index, view in enumerate(drawn)])
+
+
+def taken_with_and_without(
+    camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.1
+) -> tuple[list[View], list[View]]:
+    """The views of a seed with none spoilt, and with some; those that are in both are taken once."""
+    drawn, worse = _drawn(camera, seed, count, spoilt_share)
+    good = [_found(camera, view, seed, index) for index, view in enumerate(drawn)]
+    mixed = [_found(camera, worse[index], seed, index) if index in worse else view for index, view in enumerate(good)]
+    return _seen(good), _seen(mixed)
+
+
+def _drawn(camera: CameraModel, seed: int, count: int, spoilt_share: float) -> tuple[list[Taken], dict[int, Taken]]:
+    """How pictures are taken, and by their numbers how those that are spoilt are taken instead."""
     rng = np.random.default_rng(seed)
-    painter, finder = BoardPainter(camera, DEFAULT_BOARD), BoardFinder(DEFAULT_BOARD)
     drawn = drawn_views(camera, DEFAULT_BOARD, count, rng)
-    for index in rng.choice(count, round(spoilt_share * count), replace=False):
-        drawn[index] = spoilt(drawn[index], camera, rng)
-    found = [finder.find(painter.picture(view, rng), f"picture {index}") for index, view in enumerate(drawn)]
-    return [view for view in found if view is not None]
+    chosen = rng.choice(count, round(spoilt_share * count), replace=False)
+    return drawn, {int(index): spoilt(drawn[index], camera, rng) for index in chosen}
+
+
+@cache
+def _painter(camera: CameraModel) -> BoardPainter:
+    return BoardPainter(camera, DEFAULT_BOARD)
+
+
+def _found(camera: CameraModel, view: Taken, seed: int, index: int) -> View | None:
+    picture = _painter(camera).picture(view, np.random.default_rng([seed, index]))
+    return BoardFinder(DEFAULT_BOARD).find(picture, f"picture {index}")
+
+
+def _seen(views: Sequence[View | None]) -> list[View]:
+    return [view for view in views if view is not None]
