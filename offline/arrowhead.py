@@ -10,12 +10,12 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg
 
 from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_many, arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
 from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_covariance import Entries, joint_covariance, quadratic_form
+from offline.arrowhead_covariance import SquareRoot, joint_covariance, square_root
 from offline.arrowhead_marginals import pose_marginals
 from offline.arrowhead_measured import MeasuredBlocks
 from offline.arrowhead_skeleton import expand
@@ -224,12 +224,10 @@ class Factorisation:
         covariance[np.ix_(free, free)] = joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
         return covariance
 
-    def quadratic_form(self, columns: sparse.csc_array) -> FloatArray:
-        """E^T H^-1 E (k, k) for sparse columns E (n, k) of the tangent space; nothing in what is held."""
-        entries = sparse.coo_array(columns)
-        row, column = entries.coords
-        own = Entries(self.arrowhead.tangent[row], np.asarray(column, dtype=np.int64), entries.data)
-        return quadratic_form(self.arrowhead.tree, self.system, self.rows, self.top, own, columns.shape[1])
+    def square_root_of_tags(self, tags: IntArray) -> SquareRoot:
+        """Of the joint covariance (2 k, 2 k) of k tags."""
+        wanted = (3 * self.arrowhead.tree.n_poses + 2 * tags[:, None] + np.arange(2)).reshape(-1)
+        return square_root(self.arrowhead.tree, self.rows, self.top, wanted)
 
     def pose_covariances(self, poses: IntArray) -> FloatArray:
         """(k, 3, 3) of k poses, by their right perturbation; all at once, and 0 where held."""

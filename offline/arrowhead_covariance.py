@@ -5,10 +5,11 @@ from its node to the top: so a tag in the border costs one triangular solve ther
 """
 
 import heapq
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, sparse
 
 from calib.arrays import FloatArray, IntArray
 from offline import arrowhead_substitution
@@ -16,6 +17,38 @@ from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_tree import Tree
 
 _AT_ONCE: Final = 1024
+_FEW: Final = 2**22  # numbers, which are better kept with their zeros
+
+
+class SquareRoot(NamedTuple):
+    """Z with Z^T Z a block (k, k) of H^-1.
+
+    Attributes:
+        top: (t, k) rows of the columns that meet in the top, or all where there are few.
+        below: (m, k) rows of those that are eliminated before, most of them zero.
+    """
+
+    top: FloatArray
+    below: sparse.csc_array
+
+    def times(self, vectors: FloatArray) -> FloatArray:
+        """The block of H^-1 times vectors (k, n)."""
+        product: FloatArray = self.top.T @ (self.top @ vectors)
+        return product + self.below.T @ (self.below @ vectors) if self.below.shape[0] else product
+
+    def of(self, columns: IntArray) -> "SquareRoot":
+        """Of some of the columns."""
+        return SquareRoot(self.top[:, columns], self.below[:, columns] if self.below.shape[0] else self.below)
+
+    def summed(self, columns: sparse.csc_array) -> "SquareRoot":
+        """Of sums of the columns, as a sparse matrix (k, n) has them."""
+        below = sparse.csc_array(self.below @ columns) if self.below.shape[0] else self.below
+        return SquareRoot(np.asarray((columns.T @ self.top.T).T), below)
+
+    def against(self, other: "SquareRoot") -> FloatArray:
+        """Z^T Z' between these columns and another's."""
+        product: FloatArray = self.top.T @ other.top
+        return product + (self.below.T @ other.below).toarray() if self.below.shape[0] else product
 
 
 def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: IntArray) -> FloatArray:
@@ -28,59 +61,74 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
     """
-    return quadratic_form(tree, system, rows, top, Entries(wanted, np.arange(len(wanted)), np.ones(len(wanted))))
+    square = np.zeros((len(wanted), len(wanted)))
+    sent: list[_Sent] = []
+    for node, who in _by_node(tree, wanted):
+        if tree.level[node] == 0:
+            inner, values = _through_leaf(tree, system, rows, node, wanted[who])
+            square[np.ix_(who, who)] += inner
+            sent.append(_Sent(int(tree.parent[node]), who, values))
+        else:
+            sent.append(_Sent(node, who, _on_front(tree, node, wanted[who])))
+    for _, who, Z in _to_the_top(tree, rows, top, sent):
+        for begin in range(0, len(who), _AT_ONCE):  # of thousands of columns k by k is large, and a product another
+            some = slice(begin, begin + _AT_ONCE)
+            square[np.ix_(who[some], who)] += Z[:, some].T @ Z
+    square += square.T
+    square *= 0.5
+    return square
 
 
-class Entries(NamedTuple):
-    """A sparse matrix E (n, k): entry `value` in each `row`, in the arrowhead's order, and `column`."""
-
-    row: IntArray
-    column: IntArray
-    value: FloatArray
-
-    def where(self, which: IntArray) -> "Entries":
-        """Some of them."""
-        return Entries(self.row[which], self.column[which], self.value[which])
-
-
-def quadratic_form(
-    tree: Tree, system: System, rows: Rows, top: FloatArray, entries: Entries, n_columns: int | None = None
-) -> FloatArray:
-    """E^T H^-1 E (k, k): cheap where a column of E has entries in few leaves.
+def square_root(tree: Tree, rows: Rows, top: FloatArray, wanted: IntArray) -> SquareRoot:
+    """Of the block of H^-1 of columns that are no pose's; for very many of them smaller than the block.
 
     Args:
         tree: the order.
-        system: the blocks.
-        rows: what elimination left of them.
+        rows: what elimination left of the blocks.
         top: lower triangular R^T of the top.
-        entries: of E.
-        n_columns: k, where the last columns may be empty.
+        wanted: (k,) columns in the arrowhead's order, of tags or calibration.
     """
-    k = int(entries.column.max(initial=-1)) + 1 if n_columns is None else n_columns
-    square = np.zeros((k, k))
-    # What is on its way at each node: which of the columns, and the right-hand sides (front, q) for them.
+    sent = [_Sent(node, who, _on_front(tree, node, wanted[who])) for node, who in _by_node(tree, wanted)]
+    passed = list(_to_the_top(tree, rows, top, sent))
+    n_rows = sum(len(each.values) for each in passed)
+    kept = [each for each in passed if each.node == len(tree.level) - 1 or n_rows * len(wanted) < _FEW]
+    in_top = np.zeros((sum(len(each.values) for each in kept), len(wanted)))
+    n = 0
+    for _, who, Z in kept:
+        in_top[n : n + len(Z), who] = Z
+        n += len(Z)
+    below = [each for each in passed if each.node != len(tree.level) - 1] if len(kept) < len(passed) else []
+    return SquareRoot(in_top, _sparse([(who, Z) for _, who, Z in below], len(wanted)))
+
+
+def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.csc_array:
+    """Rows (n, q) of some of the columns (q,), one part below the other."""
+    empty = np.zeros(0, dtype=np.int64)
+    rows, columns, values, n = [empty], [empty], [np.zeros(0)], 0
+    for who, Z in parts:
+        rows.append(np.repeat(np.arange(n, n + len(Z)), len(who)))
+        columns.append(np.tile(who, len(Z)))
+        values.append(Z.reshape(-1))
+        n += len(Z)
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csc_array(entries, shape=(n, n_columns))
+
+
+class _Sent(NamedTuple):
+    """Right-hand sides (front, q) that have come to a node, and the columns (q,) that they are of."""
+
+    node: int
+    who: IntArray
+    values: FloatArray
+
+
+def _to_the_top(tree: Tree, rows: Rows, top: FloatArray, sent: list[_Sent]) -> Iterator[_Sent]:
+    """Each node's rows (n_eliminated, q) of Z, children first."""
     waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
-    queue: list[int] = []
-
-    def send(node: int, who: IntArray, values: FloatArray) -> None:
-        if node not in waiting:
-            heapq.heappush(queue, node)
-        waiting.setdefault(node, []).append((who, values))
-
-    for node, which in _by_node(tree, entries.row):
-        own = entries.where(which)
-        who, column = np.unique(own.column, return_inverse=True)
-        own = own._replace(column=column)
-        if tree.level[node] == 0:
-            inner, values = _through_leaf(tree, system, rows, node, own)
-            square[np.ix_(who, who)] += inner
-            send(int(tree.parent[node]), who, values)
-        else:
-            front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
-            sorter = np.argsort(front)
-            values = np.zeros((len(front), len(who)))
-            np.add.at(values, (sorter[np.searchsorted(front, own.row, sorter=sorter)], own.column), own.value)
-            send(node, who, values)
+    for each in sent:
+        waiting.setdefault(each.node, []).append((each.who, each.values))
+    queue = list(waiting)
+    heapq.heapify(queue)
     while queue:
         node = heapq.heappop(queue)
         who, values = _together(waiting.pop(node))
@@ -88,13 +136,20 @@ def quadratic_form(
             Z = linalg.solve_triangular(top, values, lower=True, check_finite=False) if len(top) else values
         else:
             Z, left = _through_front(tree, rows, node, values)
-            send(int(tree.parent[node]), who, left)
-        for begin in range(0, len(who), _AT_ONCE):  # of thousands of columns k by k is large, and a product another
-            some = slice(begin, begin + _AT_ONCE)
-            square[np.ix_(who[some], who)] += Z[:, some].T @ Z
-    square += square.T
-    square *= 0.5
-    return square
+            parent = int(tree.parent[node])
+            if parent not in waiting:
+                heapq.heappush(queue, parent)
+            waiting.setdefault(parent, []).append((who, left))
+        yield _Sent(node, who, Z)
+
+
+def _on_front(tree: Tree, node: int, wanted: IntArray) -> FloatArray:
+    """(front, q) a one for each column (q,) that the node eliminates."""
+    front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
+    sorter = np.argsort(front)
+    values = np.zeros((len(front), len(wanted)))
+    values[sorter[np.searchsorted(front, wanted, sorter=sorter)], np.arange(len(wanted))] = 1.0
+    return values
 
 
 def _together(arrived: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
@@ -126,22 +181,22 @@ def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
     return list(zip(nodes.tolist(), np.split(order, first[1:]), strict=True))
 
 
-def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, entries: Entries) -> tuple[FloatArray, FloatArray]:
-    """E^T A^-1 E of entries in a leaf's poses, and what they leave in the parent's front."""
+def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, wanted: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The block of A^-1 of columns in a leaf's poses, and what they leave in the parent's front."""
     first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
     start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
     parent = int(tree.parent[leaf])
-    k = int(entries.column.max()) + 1
-    right = np.zeros((k, 3 * n))
-    np.add.at(right, (entries.column, entries.row - 3 * first), entries.value)
-    solved = right.reshape(k, n, 3).copy()
+    k = len(wanted)
+    own = wanted - 3 * first
+    solved = np.zeros((k, n, 3))
+    solved[np.arange(k), own // 3, own % 3] = 1.0
     values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), k))
     for i in range(k):
         arrowhead_substitution.solve_leaf(tree, rows, leaf, solved[i])
         outside = np.zeros(end - start)
         arrowhead_substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
         values[tree.up[start:end], i] = -outside
-    return right @ solved.reshape(k, 3 * n).T, values
+    return solved.reshape(k, 3 * n)[:, own].T, values
 
 
 def _through_front(tree: Tree, rows: Rows, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:

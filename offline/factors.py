@@ -243,22 +243,19 @@ class CalibrationPrior:
 
 
 def stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
-    """One sparse Jacobian (m, n) and its residuals (m,)."""
-    rows, columns, values, residuals = [], [], [], []
-    first_row = 0
+    """One sparse Jacobian (m, n), columns in no order within its rows, and its residuals (m,)."""
+    values, columns, counts, residuals = [], [], [np.zeros(1, dtype=np.int64)], []
     for kind in kinds:
-        m, n = kind.residual.shape
-        row = first_row + np.arange(m * n).reshape(m, n, 1)
-        for block_columns, derivative in kind.blocks:
-            full = np.broadcast_to(block_columns[:, None, :], derivative.shape)
-            free = full >= 0
-            rows.append(np.broadcast_to(row, derivative.shape)[free])
-            columns.append(full[free])
-            values.append(derivative[free])
+        n = kind.residual.shape[1]
+        own = np.concatenate([each for each, _ in kind.blocks], axis=1)
+        free = np.repeat(own >= 0, n, axis=0)
+        values.append(np.concatenate([each for _, each in kind.blocks], axis=2).reshape(free.shape)[free])
+        columns.append(np.repeat(own, n, axis=0)[free])
+        counts.append(free.sum(axis=1))
         residuals.append(kind.residual.reshape(-1))
-        first_row += m * n
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(entries, shape=(first_row, n_columns)), np.concatenate(residuals)
+    ends = np.cumsum(np.concatenate(counts))
+    entries = (np.concatenate(values), np.concatenate(columns), ends)
+    return sparse.csr_array(entries, shape=(len(ends) - 1, n_columns)), np.concatenate(residuals)
 
 
 def whitening(covariance: FloatArray) -> FloatArray:

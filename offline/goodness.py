@@ -37,6 +37,9 @@ _TOLD: Final = 4.0
 # Fits end where a factor changes by less than this share; far below what the factors' own uncertainty moves the bound.
 _FACTOR_TOLERANCE: Final = 0.02
 _MAX_FITS: Final = 20
+# Of the solves whose residuals are asked for: what their squares are off by is the root of it.
+_COST_TOLERANCE: Final = 1e-4
+_RELATIVE_TOLERANCE: Final = 1e-8
 _ROUNDING: Final = 1e-6
 _N_SIGNS: Final = 8
 _AT_ONCE: Final = 4096  # motions: a Jacobian of all of them takes as much memory as the solve
@@ -138,7 +141,7 @@ def fitted_windows(
     left = effort.steps(apart, share, _MAX_FITS * MAX_STEPS) if effort else _MAX_FITS * MAX_STEPS
     factors, redundancy = np.ones(2), np.zeros(2)
     for _ in range(_MAX_FITS):
-        solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=min(left, MAX_STEPS))
+        solution = _nearly_solved(_scaled(apart, *factors), state, losses, min(left, MAX_STEPS))
         left -= len(solution.costs)
         if effort:
             effort.spend(solution)
@@ -154,8 +157,10 @@ def fitted_windows(
     n_conditions = max(0, _freedom(problem) - _freedom(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     most_steps = max(1, min(left, MAX_STEPS))
-    solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=most_steps)
-    if n_conditions:
+    if not n_conditions:
+        solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=most_steps)
+    else:
+        solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_steps)
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
         sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
@@ -165,6 +170,11 @@ def fitted_windows(
         solution = solve(shared, state, losses=losses, most_steps=most_steps)
     of_the_whole = effort.steps(problem, share) if effort else MAX_STEPS
     return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, of_the_whole)
+
+
+def _nearly_solved(problem: Problem, state: State, losses: Losses, most_steps: int) -> Solution:
+    """To where its cost is not yet that of the end, but squares of what is left over are."""
+    return solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_steps=most_steps)
 
 
 def _affordable_windows(problem: Problem, effort: Effort | None) -> Problem:
@@ -255,12 +265,8 @@ def _dead_reckoned(problem: Problem, windows: Problem) -> State:
 def _scaled(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
     """With the noise of wheels and readings so many times as large; (M, 2) where readings differ in that."""
     by_row = np.broadcast_to(reading_factor, problem.readings.value.shape)[..., None]
-    odometry, readings = problem.odometry, problem.readings
-    return replace(
-        problem,
-        odometry=replace(odometry, whitening=odometry.whitening / odometry_factor),
-        readings=replace(readings, whitening=readings.whitening / by_row),
-    )
+    odometry, readings = problem.odometry.whitening / odometry_factor, problem.readings.whitening / by_row
+    return problem.reweighed(odometry, readings)
 
 
 def _freedom(problem: Problem) -> int:
@@ -284,7 +290,7 @@ def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
         some = slice(begin, begin + _AT_ONCE)
         jacobian, _ = stacked((_part(problem.odometry, some).linearise(state, columns),), n_columns)
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
-    taken = sum(float(each @ solution.factorisation.solve(each)) for each in pulled) / _N_SIGNS
+    taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)
     whole = max(0, _freedom(problem))
     return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])

@@ -51,6 +51,7 @@ class FittedPart:
 
     chain: Chain
     solution: Solution
+    is_whole: bool
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,11 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
         if not small:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
-            parts = zip(_beginnings(maps), fitted.solutions, strict=True)
-            fitted_noise = noise.model_copy(update=values)
-            return NoiseFit(fitted_noise, _in_order(told | kept), tuple(FittedPart(*part) for part in parts))
+            parts = tuple(
+                FittedPart(chain, solution, chain is each.chain)
+                for each, chain, solution in zip(maps, _beginnings(maps), fitted.solutions, strict=True)
+            )
+            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept), parts)
         kept |= small
         free = tuple(name for name in free if name not in small)
     return NoiseFit(noise, _in_order(kept))

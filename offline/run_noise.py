@@ -17,7 +17,7 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.chain import Chain
-from offline.factors import whitening
+from offline.factors import State, whitening
 from offline.local_map import LocalMap
 from offline.noise_fit import FittedPart, FittedSigma, fit_noise
 from offline.odometry import ODOMETRY_NOISE
@@ -64,8 +64,12 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         for name in NoiseParameters.model_fields
     )
     doubted = _larger(prior, noise)
+    solved = {each.chain.name: each.solution.state for each in fit.parts if each.is_whole}
     return WeighedMaps(
-        [_under(each, noise if each.goodness.fits else doubted, shared, prior) for each in maps],
+        [
+            _under(each, noise if each.goodness.fits else doubted, shared, prior, solved.get(each.chain.name))
+            for each in maps
+        ],
         noise,
         FittedNoise(
             tuple(parameters),
@@ -105,8 +109,10 @@ def _cells(chain: Chain) -> IntArray:
     return np.asarray(cell, dtype=np.int64)
 
 
-def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
-    """The map solved under other noise and with readings that share errors."""
+def _under(
+    local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters, near: State | None = None
+) -> LocalMap:
+    """The map solved under other noise and with readings that share errors; the fit may have ended near that."""
     if noise == prior and not shared.any():
         return local_map
     chain = local_map.chain.weighed(noise)
@@ -119,7 +125,7 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
-    solution = solve(graph.problem, local_map.solution.state)
+    solution = solve(graph.problem, near or local_map.solution.state)
     return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness)
 
 

@@ -161,7 +161,7 @@ class Solution:
     @cached_property
     def _factorised(self) -> tuple[Factorisation, float]:
         system, _ = self.problem.arrowhead.linearise(self.state, *self.losses)
-        return _factorised(self.problem.arrowhead, system, 0.0)
+        return factorised(self.problem.arrowhead, system, 0.0)
 
     @cached_property
     def untied(self) -> Untied:
@@ -238,7 +238,7 @@ def solve(
         return ended("the cost is no number at the start", converged=False)
     for _ in range(most_steps):
         try:
-            factorisation, used = _factorised(arrowhead, system, damping.share, rows, threads)
+            factorisation, used = factorised(arrowhead, system, damping.share, rows, threads)
         except UnderDeterminedError:
             return ended("a variable is in no factor", converged=False)
         damping.needed(used)
@@ -267,7 +267,7 @@ def solve(
     return ended(f"stopped after {most_steps} steps", converged=False)
 
 
-def _factorised(
+def factorised(
     arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None, threads: int = 1
 ) -> tuple[Factorisation, float]:
     """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.

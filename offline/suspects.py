@@ -18,8 +18,9 @@ from offline.measured_factors import Measured
 from offline.merge import Merge
 from offline.run import TagKey
 from offline.solver import Solution, solve
-from offline.suspects_evidence import Evidence, contradicted, gathered, noise_scales
-from offline.suspects_search import FALSE_ALARM, Places, bound, excess, search, settled
+from offline.suspects_evidence import Evidence, contradicted, gathered, noise_scales, to_other_tags
+from offline.suspects_places import Places, settled
+from offline.suspects_search import FALSE_ALARM, bound, excess, search
 from offline.suspects_sightings import (
     Sightings,
     instances,
@@ -224,15 +225,8 @@ def _loosened(measured: Measured) -> Measured:
 
 def _measured_again(before: Graph, after: Graph) -> Measured:
     """What was measured, now to the first instance of each tag."""
-    measured = before.problem.measured
     first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
-    index = np.array([first[tag.whole] for tag in before.tags], dtype=np.int64)
-    distances = measured.distances
-    ends = {
-        name: np.where(tag >= 0, index[tag], -1)
-        for name, tag in (("tag_a", distances.tag_a), ("tag_b", distances.tag_b))
-    }
-    return replace(measured, distances=replace(distances, **ends))
+    return to_other_tags(before.problem.measured, np.array([first[tag.whole] for tag in before.tags], dtype=np.int64))
 
 
 def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:

@@ -6,7 +6,8 @@ put them equal. So one linearisation tells the cost of every split of every tag:
 exact joint information of all readings, for all hypotheses at once.
 
 A tag is moved by more than a lean of its board or the remains of a lens shift it: each sighting may be off by a
-centimetre, which the form carries: (L^-1 + s^2)^-1.
+centimetre, which the form carries: (L^-1 + s^2)^-1. For that each place gets a prior of a centimetre about where the
+solve has it; one factorisation with each sighting's tag apart then tells all (`suspects_information`).
 """
 
 from collections.abc import Sequence
@@ -14,15 +15,16 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy import linalg, sparse
 
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import Columns, State, stacked
+from offline.factors import Columns, State
 from offline.goodness import Goodness
 from offline.graph import Graph
 from offline.joint_fit import UNMODELLED_SIGMA_M
+from offline.measured_factors import Measured
 from offline.robust import losses_and_weights
-from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, Solution
+from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, factorised
+from offline.suspects_information import Information, no_information
 from offline.suspects_sightings import Sightings
 
 _WEIGHINGS: Final = 5
@@ -40,7 +42,7 @@ class Evidence:
     """
 
     which: IntArray
-    information: FloatArray
+    information: Information
     score: FloatArray
     places_m: FloatArray
 
@@ -77,78 +79,55 @@ def gathered(
         unmodelled_sigma_m: of each coordinate of a sighting, beyond what the covariances say.
         weighed: whether readings count by how well they fit the others of their sighting, or all alike.
     """
-    held = _sighted_again(sightings)
-    if not held.any():
-        none = np.zeros((0, 2))
-        return Evidence(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), none.reshape(-1), none)
+    which = np.flatnonzero(np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] > 1)
+    if not len(which):
+        return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
     problem = _scaled(graph, scales)
     if weighed:
         problem = _weighed(problem, state, sightings)
-    of_reading = sightings.of_reading
-    which = np.flatnonzero(held[sightings.id])
-    place_of = np.full(len(sightings), -1, dtype=np.int64)
-    place_of[which] = np.arange(len(which))
-    tag_held = np.zeros(len(graph.tags), dtype=np.bool_)
-    tag_held[problem.readings.tag] = place_of[of_reading] >= 0
-    tag_of_sighting = np.zeros(len(sightings), dtype=np.int64)
-    tag_of_sighting[of_reading] = problem.readings.tag
-    places_m = state.tags[tag_of_sighting[which]]
-    eliminated = replace(problem, columns=_without_tags(problem.columns, tag_held))
-    _, distances = problem.measured.linearise(state, eliminated.columns)
-    readings = problem.readings.linearise(state, eliminated.columns)
-    by_place = readings._replace(blocks=((_columns_of(place_of[of_reading]), readings.blocks[1][1]),))
-    # What was measured to a tag was measured to where it was first.
-    first_place = np.full(len(graph.tags), -1, dtype=np.int64)
-    first_place[tag_of_sighting[which[::-1]]] = place_of[which[::-1]]
-    to_places = replace(
-        problem.columns, poses=np.full_like(problem.columns.poses, -1), tags=_columns_of(first_place), n=2 * len(which)
+    apart, state = _apart(problem, state, sightings)
+    system, _ = apart.arrowhead.linearise(state, *PLAIN_SQUARES)
+    system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
+    factorisation, _ = factorised(apart.arrowhead, system, 0.0)
+    step = factorisation.solve_in_order(system.gradient)
+    by_tag = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(sightings)].reshape(-1, 2)
+    information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
+    # What is left of the gradient once all else is eliminated, S^-1 times this step, through the slack: s^-2 S S^-1.
+    return Evidence(which, information, unmodelled_sigma_m**-2 * by_tag[which].reshape(-1), state.tags[which])
+
+
+def _apart(problem: Problem, state: State, sightings: Sightings) -> tuple[Problem, State]:
+    """Each sighting with a tag of its own, in the same places; what was measured to a tag was to where it was first."""
+    columns, n = problem.columns, len(sightings)
+    of_tag, first_reading = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    of_tag[sightings.of_reading] = problem.readings.tag
+    first_reading[sightings.of_reading[::-1]] = np.arange(len(problem.readings.tag))[::-1]
+    first = np.full(len(columns.tags), -1, dtype=np.int64)
+    first[of_tag[::-1]] = np.arange(n)[::-1]
+    free_poses, free_calibration = columns.poses >= 0, columns.calibration >= 0
+    n_poses = int(free_poses.sum())
+    n_all = n_poses + 2 * n + int(free_calibration.sum())
+    apart = Columns(
+        np.where(free_poses, np.cumsum(free_poses).reshape(free_poses.shape) - 1, -1),
+        n_poses + np.arange(2 * n).reshape(n, 2),
+        np.where(free_calibration, n_poses + 2 * n + np.cumsum(free_calibration) - 1, -1),
+        n_all,
     )
-    _, to_place = problem.measured.linearise(state, to_places)
-    by_others, _ = stacked((readings, distances), eliminated.columns.n)
-    by_places, read = stacked((by_place, to_place), 2 * len(which))
-    coupling = sparse.csc_array(by_others.T @ by_places)
-    solution = Solution(state, (0.0,), "", converged=True, problem=eliminated, losses=PLAIN_SQUARES)
-    factorisation = solution.factorisation
-    others_step = factorisation.solve_in_order(factorisation.system.gradient)[eliminated.arrowhead.tangent]
-    information = factorisation.quadratic_form(coupling)
-    np.subtract((by_places.T @ by_places).toarray(), information, out=information)
-    score = by_places.T @ read - coupling.T @ others_step
-    return Evidence(which, *_with_slack(information, score, unmodelled_sigma_m), places_m)
+    other = replace(
+        problem,
+        readings=replace(problem.readings, tag=sightings.of_reading),
+        columns=apart,
+        anchor=problem.readings.pose[first_reading],
+        measured=to_other_tags(problem.measured, first),
+    )
+    return other, State(state.poses, state.tags[of_tag], state.calibration)
 
 
-def _columns_of(place: IntArray) -> IntArray:
-    """(n, 2) columns of places (n,), -1 where there is none."""
-    columns: IntArray = np.where(place[:, None] >= 0, 2 * place[:, None] + np.arange(2), -1)
-    return columns
-
-
-def _sighted_again(sightings: Sightings) -> BoolArray:
-    """(N,) which ids were sighted more than once."""
-    return np.asarray(np.bincount(sightings.id, minlength=len(sightings.ids)) > 1)
-
-
-def _with_slack(information: FloatArray, score: FloatArray, sigma_m: float) -> tuple[FloatArray, FloatArray]:
-    """Each place may be off by this sigma: (L^-1 + s^2)^-1, which L need not have an inverse for.
-
-    That is (I - (I + s^2 L)^-1) / s^2. It takes the place of L, since of many tags one such matrix is large.
-    """
-    n = len(score)
-    if not n or not sigma_m:
-        return information, score
-    information *= sigma_m**2
-    information[np.diag_indices(n)] += 1.0
-    # Symmetric, so that its transpose is the same in the order of columns that LAPACK works on in place.
-    root, failed = linalg.lapack.dpotrf(information.T, lower=1, overwrite_a=1)
-    if failed:
-        raise ValueError(f"the information of {n} coordinates of sightings is not positive")
-    widened_score = linalg.cho_solve((root, True), score, check_finite=False)
-    inverse, _ = linalg.lapack.dpotri(root, lower=1, overwrite_c=1)
-    found: FloatArray = inverse.T
-    for i in range(n):
-        found[i + 1 :, i] = found[i, i + 1 :]
-    found *= -(sigma_m**-2)
-    found[np.diag_indices(n)] += sigma_m**-2
-    return found, widened_score
+def to_other_tags(measured: Measured, index: IntArray) -> Measured:
+    """What was measured, with tags numbered anew by index (T,)."""
+    distances = measured.distances
+    tag_a, tag_b = (np.where(tag >= 0, index[tag], -1) for tag in (distances.tag_a, distances.tag_b))
+    return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
 
 
 def contradicted(graph: Graph, state: State, sightings: Sightings, scales: FloatArray) -> BoolArray:
@@ -164,22 +143,51 @@ def contradicted(graph: Graph, state: State, sightings: Sightings, scales: Float
     pull = -np.einsum("mki,mk->mi", by_tag, lin.residual)
     cut = np.zeros(len(pull), dtype=np.bool_)
     order = np.lexsort((problem.readings.pose, sightings.of_reading))
-    parts = np.split(order, np.cumsum(sightings.n_readings)[:-1]) if len(order) else []
-    while parts:
-        own = parts.pop()
-        if len(own) < 2:
-            continue
-        before, pulled = np.cumsum(square[own], axis=0), np.cumsum(pull[own], axis=0)
-        covariance = np.linalg.inv(before[:-1])
-        covariance_after = np.linalg.inv(before[-1] - before[:-1])
-        off = np.einsum("nij,nj->ni", covariance, pulled[:-1])
-        off -= np.einsum("nij,nj->ni", covariance_after, pulled[-1] - pulled[:-1])
-        gain = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance + covariance_after), off)
-        at = int(np.argmax(gain)) + 1
-        if gain[at - 1] > -2.0 * np.log(_MOVED_IN_SIGHT / len(own)):  # chi-square with 2 degrees
-            cut[own[at]] = True
-            parts += [own[:at], own[at:]]
+    n_readings = sightings.n_readings
+    while len(order):
+        at, gain = _best_cuts(square[order], pull[order], n_readings)
+        ends = np.cumsum(n_readings)
+        found = gain > -2.0 * np.log(_MOVED_IN_SIGHT / n_readings)  # chi-square with 2 degrees
+        cut[order[at[found]]] = True
+        # Those that were cut are looked at again, in two parts.
+        order = order[np.repeat(found, n_readings)]
+        before = (at - (ends - n_readings))[found]
+        n_readings = np.stack([before, n_readings[found] - before], axis=-1).reshape(-1)
     return cut
+
+
+def _best_cuts(square: FloatArray, pull: FloatArray, n_readings: IntArray) -> tuple[IntArray, FloatArray]:
+    """Of sightings one after the other (S,), the reading that would begin another one, and what that brings (S,).
+
+    Args:
+        square: (M, 2, 2) information of each reading on the place.
+        pull: (M, 2) how it draws it elsewhere.
+        n_readings: (S,) of each sighting.
+    """
+    ends = np.cumsum(n_readings)
+    begins, of = ends - n_readings, np.repeat(np.arange(len(n_readings)), n_readings)
+    rows = np.concatenate([square.reshape(-1, 4), pull], axis=1)
+    # Within each sighting, so that rounding does not run on from one to the next.
+    up_to = np.concatenate([np.cumsum(each, axis=0) for each in np.split(rows, ends[:-1])])
+    inside = np.flatnonzero(np.arange(len(of)) + 1 < ends[of])  # the last reading of a sighting is before nothing
+    gain = np.full(len(of), -np.inf)
+    before, after = up_to[inside], up_to[ends[of[inside]] - 1] - up_to[inside]
+    covariance, covariance_after = _inverse(before[:, :4].reshape(-1, 2, 2)), _inverse(after[:, :4].reshape(-1, 2, 2))
+    off = np.einsum("nij,nj->ni", covariance, before[:, 4:]) - np.einsum("nij,nj->ni", covariance_after, after[:, 4:])
+    gain[inside] = np.einsum("ni,nij,nj->n", off, _inverse(covariance + covariance_after), off)
+    best = np.maximum.reduceat(gain, begins)
+    at = np.full(len(n_readings), len(of), dtype=np.int64)
+    is_best = np.flatnonzero(gain == best[of])
+    np.minimum.at(at, of[is_best], is_best)
+    return at + 1, best
+
+
+def _inverse(matrices: FloatArray) -> FloatArray:
+    """Of symmetric ones (n, 2, 2)."""
+    (a, b), (_, d) = matrices[:, 0].T, matrices[:, 1].T
+    turned = np.stack([d, -b, -b, a], axis=-1).reshape(-1, 2, 2)
+    inverse: FloatArray = turned / (a * d - b * b)[:, None, None]
+    return inverse
 
 
 def _scaled(graph: Graph, scales: FloatArray) -> Problem:
@@ -210,21 +218,14 @@ def _weighed(problem: Problem, state: State, sightings: Sightings) -> Problem:
 def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Sightings) -> FloatArray:
     """(M,) robust weights of readings about the place that their sighting alone gives the tag, poses held."""
     n, of = len(sightings), sightings.of_reading
+    order = np.argsort(of, kind="stable")
+    begins = np.cumsum(sightings.n_readings) - sightings.n_readings
+    squares = np.einsum("mki,mkj->mij", by_tag, by_tag).reshape(-1, 4)
+    rows = np.concatenate([squares, np.einsum("mki,mk->mi", by_tag, residual)], axis=1)[order]
     weights = np.ones(len(residual))
-    for _ in range(_WEIGHINGS):
-        square, pull = np.zeros((n, 2, 2)), np.zeros((n, 2))
-        np.add.at(square, of, weights[:, None, None] * np.einsum("mki,mkj->mij", by_tag, by_tag))
-        np.add.at(pull, of, weights[:, None] * np.einsum("mki,mk->mi", by_tag, residual))
-        off = -np.linalg.solve(square, pull[..., None])[..., 0]
+    for _ in range(_WEIGHINGS if n else 0):
+        sums = np.add.reduceat(weights[order, None] * rows, begins)
+        off = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
         left = residual + np.einsum("mki,mi->mk", by_tag, off[of])
         _, weights = losses_and_weights(DEFAULT_LOSSES.readings, left)
     return weights
-
-
-def _without_tags(columns: Columns, held: BoolArray) -> Columns:
-    """With some of the tags (T,) held, and the rest numbered anew."""
-    kept = np.zeros(columns.n, dtype=np.bool_)
-    for each in (columns.poses, columns.tags[~held], columns.calibration):
-        kept[each[each >= 0]] = True
-    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-    return Columns(number[columns.poses], number[columns.tags], number[columns.calibration], int(kept.sum()))

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calib.arrays import IntArray
 from offline.run import TagKey
 from offline.suspects_evidence import Evidence
-from offline.suspects_search import Places
+from offline.suspects_places import Places
 from offline.suspects_sightings import Sightings
 
 MOVED: Final = "moved"
@@ -83,8 +83,7 @@ def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case
     label = np.full(len(sightings), -1, dtype=np.int64)
     label[evidence.which] = places.place
     found = []
-    for number, tag in enumerate(sightings.ids):
-        own = sightings.in_time[sightings.id[sightings.in_time] == number]
+    for tag, own in zip(sightings.ids, sightings.of_ids(), strict=True):
         labels = list(dict.fromkeys(label[own].tolist()))
         if len(labels) < 2:
             continue
@@ -123,8 +122,8 @@ def swapped_pairs(found: Sequence[Case], evidence: Evidence, places: Places) -> 
 def wrong_runs(found: Sequence[Case], sightings: Sightings) -> dict[int, list[int]]:
     """Chains that have most of their shared tags elsewhere than all others have them, and the cases of these."""
     shared: dict[int, int] = {}
-    for number in range(len(sightings.ids)):
-        seen_by = np.unique(sightings.chain[sightings.id == number]).tolist()
+    for own in sightings.of_ids():
+        seen_by = np.unique(sightings.chain[own]).tolist()
         for c in seen_by if len(seen_by) > 1 else []:
             shared[c] = shared.get(c, 0) + 1
     alone: dict[int, list[int]] = {}

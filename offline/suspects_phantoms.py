@@ -25,6 +25,7 @@ _NEAR_RANGE: Final = 0.25
 _NEAR_BEARING_RAD: Final = np.radians(10.0)
 # Keyframes before and after the sighting.
 _WINDOW: Final = 100
+_AT_ONCE: Final = 500
 _WORST_SHARE: Final = 0.01
 # Fewer sightings say too little of how often a tag is read.
 _LEAST_CONFIRMED: Final = 20
@@ -40,25 +41,49 @@ class Views:
 
 def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
     """Counts near views, in runs that tell when pictures were taken that showed nothing."""
-    readings = graph.problem.readings
-    places = readings.places_in_map(state)
-    read, near = np.zeros(len(sightings), dtype=np.int64), np.zeros(len(sightings), dtype=np.int64)
-    order = np.argsort(sightings.of_reading, kind="stable")
-    parts = np.split(order, np.cumsum(sightings.n_readings)[:-1]) if len(sightings) else []
-    for s, own in enumerate(parts):
-        chain = int(sightings.chain[s])
-        if not len(graph.chains[chain].run.picture_stamps_ns):
-            continue
-        first = int(graph.first_pose[chain])
-        poses = readings.pose[own]
-        begin = max(first, int(poses.min()) - _WINDOW)
-        end = min(first + len(graph.chains[chain].stamps_ns), int(poses.max()) + _WINDOW + 1)
-        views = _view(state.poses[begin:end], readings.mount[own[0]], places[own].mean(axis=0))
-        at = views[poses - begin]
-        alike = np.abs(views[:, None, 0] / np.maximum(at[:, 0], 1e-6) - 1.0) < _NEAR_RANGE
-        alike &= np.abs(se2.wrap_angle(views[:, None, 1] - at[:, 1])) < _NEAR_BEARING_RAD
-        read[s], near[s] = len(np.unique(poses)), int(alike.any(axis=1).sum())
-    return Views(read, near)
+    n = len(sightings)
+    views = Views(np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64))
+    tells = np.array([len(chain.run.picture_stamps_ns) > 0 for chain in graph.chains], dtype=np.bool_)
+    counted = np.flatnonzero(tells[sightings.chain])
+    for begin in range(0, len(counted), _AT_ONCE):
+        some = counted[begin : begin + _AT_ONCE]
+        views.read[some], views.near[some] = _counted(graph, state, sightings, some)
+    return views
+
+
+def _counted(graph: Graph, state: State, sightings: Sightings, which: IntArray) -> tuple[IntArray, IntArray]:
+    """From how many poses tags were read in some sightings (s,), and how many poses have a near view (s,)."""
+    readings, n = graph.problem.readings, len(which)
+    number = np.full(len(sightings), -1, dtype=np.int64)
+    number[which] = np.arange(n)
+    own = np.flatnonzero(number[sightings.of_reading] >= 0)
+    own = own[np.lexsort((readings.pose[own], number[sightings.of_reading[own]]))]
+    of = number[sightings.of_reading[own]]  # rising
+    pose, n_readings = readings.pose[own], np.bincount(of, minlength=n)
+    begins = np.cumsum(n_readings) - n_readings
+    place = np.add.reduceat(readings.places_in_map(state)[own], begins) / n_readings[:, None]
+    again = np.append(False, (np.diff(pose) == 0) & (np.diff(of) == 0))
+    # Poses before and after the sighting, in the same run.
+    chain = sightings.chain[which]
+    ends = graph.first_pose[chain] + np.array([len(each.stamps_ns) for each in graph.chains])[chain]
+    first = np.maximum(graph.first_pose[chain], pose[begins] - _WINDOW)
+    n_around = np.minimum(ends, pose[begins + n_readings - 1] + _WINDOW + 1) - first
+    around, of_around = _ranges(first, n_around)
+    mount = readings.mount[own[begins]]
+    seen, at = (_view(state.poses[p], mount[s], place[s]) for p, s in ((around, of_around), (pose, of)))
+    near = np.zeros(n, dtype=np.int64)
+    views = np.split(seen, np.cumsum(n_around)[:-1]), np.split(at, np.cumsum(n_readings)[:-1])
+    for i, (here, there) in enumerate(zip(*views, strict=True)):
+        alike = np.abs(here[:, :1] / np.maximum(there[:, 0], 1e-6) - 1.0) < _NEAR_RANGE
+        alike &= here[:, 1:] @ there[:, 1:].T > np.cos(_NEAR_BEARING_RAD)
+        near[i] = np.count_nonzero(alike.any(axis=1))
+    return np.bincount(of[~again], minlength=n), near
+
+
+def _ranges(first: IntArray, length: IntArray) -> tuple[IntArray, IntArray]:
+    """Numbers from each first (n,) on, so many, one range after the other; and the range that each is of."""
+    of = np.repeat(np.arange(len(first)), length)
+    return np.arange(len(of)) - np.repeat(np.cumsum(length) - length, length) + first[of], of
 
 
 def chances(sightings: Sightings, place: IntArray, views: Views) -> FloatArray:
@@ -83,6 +108,7 @@ def chances(sightings: Sightings, place: IntArray, views: Views) -> FloatArray:
 
 
 def _view(poses: FloatArray, mount: FloatArray, place_m: FloatArray) -> FloatArray:
-    """(K, 2) range and bearing of a place about a sensor."""
+    """(K, 3) range of places (K, 2) about sensors (K, 3) of poses (K, 3), and the direction."""
     seen = se2.apply(se2.inverse(se2.compose(poses, mount)), place_m)
-    return np.stack([np.hypot(seen[:, 0], seen[:, 1]), np.arctan2(seen[:, 1], seen[:, 0])], axis=-1)
+    range_m = np.hypot(seen[:, 0], seen[:, 1])
+    return np.column_stack([range_m, seen / np.maximum(range_m, 1e-12)[:, None]])

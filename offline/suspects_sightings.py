@@ -7,6 +7,7 @@ alone would hold them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
@@ -48,12 +49,24 @@ class Sightings:
         """How many there are."""
         return len(self.id)
 
-    @property
+    @cached_property
     def in_time(self) -> IntArray:
         """(S,) their order by id, then by the beginning of the chain, then by time."""
         begin_ns = np.full(int(self.chain.max(initial=-1)) + 1, np.iinfo(np.int64).max)
         np.minimum.at(begin_ns, self.chain, self.first_ns)
         return np.lexsort((self.first_ns, self.chain, begin_ns[self.chain], self.id))
+
+    @cached_property
+    def rank(self) -> IntArray:
+        """(S,) of each in that order."""
+        rank = np.empty(len(self), dtype=np.int64)
+        rank[self.in_time] = np.arange(len(self))
+        return rank
+
+    def of_ids(self) -> list[IntArray]:
+        """Those of each id, in order of time."""
+        ends = np.cumsum(np.bincount(self.id, minlength=len(self.ids)))
+        return np.split(self.in_time, ends[:-1]) if len(ends) else []
 
     def one_after_the_other(self, members: IntArray) -> bool:
         """Whether the runs that these sightings are of were driven at different times, by what all of them sighted."""
@@ -137,13 +150,12 @@ def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[
         only_in: put before the letter, so that no other chain has a tag of that name.
     """
     names: dict[tuple[int, int], str] = {}
+    n_places = np.zeros(len(sightings.ids), dtype=np.int64)
     for s in sightings.in_time.tolist():
         own, at = int(sightings.id[s]), int(place[s])
-        n_before = sum(1 for other, _ in names if other == own)
-        names.setdefault((own, at), only_in + _letters(n_before))
-    n_places = np.zeros(len(sightings.ids), dtype=np.int64)
-    for own, _ in names:
-        n_places[own] += 1
+        if (own, at) not in names:
+            names[own, at] = only_in + _letters(int(n_places[own]))
+            n_places[own] += 1
     return [
         sightings.ids[own]._replace(instance=names[own, at] if n_places[own] > 1 else "")
         for own, at in zip(sightings.id.tolist(), place.tolist(), strict=True)

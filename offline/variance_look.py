@@ -4,17 +4,15 @@ The problem is solved under them from where it was before, and what the estimate
 once.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy import sparse
 from scipy.linalg import hadamard
 from scipy.special import chdtr, chdtri
 
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import Linearised, State, stacked, whitening
+from offline.factors import State, stacked, whitening
 from offline.solver import Problem, Solution, solve
 
 # A residual beyond this is no noise but a fault, and says nothing of the noise; of good ones 0.1 % lie there.
@@ -86,7 +84,6 @@ class Looker:
         self._readings = _Kind(components.readings, components.readings_rest)
         self._n_odometry = problem.odometry.motion.size
         self._signs = _signs(self._n_odometry + problem.readings.value.size)
-        self._pattern = _Pattern(self._linearised(problem, part.start), problem.columns.n)
 
     def look(self, variances: FloatArray, good: Good | None) -> Seen:
         """Solves under variances (K,); `good` are no faults, where that is settled."""
@@ -94,8 +91,9 @@ class Looker:
         problem = self.solution.problem.reweighed(*weights)
         self.solution = solve(problem, self.solution.state, _COST_TOLERANCE, relative_tolerance=_RELATIVE_TOLERANCE)
         state = self.solution.state
-        kinds = self._linearised(problem, state)
-        jacobian, residuals = self._pattern.filled(kinds), (kinds[0].residual, kinds[1].residual)
+        kinds = problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
+        jacobian, _ = stacked(kinds, problem.columns.n)
+        residuals = kinds[0].residual, kinds[1].residual
         good = good or (_no_fault(residuals[0]), _no_fault(residuals[1]))
         shares = (
             self._odometry.shares(weights[0], variances, residuals[0], good[0]),
@@ -115,31 +113,6 @@ class Looker:
             _positive(2.0 * (force @ force.T - inner[:, _N_SIGNS:].T @ solved[:, _N_SIGNS:])),
             good,
         )
-
-    @staticmethod
-    def _linearised(problem: Problem, state: State) -> tuple[Linearised, Linearised]:
-        return problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
-
-
-class _Pattern:
-    """Where the numbers of a Jacobian stand, which is the same at each look."""
-
-    def __init__(self, kinds: Sequence[Linearised], n_columns: int) -> None:
-        numbered, n = [], 1
-        for kind in kinds:
-            blocks = []
-            for columns, derivative in kind.blocks:
-                blocks.append((columns, np.arange(n, n + derivative.size, dtype=np.float64).reshape(derivative.shape)))
-                n += derivative.size
-            numbered.append(kind._replace(blocks=tuple(blocks)))
-        self._jacobian, _ = stacked(tuple(numbered), n_columns)
-        self._from = self._jacobian.data.astype(np.int64) - 1
-
-    def filled(self, kinds: Sequence[Linearised]) -> sparse.csr_array:
-        """The Jacobian (m, n) of the same factors elsewhere."""
-        values = np.concatenate([derivative.reshape(-1) for kind in kinds for _, derivative in kind.blocks])
-        pattern = self._jacobian
-        return sparse.csr_array((values[self._from], pattern.indices, pattern.indptr), shape=pattern.shape)
 
 
 class _Shares(NamedTuple):

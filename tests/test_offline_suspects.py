@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calib.arrays import FloatArray
+from offline import arrowhead_covariance
 from offline.global_map import solve_global_map
 from offline.graph import build_graph
-from offline.local_map import solve_local_map
+from offline.local_map import LocalMap, solve_local_map
 from offline.map_command import exit_code, summary
 from offline.map_io import read_map, write_map
 from offline.map_json import map_as_json
@@ -22,9 +24,10 @@ from offline.run import Run, TagKey
 from offline.solver import PLAIN_SQUARES, solve
 from offline.stages import Stages
 from offline.suspects import Searched, split_together
-from offline.suspects_evidence import gathered
+from offline.suspects_evidence import gathered, noise_scales
+from offline.suspects_information import rows_of
 from offline.suspects_phantoms import Views, chances
-from offline.suspects_search import gain_of, settled
+from offline.suspects_places import NOWHERE, gain_of, settled
 from offline.suspects_sightings import Sightings, instances, sightings_of, with_instances
 from tests.made_drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
 from tests.made_moves import made_scene
@@ -120,19 +123,24 @@ def test_a_run_that_has_most_of_its_tags_elsewhere_is_wrong_itself() -> None:
 
 
 @cache
+def local_maps() -> tuple[LocalMap, ...]:
+    return tuple(solve_local_map(drive.chain) for drive in made_scene(31).drives)
+
+
+@cache
 def searched() -> Searched:
-    maps = [solve_local_map(drive.chain) for drive in made_scene(31).drives]
+    maps = local_maps()
     graph, solution = solve_global_map(maps, merge(maps).groups[0], Stages())
     return split_together(graph, solution, maps)
 
 
 @pytest.mark.parametrize("which", [0, 7, 30])
 def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
-    """By one linearisation, without the slack, against a solve of all runs with that sighting's tag apart."""
+    """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
     seen = searched()
     own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
     scales = np.ones((4, 2))
-    bare = gathered(seen.graph, seen.solution.state, seen.sightings, scales, unmodelled_sigma_m=0.0, weighed=False)
+    bare = gathered(seen.graph, seen.solution.state, seen.sightings, scales, unmodelled_sigma_m=1e-4, weighed=False)
     at = int(np.flatnonzero(bare.which == own)[0])
     gain, _ = gain_of(settled(bare, seen.place[bare.which]), np.array([at]))
     joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)
@@ -143,6 +151,44 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     start = apart.start(joined.state.poses, {}, seen.graph.calibration_of(joined.state))
     split = solve(apart.problem, start, losses=PLAIN_SQUARES)
     assert gain == pytest.approx(2.0 * (joined.cost - split.cost), rel=0.02, abs=0.02)
+
+
+def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few tags keep Z with its zeros, fleets without: blocks, sums and what gives way are the same by dense algebra."""
+    seen = searched()
+    information = seen.evidence.information
+    n = len(seen.evidence.score)
+    whole = information.times(np.eye(n))
+    monkeypatch.setattr(arrowhead_covariance, "_FEW", 0)
+    scales = noise_scales([each.goodness for each in local_maps()])
+    apart = gathered(seen.graph, seen.solution.state, seen.sightings, scales).information
+    assert apart.root.below.shape[0] > 0
+    assert information.root.below.shape[0] == 0
+    gather = np.zeros((2 * int(seen.places.place.max()) + 2, n))
+    gather[rows_of(seen.places.place), np.arange(n)] = 1.0
+    across = whole @ gather.T
+    stiffness = whole - across @ np.linalg.inv(gather @ across + NOWHERE * np.eye(len(gather))) @ across.T
+    members = seen.places.held[3].members
+    rows = rows_of(members)
+    for each in (information, apart):
+        parts = each.gathered(seen.places.place, len(gather) // 2)
+        assert_allclose(each.times(np.eye(n)), whole, rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(each.among(rows), whole[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(parts.whole(), gather @ across, rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(parts.across(rows), across[rows], rtol=0.0, atol=1e-6 * whole.max())
+    found = seen.places.stiffness
+    assert_allclose(found.among(members), stiffness[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
+    together = stiffness.reshape(n, -1, 2)[:, members].sum(axis=1)
+    assert_allclose(found.against(members), together, rtol=0.0, atol=1e-6 * whole.max())
+
+
+def test_all_splits_of_a_place_are_weighed_at_once() -> None:
+    places = searched().places
+    held = next(each for each in places.held if len(each.members) > 3)
+    masks = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
+    masks = np.pad(masks, ((0, 0), (0, len(held.members) - 4)))
+    one_by_one = [gain_of(places, held.members[mask > 0.0])[0] for mask in masks]
+    assert_allclose(held.gains(masks), one_by_one, rtol=1e-6)
 
 
 def test_sightings_end_where_a_tag_is_out_of_sight() -> None:

@@ -1,19 +1,19 @@
 """How often tags that were moved, doubled or swapped are named, and how often others are.
 
-    python -m tests.benchmarks.suspects_study [--trials 200] [--kinds clean,moved,...] [--output FOLDER]
+    python -m tests.benchmarks.suspects_study [--trials 200] [--cases clean,moved:0.3,...] [--compare-every 1]
 
-Forty tags, four runs: one to five tags moved between the runs, by 0.1, 0.3 or 1 m; moved while a run passes by; ids
-given twice; pairs swapped; and nothing done. A tag counts as seen if the readings hold it on both sides of the change
-and their covariance, all else as it was, foretells the shift to better than a sixth of it. The map that remains is
-compared with that of the same runs without the tags in question. Exit 1 where a bound is missed.
+Forty tags, four runs, mapped under the noise that is fitted to them: nothing done; one to five tags moved between the
+runs, by 0.1, 0.3 or 1 m; moved while a run passes by; ids given twice; pairs swapped. A tag counts as seen if the
+readings hold it on both sides of the change and their covariance, all else as it was, foretells the shift to better
+than a sixth of it. The map that remains is compared with that of the same runs without the tags in question. All cases
+come in turn, twenty trials each, so that a study broken off says something of all; a row a trial, with what came of its
+case so far. Exit 1 where a bound is missed.
 """
 
 import argparse
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -21,42 +21,33 @@ import numpy as np
 
 from calib import se2
 from calib.arrays import BoolArray, IntArray
+from calib.noise import NoiseParameters
 from offline.alignment import fit_transform
 from offline.global_map import solve_global_map
 from offline.graph import Graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
 from offline.result import SuspectTag
+from offline.run_noise import fit_and_weigh
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import Searched, split_alone, split_together, with_outliers_apart
+from offline.suspects_places import gain_of, settled
 from offline.suspects_report import suspect_tags
-from offline.suspects_search import gain_of, settled
+from tests.benchmarks.suspects_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
 from tests.made_moves import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, made_scene, without
 
 KINDS: Final = (CLEAN, MOVED, MOVING, SWAPPED, DUPLICATED)
-SHIFTS_M: Final = (0.1, 0.3, 1.0)
+Case = tuple[str, float]  # kind and shift in metres, 0 where the kind has none
+CASES: Final[tuple[Case, ...]] = (
+    (CLEAN, 0.0), (MOVED, 0.3), (MOVED, 1.0), (SWAPPED, 0.0), (DUPLICATED, 0.0), (MOVED, 0.1),
+    (MOVING, 0.1), (MOVING, 0.3), (MOVING, 1.0),
+)  # fmt: skip
+IN_TURN: Final = 20  # trials of a case before the next has its turn
 MOST_TAGS: Final = 5
-CLEAR_SIGMAS: Final = 6.0
-NAMED_SHARE: Final = 0.95
 FALSE_A_MAP: Final = 0.1
 FALSE_CLEAN: Final = 0.05
 MAP_FACTOR: Final = 1.1
-SIGMA_BINS: Final = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 25.0, 50.0, np.inf)
-
-
-@dataclass(frozen=True)
-class Told:
-    """One tag that something was done to.
-
-    Attributes:
-        sigmas: by the shift and its foretold covariance; 0 where not seen on both sides.
-        named: as a suspect; right: as of the right kind.
-    """
-
-    sigmas: float
-    named: bool
-    right: bool
 
 
 @dataclass
@@ -89,8 +80,8 @@ class Counts:
 
 
 def mapped(maps: Sequence[LocalMap]) -> Searched | None:
-    """The map and what was found in it; None where the runs do not hang together."""
-    alone = [split_alone(each) for each in maps]
+    """The map under fitted noise and what was found in it; None where the runs do not hang together."""
+    alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
     merged = merge(alone)
     if len(merged.groups) > 1:
         return None
@@ -118,7 +109,7 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
     counts.n_false += len(named.keys() - set(scene.ids))
     if compare and scene.ids:
         chains = [without(drive.chain, scene.ids) for drive in scene.drives]
-        alone = [solve_local_map(chain) for chain in chains]
+        alone = fit_and_weigh([solve_local_map(chain) for chain in chains], NoiseParameters()).maps
         merged = merge(alone)
         if len(merged.groups) == 1:
             counts.squares_m2.append(map_error_m2(scene, searched.graph, searched.solution))
@@ -194,56 +185,58 @@ def map_error_m2(scene: Scene, graph: Graph, solution: Solution) -> float:
     return float((left**2).sum(axis=1).mean())
 
 
-def scenes(kind: str, shift_m: float, n_trials: int, seed: int) -> Iterator[Scene]:
-    """One to five tags each, in turn."""
-    for i in range(n_trials):
-        yield made_scene(seed + i, kind, 0 if kind == CLEAN else 1 + i % MOST_TAGS, shift_m)
+def made_case(case: Case, number: int, seed: int) -> Scene:
+    """The scene of a trial: one to five tags, in turn."""
+    kind, shift_m = case
+    first = seed + 100_000 * KINDS.index(kind) + round(10_000 * shift_m)
+    return made_scene(first + number, kind, 0 if kind == CLEAN else 1 + number % MOST_TAGS, shift_m)
 
 
-def study(kinds: Sequence[str], n_trials: int, seed: int, compare_every: int) -> dict[tuple[str, float], Counts]:
-    """All trials; a row for each kind and shift as it is done."""
-    table: dict[tuple[str, float], Counts] = {}
-    for kind in kinds:
-        for shift_m in SHIFTS_M if kind in (MOVED, MOVING) else (0.0,):
-            first = seed + 100_000 * KINDS.index(kind) + round(10_000 * shift_m)
-            counts = table.setdefault((kind, shift_m), Counts())
-            began_s = time.process_time()
-            for i, scene in enumerate(scenes(kind, shift_m, n_trials, first)):
-                trial(scene, counts, compare=i % compare_every == 0)
-            _tell(f"{row(kind, shift_m, counts)}; {time.process_time() - began_s:.0f} s")
+def study(cases: Sequence[Case], n_trials: int, seed: int, compare_every: int) -> dict[Case, Counts]:
+    """All trials; a row for each, and one for each case at the end."""
+    table = {case: Counts() for case in cases}
+    for begin in range(0, n_trials, IN_TURN):
+        for case, counts in table.items():
+            for number in range(begin, min(begin + IN_TURN, n_trials)):
+                n_told, n_false = len(counts.told), counts.n_false
+                suspects = trial(made_case(case, number, seed), counts, compare=number % compare_every == 0)
+                clear = [each for each in counts.told[n_told:] if each.sigmas > CLEAR_SIGMAS]
+                _tell(
+                    f"{title(case)} {number}: {sum(each.right for each in clear)} of {len(clear)} right, "
+                    f"{counts.n_false - n_false} false ({', '.join(f'{s.tag_id} {s.kind}' for s in suspects)}); so far "
+                    f"{sum(each.right for each in counts.clear)} of {len(counts.clear)}, {counts.n_false} false in "
+                    f"{counts.n_maps} maps, rest {counts.map_factor:.3f}"
+                )
+    for case, counts in table.items():
+        _tell(row(case, counts))
     return table
 
 
-def row(kind: str, shift_m: float, counts: Counts) -> str:
+def title(case: Case) -> str:
     """In words."""
-    what = f"{kind} by {shift_m:g} m" if shift_m else kind
+    kind, shift_m = case
+    return f"{kind} by {shift_m:g} m" if shift_m else kind
+
+
+def row(case: Case, counts: Counts) -> str:
+    """In words."""
+    named = float(np.mean([each.named for each in counts.clear] or [True]))
     return (
-        f"{what}: {counts.n_maps} maps, {len(counts.told)} tags, of {len(counts.clear)} beyond {CLEAR_SIGMAS:g} sigma "
-        f"{counts.right_share:.1%} named right ({np.mean([each.named for each in counts.clear] or [True]):.1%} named); "
+        f"{title(case)}: {counts.n_maps} maps, {len(counts.told)} tags, of {len(counts.clear)} beyond "
+        f"{CLEAR_SIGMAS:g} sigma {counts.right_share:.1%} named right ({named:.1%} named); "
         f"{counts.n_false / max(counts.n_maps, 1):.3f} false names a map; {counts.n_apart} in parts; rest of the map "
         f"{counts.map_factor:.3f} times the error without"
     )
 
 
-def detection_curve(told: Sequence[Told]) -> list[tuple[float, float, int, float, float]]:
-    """Least and most sigmas, how many tags, share named, share named right."""
-    rows = []
-    for low, high in pairwise(SIGMA_BINS):
-        own = [each for each in told if low < each.sigmas <= high]
-        if own:
-            named, right = np.mean([each.named for each in own]), np.mean([each.right for each in own])
-            rows.append((low, high, len(own), float(named), float(right)))
-    return rows
-
-
-def missed_bounds(table: dict[tuple[str, float], Counts]) -> list[str]:
+def missed_bounds(table: dict[Case, Counts]) -> list[str]:
     """A sentence for each."""
     missed = []
-    for (kind, shift_m), counts in table.items():
-        what = f"{kind} by {shift_m:g} m" if shift_m else kind
+    for case, counts in table.items():
+        what = title(case)
         if counts.right_share < NAMED_SHARE:
             missed.append(f"{what}: {counts.right_share:.1%} named right, at least {NAMED_SHARE:.0%} asked")
-        most = FALSE_CLEAN if kind == CLEAN else FALSE_A_MAP
+        most = FALSE_CLEAN if case[0] == CLEAN else FALSE_A_MAP
         if counts.n_false >= most * counts.n_maps and counts.n_false:
             missed.append(
                 f"{what}: {counts.n_false} false names in {counts.n_maps} maps, fewer than {most:g} each asked"
@@ -255,43 +248,26 @@ def missed_bounds(table: dict[tuple[str, float], Counts]) -> list[str]:
     return missed
 
 
-def draw_curve(table: dict[tuple[str, float], Counts], path: Path) -> None:
-    """Share of tags named over how many foretold sigmas they were moved."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    for kind in (MOVED, MOVING, SWAPPED, DUPLICATED):
-        rows = detection_curve([each for (own, _), counts in table.items() if own == kind for each in counts.told])
-        # A bin of a tag or two says nothing.
-        rows = [each for each in rows if each[2] >= 10]
-        at = [np.sqrt(max(low, 0.5) * min(high, 100.0)) for low, high, *_ in rows]
-        if rows:
-            axes.plot(at, [100.0 * each[4] for each in rows], "o-", ms=4, label=kind)
-    axes.axvline(CLEAR_SIGMAS, color="0.6", lw=1)
-    axes.axhline(100.0 * NAMED_SHARE, color="0.6", lw=1)
-    axes.set(xscale="log", xlabel="shift, in sigmas foretold for the split", ylabel="named with the right kind, %")
-    axes.set(ylim=(-3.0, 103.0))
-    axes.set_xticks([1, 2, 3, 6, 10, 30, 100], ["1", "2", "3", "6", "10", "30", "100"])
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=200, help="of each kind and shift [200]")
-    parser.add_argument("--kinds", default=",".join(KINDS), help="[all]")
+    parser.add_argument("--cases", default=",".join(f"{kind}:{shift_m:g}" for kind, shift_m in CASES), help="[all]")
     parser.add_argument("--seed", type=int, default=1, help="the first; one more each trial [1]")
     parser.add_argument("--compare-every", type=int, default=1, help="the map without the tags each so many trials [1]")
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"), help="of the curve's picture")
     given = parser.parse_args(arguments)
-    table = study(given.kinds.split(","), given.trials, given.seed, given.compare_every)
+    wanted = [each.partition(":") for each in given.cases.split(",")]
+    cases = [(kind, float(shift_m or 0.0)) for kind, _, shift_m in wanted]
+    table = study(cases, given.trials, given.seed, given.compare_every)
     told = [each for counts in table.values() for each in counts.told]
     for low, high, n, named, right in detection_curve(told):
         _tell(f"{low:5.0f} to {high:3.0f} sigma: {n:5d} tags, {named:6.1%} named, {right:6.1%} right")
     given.output.mkdir(parents=True, exist_ok=True)
-    draw_curve(table, given.output / "suspects_detection.png")
+    by_kind: dict[str, list[Told]] = {}
+    for (kind, _), counts in table.items():
+        by_kind.setdefault(kind, []).extend(counts.told)
+    draw_curve(by_kind, given.output / "suspects_detection.png")
     missed = missed_bounds(table)
     for sentence in missed:
         _tell(f"missed: {sentence}")
