@@ -1,13 +1,11 @@
 """One run log -> one Run of measurements, or a refusal with reasons."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.arrays import IntArray
 from calib.camera_file import read_camera_yaml
 from calib.camera_model import CameraModel
 from calib.errors import GroundsbotError
@@ -16,6 +14,7 @@ from calib.words import counted
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
 from offline.plausible import check_file_name
+from offline.run_readings import Detections, Positions, RunReadings, TagKey
 from offline.stretches import WheelRow, stretches_of
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
@@ -31,54 +30,7 @@ from onboard.messages import (
     WheelEncoders,
 )
 
-
-class TagKey(NamedTuple):
-    """What a detector can tell of a tag; and which one it is where an id turned out to hang in several places."""
-
-    family: str
-    tag_id: int
-    instance: str = ""
-
-    @property
-    def whole(self) -> "TagKey":
-        """The id alone, whichever instance."""
-        return TagKey(self.family, self.tag_id)
-
-
-@dataclass(frozen=True)
-class Detections:
-    """M tags in pixels.
-
-    Attributes:
-        stamps_ns: (M,) middle of the picture's exposure.
-        tag: (M,) index into `Run.tags`.
-        corners_px: (M, 4, 2) raw pixels, corner order of groundsbot.proto.
-    """
-
-    stamps_ns: IntArray
-    tag: IntArray
-    corners_px: FloatArray
-
-
-@dataclass(frozen=True)
-class Positions:
-    """M imported tag positions in metres.
-
-    Attributes:
-        stamps_ns: (M,)
-        tag: (M,) index into `Run.tags`.
-        value: (M, 2) (x, y) or (range, bearing).
-        polar: (M,) whether it is the latter.
-        covariance: (M, 2, 2) of the value, NaN where the log has none.
-        in_camera: (M,) about the camera's place and yaw (x forward, y left) instead of base.
-    """
-
-    stamps_ns: IntArray
-    tag: IntArray
-    value: FloatArray
-    polar: BoolArray
-    covariance: FloatArray
-    in_camera: BoolArray
+__all__ = ["Detections", "Positions", "RobotFile", "Run", "RunEvent", "TagKey", "load_run", "read_robot_file"]
 
 
 class RunEvent(NamedTuple):
@@ -122,14 +74,6 @@ class Run:
     events: tuple[RunEvent, ...] = ()
 
 
-# Readings with corrected bits are the ones that turn out to be phantoms.
-MAX_HAMMING = 0
-# All that the families we know have together: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
-# kilobytes with a thousand tags took over 400 MiB.
-_MOST_TAGS = 652
-# A reading that was measured takes twelve bytes at least: noise cannot be compressed.
-_FREE_READINGS = 60_000
-_LEAST_BYTES_A_READING = 10
 _MOST_EVENTS = 500  # a recorder gathers what happens often into one event
 
 
@@ -141,14 +85,10 @@ class _Collected:
     calibration: CameraCalibration | None = None
     wheels: list[WheelRow] = field(default_factory=list)
     odometry: list[PlanarOdometry] = field(default_factory=list)
-    pictures: list[int] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
-    sightings: list[tuple[int, TagKey, Sequence[float]]] = field(default_factory=list)
-    observations: list[TagObservations] = field(default_factory=list)
+    readings: RunReadings = field(default_factory=RunReadings)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
-    n_corrected: int = 0
-    n_readings: int = 0
 
     def add(self, entry: LogMessage) -> None:
         """Takes one message of the log."""
@@ -160,8 +100,7 @@ class _Collected:
         elif isinstance(message, PlanarOdometry):
             self.odometry.append(message)
         elif isinstance(message, TagObservations):
-            self.observations.append(message)
-            self.n_readings += len(message.observations)
+            self.readings.add_observations(message)
         elif isinstance(message, RunInfo):
             self.info = self.info or message
         elif isinstance(message, CameraCalibration):
@@ -176,14 +115,7 @@ class _Collected:
         if size != self.picture_size:
             self.n_other_size += 1
             return
-        self.pictures.append(message.stamp_ns)
-        self.n_readings += len(message.detections)
-        for detection in message.detections:
-            if detection.hamming > MAX_HAMMING or len(detection.corners_px) != 8:
-                self.n_corrected += 1
-                continue
-            key = TagKey(detection.family, detection.tag_id)
-            self.sightings.append((message.stamp_ns, key, detection.corners_px))
+        self.readings.add_detections(message)
 
 
 _TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations", "/events")
@@ -220,14 +152,9 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
     log = Path(log)
     collected, losses = _Collected(), LogLosses()
     log_bytes = _size_bytes(log)
-    most = _FREE_READINGS + log_bytes // _LEAST_BYTES_A_READING
     for entry in read_log(log, topics=_TOPICS, losses=losses):
         collected.add(entry)
-        if collected.n_readings > most:
-            raise OfflineError(
-                f"{log}: more than {most} tag readings, the limit for a log of {log_bytes} bytes: a tag that was "
-                "measured takes more room; was this file made for a test? leave out some of the looks"
-            )
+        collected.readings.check(log, log_bytes)
     info = collected.info
     if info is None:
         found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
@@ -238,7 +165,13 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
-    tags, detections, positions = _tag_readings(collected, log)
+    collected.readings.check_tags(log)
+    read = collected.readings.gathered(log_bytes)
+    if read.every > 1:
+        warnings.append(
+            f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
+            f"{read.every} is used"
+        )
     camera = _camera(collected, given.camera if given else None, log)
     if collected.n_other_size:
         pictures = counted(collected.n_other_size, "picture")
@@ -253,10 +186,10 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
         robot=robot,
         camera=camera,
         stretches=tuple(stretches),
-        picture_stamps_ns=np.unique(np.array(collected.pictures, dtype=np.int64)) - late_ns,
-        tags=tags,
-        detections=replace(detections, stamps_ns=detections.stamps_ns - late_ns),
-        positions=positions,
+        picture_stamps_ns=read.pictures_ns - late_ns,
+        tags=read.tags,
+        detections=replace(read.detections, stamps_ns=read.detections.stamps_ns - late_ns),
+        positions=read.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,
         lost=losses.in_words,
@@ -270,45 +203,6 @@ def _size_bytes(log: Path) -> int:
     return sum(path.stat().st_size for path in files if path.is_file())
 
 
-def _tag_readings(collected: _Collected, log: Path) -> tuple[tuple[TagKey, ...], Detections, Positions]:
-    keys = {key for _, key, _ in collected.sightings}
-    keys |= {TagKey(o.family, o.tag_id) for message in collected.observations for o in message.observations}
-    if len(keys) > _MOST_TAGS:
-        raise OfflineError(
-            f"{log}: {len(keys)} different tags, limit {_MOST_TAGS} (as many as all families have); "
-            "are their numbers right?"
-        )
-    tags = tuple(sorted(keys))
-    index = {key: i for i, key in enumerate(tags)}
-    n = len(collected.sightings)
-    detections = Detections(
-        stamps_ns=np.fromiter((s[0] for s in collected.sightings), np.int64, n),
-        tag=np.fromiter((index[s[1]] for s in collected.sightings), np.int64, n),
-        corners_px=np.array([s[2] for s in collected.sightings], dtype=np.float64).reshape(n, 4, 2),
-    )
-    return tags, detections, _positions(collected.observations, index)
-
-
-def _positions(messages: list[TagObservations], index: dict[TagKey, int]) -> Positions:
-    rows = [(message.stamp_ns, message.frame, o) for message in messages for o in message.observations]
-    n = len(rows)
-    value, covariance = np.empty((n, 2)), np.full((n, 2, 2), np.nan)
-    polar = np.zeros(n, dtype=np.bool_)
-    for i, (_, _, o) in enumerate(rows):
-        polar[i] = o.WhichOneof("position") == "polar"
-        value[i] = (o.polar.range_m, o.polar.bearing_rad) if polar[i] else (o.cartesian.x_m, o.cartesian.y_m)
-        if len(o.covariance) == 4:
-            covariance[i] = np.reshape(list(o.covariance), (2, 2))
-    return Positions(
-        stamps_ns=np.fromiter((row[0] for row in rows), np.int64, n),
-        tag=np.fromiter((index[TagKey(row[2].family, row[2].tag_id)] for row in rows), np.int64, n),
-        value=value,
-        polar=polar,
-        covariance=covariance,
-        in_camera=np.fromiter((row[1] == "camera_planar" for row in rows), np.bool_, n),
-    )
-
-
 def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:
     """The given calibration, or the log's; None where there are no pictures to need one."""
     calibration, size = collected.calibration, collected.picture_size
@@ -318,7 +212,7 @@ def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> Came
             camera, source = camera_from_message(calibration), "/camera/calibration"
         except GroundsbotError as error:
             raise OfflineError(f"{log}: {error}") from error
-    if camera is None and collected.sightings:
+    if camera is None and collected.readings.in_pixels:
         raise OfflineError(
             f"{log}: tags were detected but /camera/calibration has 0 messages; "
             "give the robot's file with --robot, with its `camera` set"

@@ -13,7 +13,8 @@ from offline.graph import build_graph
 from offline.local_map import solve_local_map
 from offline.run import load_run
 from offline.solver import MAX_STEPS
-from tests.hostile_logs import observed, resets
+from tests.hostile_logs import MS, observed, resets
+from tests.made_logs import START_NS
 from tests.made_long_drives import made_long_drive, made_town
 
 # As few as noise can be packed into.
@@ -58,18 +59,46 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
 ) -> None:
     log = written(observed(4000, 10), tmp_path)
     assert len(load_run(log).positions.tag) == 8000
-    monkeypatch.setattr("offline.run._FREE_READINGS", 0)
+    monkeypatch.setattr("offline.run_readings._FREE_READINGS", 0)
     most = log.stat().st_size // 10
     assert most < 8000
     assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
 
 
+def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("offline.run_readings._FREE_TO_USE", 0)
+    log = written(observed(2000, 10), tmp_path)
+    size = log.stat().st_size
+    every = -(-4000 // (size // 32))
+    assert every > 1
+    run = load_run(log)
+    used_ns = [START_NS + index * 100 * MS for index in range(0, 2000, every)]
+    assert run.positions.stamps_ns.tolist() == [each for each in used_ns for _ in range(2)]
+    assert len(run.stretches[0].stamps_ns) == 2000
+    (warning,) = [each for each in run.warnings if "look" in each]
+    assert (
+        warning == f"gb1_r: 4000 tag readings are more than a log of {size} bytes is worth; one look in {every} is used"
+    )
+
+
+def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("offline.run_readings._FREE_TO_USE", 0)
+    run = load_run(written(resets(1, 3, 500), tmp_path))
+    assert 0 < len(run.picture_stamps_ns) < 500
+    assert len(run.detections.tag) == 3 * len(run.picture_stamps_ns)
+    assert set(run.detections.stamps_ns) == set(run.picture_stamps_ns)
+
+
 def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
-    (chain,) = chains_of(load_run(written(observed(300, 600, 100), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(written(observed(100, 650, 100), tmp_path)), NoiseParameters())
     with pytest.raises(OfflineError) as refused:
         solve_local_map(chain)
     (line,) = str(refused.value).splitlines()
-    for words in ("made.mcap: gb1_r: 30000 readings of 600 tags from 300 keyframes", "limit 1.0e9", "leave out some"):
+    for words in ("made.mcap: gb1_r: 10000 readings of 650 tags from 100 keyframes", "limit 1.0e9", "leave out some"):
         assert words in line
 
 
