@@ -38,7 +38,7 @@ _MOST_STEPS_A_PIECE: Final = 20
 # Of the effort that a log is worth.
 _BUILDING_SHARE: Final = 0.5
 _WINDOWS_SHARE: Final = 0.2
-_SOLVING_SHARE: Final = 0.2
+_SOLVING_SHARE: Final = 0.1  # in steps; where they lead nowhere each is tried some four times
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class _BuiltUp(NamedTuple):
 def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
-    Where the result does not fit together, other starts are tried, as long as there is effort left; the first that fits
+    Where the result does not fit together, other starts are tried, as long as there is effort for building up; the first that fits
     counts, else the one of least cost, whose `goodness` then says that it does not fit.
 
     Args:
@@ -106,7 +106,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
             best = LocalMap(chain, graph, solution, check.judge(solution))
             if best.goodness.fits:
                 break
-        if effort.left < 0.0:
+        if effort.left < _BUILDING_SHARE * effort.allowed:
             break
         known = _built_up(_redrawn(_as_shown(coarse, best.goodness), rng), effort)
     if best is None:
