@@ -78,8 +78,8 @@ class _BuiltUp(NamedTuple):
 def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
-    Where the result does not fit together, other starts are tried, as long as there is effort for building up; the first that fits
-    counts, else the one of least cost, whose `goodness` then says that it does not fit.
+    Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
+    first that fits counts, else the one of least cost, whose `goodness` then says that it does not fit.
 
     Args:
         chain: what was measured.
