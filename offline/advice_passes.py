@@ -20,6 +20,8 @@ _MOST_LENGTH_M: Final = 50.0
 # The advice must not take longer than the map: so many candidates, and so many keyframes of all of them together.
 MOST_PASSES: Final = 40
 _MOST_KEYFRAMES: Final = 20_000
+# Some seconds of cubes of twice the tags that each of them passes.
+_MOST_WORK: Final = 2e9
 # What a pass tells costs the cube of the tags that it passes.
 _MOST_SIGHTINGS: Final = 60
 # A tag read again after so much way was passed again.
@@ -94,7 +96,25 @@ def passes_of(ways: list[FloatArray], sightings: list[Sighting], most: int = MOS
                 found.append(Pass(c, begin.first, end.last, begin.tag, end.tag))
     n_keyframes = sum(each.last - each.first + 1 for each in found)
     most = min(most, max(1, len(found) * _MOST_KEYFRAMES // max(n_keyframes, 1)))
-    return found if len(found) <= most else [found[i] for i in np.linspace(0, len(found) - 1, most).round().astype(int)]
+    found = _evenly(found, most)
+    work = sum((2.0 * len(_passed(each, sightings))) ** 3 for each in found)
+    return _evenly(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
+
+
+def _evenly(passes: list[Pass], most: int) -> list[Pass]:
+    """So many of them at most."""
+    if len(passes) <= most:
+        return passes
+    return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
+
+
+def _passed(wanted: Pass, sightings: list[Sighting]) -> set[int]:
+    """The tags seen on the way."""
+    return {
+        each.tag
+        for each in sightings
+        if each.chain == wanted.chain and each.first <= wanted.last and each.last >= wanted.first
+    }
 
 
 def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> Gain:
