@@ -163,6 +163,9 @@ def verdict(result: Calibration, board: Board) -> list[str]:
     off = f"predictions are {estimate.expected_error_px:.3f} px off (RMS over the picture)"
     lines = [f"{model.distortion_model}: {off}; corners were found to {estimate.corner_sigma_px:.3f} px"]
     _, expected = error_map(result)
+    enough = bool(np.nanmax(expected) < _POOR_ERROR_PX)
+    if enough:
+        lines.append(f"that is good: nowhere {_POOR_ERROR_PX:g} px, and corners of tags err by 0.04 to 0.1 px")
     if np.nanmax(expected) > max(_POOR_ERROR_PX, 3.0 * float(np.nanmedian(expected))):
         row, column = np.unravel_index(int(np.nanargmax(expected)), expected.shape)
         place = place_in_picture(int(row), int(column), expected.shape)
@@ -170,7 +173,8 @@ def verdict(result: Calibration, board: Board) -> list[str]:
     size_px = model.width_px, model.height_px
     used = (view for view, kept in zip(result.views, result.lens.views, strict=True) if kept)
     boards = (seen_board(view.corners.ids, view.corners.pixels, board, size_px) for view in used)
-    lines += Spread(each for each in boards if each is not None).missing()
+    missing = Spread(each for each in boards if each is not None).missing()
+    lines += [f"to make it surer still, {each}" for each in missing] if enough else missing
     sigma = np.hypot(estimate.sigmas[0] / model.fx_px, estimate.sigmas[1] / model.fy_px)
     unequal = model.fx_px / model.fy_px - 1.0
     if abs(unequal) > max(_UNEQUAL_FOCALS, 4.0 * sigma):

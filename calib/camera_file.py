@@ -5,7 +5,7 @@ file, under `groundsbot_estimate`.
 """
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
 import yaml
@@ -18,6 +18,8 @@ from calib.errors import CalibError
 from calib.files import written_whole
 from calib.kalibr import camera_from_kalibr, is_kalibr
 from calib.yaml_file import parse_mapping, read_text, validated
+
+_ROUNDED_UP: Final = 1.001  # by whoever wrote the file
 
 
 class _Matrix(BaseModel):
@@ -51,6 +53,11 @@ class CameraEstimate(BaseModel):
         n = len(self.parameters)
         if len(self.sigmas) != n or len(self.covariance) != n * n:
             raise ValueError(f"sigmas and covariance must have {n} and {n * n} numbers for {n} parameters")
+        largest, diagonal = np.outer(self.sigmas, self.sigmas), np.diag(self.matrix())
+        if (np.abs(self.matrix()) > _ROUNDED_UP * largest).any() or (_ROUNDED_UP * diagonal < np.diag(largest)).any():
+            raise ValueError(
+                "covariance must have the sigmas' squares on its diagonal, and nothing beyond two sigmas' product"
+            )
         return self
 
     def matrix(self) -> FloatArray:

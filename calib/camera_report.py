@@ -31,8 +31,8 @@ def report_html(result: Calibration, sentences: Sequence[str]) -> str:
     name = html.escape(result.model.name)
     said = "".join(f"<li>{html.escape(line)}</li>" for line in sentences)
     return (
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Camera {name}</title>"
-        f"<style>{_STYLE}</style></head><body><h1>Camera {name}</h1><ul>{said}</ul><div class='pair'>"
+        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Calibration of {name}</title>"
+        f"<style>{_STYLE}</style></head><body><h1>Calibration of {name}</h1><ul>{said}</ul><div class='pair'>"
         f"{_map_figure(result)}{_views_figure(result)}</div>{_parameters_table(result)}{_views_table(result)}"
         "</body></html>\n"
     )
@@ -90,9 +90,10 @@ def _parameters_table(result: Calibration) -> str:
         for name, value, sigma in zip(estimate.parameters, values, estimate.sigmas, strict=True)
     )
     scores = ", ".join(f"{kind} {np.sqrt(0.5 * score):.2g} px" for kind, score in result.scores.items())
-    tried = f"<p>RMS in views left out of the fit: {scores}.</p>" if len(result.scores) > 1 else ""
+    tried = f"<p>The simplest that predicts well what it was not fitted to. RMS in views left out: {scores}.</p>"
     return (
-        f"<h2>{result.model.distortion_model}, {result.model.width_px}x{result.model.height_px}</h2>{tried}"
+        f"<h2>{result.model.distortion_model}, {result.model.width_px}x{result.model.height_px}</h2>"
+        f"{tried if len(result.scores) > 1 else ''}"
         f"<table><tr><th>parameter</th><th>value</th><th>sigma</th></tr>{rows}</table>"
     )
 
@@ -100,8 +101,8 @@ def _parameters_table(result: Calibration) -> str:
 def _views_table(result: Calibration) -> str:
     rows = "".join(_view_rows(result))
     return (
-        "<h2>Views</h2><table><tr><th>view</th><th>corners</th><th>used</th><th>residual px</th><th>blur px</th>"
-        f"<th class='words'>residual, or why it was not used</th></tr>{rows}</table>"
+        "<h2>Views</h2><table><tr><th>view</th><th>corners</th><th>of these used</th><th>residual px</th>"
+        f"<th>blur px</th><th class='words'>residual, or why it was not used</th></tr>{rows}</table>"
     )
 
 

@@ -197,7 +197,7 @@ class _Patches:
         reflected = a + b * edges[0] * edges[1]
         away = (self._places[of] - self._around.pixels[of, None]) / self._around.radius_px
         falling = self._seen[of] * (1.0 + np.einsum("npi,ni->np", away, p[:, _SLOPE]))
-        jacobian *= falling[..., None]
+        jacobian[..., : _SLOPE.start] *= falling[..., None]
         jacobian[..., _SLOPE] = (self._seen[of] * reflected)[..., None] * away
         return falling * reflected - self._seen[of] * self._light[of], jacobian
 

@@ -64,7 +64,8 @@ def test_a_camera_file_a_page_and_sentences_come_of_good_pictures(good: Good) ->
     assert estimate is not None
     assert rms_px(difference_px(WIDE, model, PictureGrid.of(WIDE))) < 3.0 * estimate.expected_error_px < 0.1
     assert "010.png: left out, too blurred" in good.said
-    assert "take the board farther away" in good.said
+    assert "that is good: nowhere 0.1 px" in good.said
+    assert "to make it surer still, take the board farther away" in good.said
     page = good.camera.with_suffix(".html").read_text()
     assert "http" not in page.replace("https://www.w3.org", "")
     assert "010.png" in page

@@ -314,3 +314,17 @@ def test_what_a_calibration_says_of_its_errors_stands_in_the_file(tmp_path: Path
     np.testing.assert_array_equal(estimate.matrix(), [[0.01, 0.005], [0.005, 0.04]])
     write_camera_yaml(UNDISTORTED, path)
     assert read_estimate(path) is None
+
+
+@pytest.mark.parametrize(
+    "covariance", ["[0.01, 0.03, 0.03, 0.04]", "[-0.01, 0.0, 0.0, 0.04]", "[0.02, 0.0, 0.0, 0.04]"]
+)
+def test_errors_that_cannot_be_are_refused(covariance: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    estimate = (
+        "groundsbot_estimate: {n_views: 30, n_corners: 1200, corner_sigma_px: 0.01, expected_error_px: 0.02, "
+        f"parameters: [fx_px, fy_px], sigmas: [0.1, 0.2], covariance: {covariance}}}\n"
+    )
+    path.write_text(estimate)
+    with pytest.raises(CalibError, match=r"camera.yaml: .*covariance must have the sigmas' squares on its diagonal"):
+        read_estimate(path)
