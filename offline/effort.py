@@ -31,6 +31,10 @@ _BYTES_A_KEYFRAME: Final = 3300.0
 _BYTES_A_READING: Final = 2900.0
 _FREE_BYTES: Final = 64 << 20
 _BYTES_PER_BYTE: Final = 160.0
+# Stretches are laid over each other by the joint covariances of their tags. One stretch may see all tags that there
+# are; that others see them again takes a recorder some 26 readings of 200 bytes for each.
+_FREE_PLACES: Final = 652
+_BYTES_A_PLACE: Final = 5200
 
 
 @dataclass
@@ -42,18 +46,25 @@ class Effort:
         left: what was not yet used.
         memory_bytes: that a map of it may take.
         promised: work of one step over all problems that were found to be affordable.
+        places: how many tags all stretches may see, each counted anew in each.
     """
 
     allowed: float
     left: float
     memory_bytes: float
     promised: float = 0.0
+    places: float = np.inf
 
     @staticmethod
     def of_log(log_bytes: int) -> "Effort":
         """What a log of this size is worth."""
         allowed = _FREE_WORK + _WORK_AT_A_MIB * (log_bytes / 2**20) ** 2
-        return Effort(allowed, allowed, _FREE_BYTES + _BYTES_PER_BYTE * log_bytes)
+        return Effort(
+            allowed,
+            allowed,
+            _FREE_BYTES + _BYTES_PER_BYTE * log_bytes,
+            places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
+        )
 
     def suffices(self, problem: Problem) -> bool:
         """Whether some solves of a problem can be paid for."""
@@ -66,6 +77,12 @@ class Effort:
             OfflineError: naming log and chain, what a step would take, the limit and the way out.
         """
         self.promised += step_work(problem)
+        self.places -= len(problem.columns.tags)
+        if self.places < 0.0:
+            raise OfflineError(
+                f"{log}: {name}: the run's stretches see more tags than a log of this size can tell of; "
+                "are the tags' numbers right? leave out some of the looks"
+            )
         if self.promised <= self.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
             return
         work, mib = self.promised / 1e9, memory_bytes_of(problem) / 2**20

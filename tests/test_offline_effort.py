@@ -102,6 +102,16 @@ def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_pat
         assert words in line
 
 
+def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
+    run = load_run(written(resets(3, 400, size_bytes=1_010_000), tmp_path))
+    effort = Effort.of_log(run.log_bytes)
+    first, second, third = chains_of(run, NoiseParameters())
+    for chain in (first, second):
+        effort.check(build_graph([chain]).problem, run.log, chain.name)
+    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's stretches see more tags"):
+        effort.check(build_graph([third]).problem, run.log, third.name)
+
+
 def test_stretches_share_what_their_log_is_worth() -> None:
     chain = made_long_drive(4, 100.0).chain
     work = step_work(build_graph([chain]).problem)
