@@ -52,6 +52,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.benchmarks.fleet
 	$(BIN)/python -m tests.benchmarks.solver_bench
 	$(BIN)/python -m tests.benchmarks.solver_scaling
+	$(BIN)/python -m tests.benchmarks.stages_bench
 
 # Writes requirements.lock anew: exact versions and hashes for every platform.
 lock: $(READY)

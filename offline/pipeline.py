@@ -238,7 +238,8 @@ class _Found:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
             )
-        self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
+        with stages.stage("checking that it fits"):
+            self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
         return Solved(members, graph, solution, last.state.poses)
 
 

@@ -23,6 +23,7 @@ ALL = [
     "solving all runs together",
     "covariances",
     "advice",
+    "checking that it fits",
     "writing files",
     "drawing the picture",
     "writing the report",
