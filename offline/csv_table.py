@@ -1,6 +1,7 @@
 """CSV files as typed columns; every complaint names file, line, column, value and the way out."""
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -52,9 +53,17 @@ class CsvTable:
             values.append(value)
         return values
 
-    def positive_numbers(self, column: str) -> list[float]:
-        """The cells of a column as finite numbers above zero."""
+    def numbers_below(self, column: str, limit: float) -> list[float]:
+        """The cells of a column as numbers of a size below a limit."""
         values = self.numbers(column)
+        for row, value in enumerate(values):
+            if not abs(value) < limit:
+                self.fail(row, column, f"must be below {limit:g}; correct it, or leave the row out")
+        return values
+
+    def positive_numbers(self, column: str, limit: float = math.inf) -> list[float]:
+        """The cells of a column as finite numbers above zero and below a limit."""
+        values = self.numbers_below(column, limit)
         for row, value in enumerate(values):
             if value <= 0.0:
                 self.fail(row, column, "must be above 0; correct it, or leave the row out")
@@ -138,7 +147,7 @@ def read_table(path: Path, headerless_columns: tuple[str, ...] | None = None) ->
 
 def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
     """Line number and stripped cells of every row that is not blank."""
-    reader = csv.reader(text.splitlines(), strict=True)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows = []
     try:
         for cells in reader:

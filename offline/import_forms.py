@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from offline.csv_table import CsvTable, read_table
 from offline.errors import OfflineError
+from offline.observations import MAX_RANGE_M
 
 MAX_WHEEL_SPEED_M_S: Final = 20.0  # beyond it the unit is wrong, a counter was reset, or a time is
 _NS_PER_S: Final = 1_000_000_000
@@ -19,6 +20,7 @@ _TIMES: Final = ("t_s", "t_ns")
 _ODOMETRY: Final = (("left_m_s", "right_m_s"), ("left_ticks", "right_ticks"), ("v_m_s", "omega_rad_s"))
 _POSITIONS: Final = (("x_m", "y_m"), ("range_m", "bearing_rad"))
 _SIGMAS: Final = (("sigma_x_m", "sigma_y_m"), ("sigma_range_m", "sigma_bearing_rad"))
+_MAX_SIGMA: Final = MAX_RANGE_M  # a map leaves out a position that is known no better than to where it might be at all
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def read_observations(path: Path, max_tag_id: int) -> list[Observation]:
     sigma_columns = _SIGMAS[1] if polar else _SIGMAS[0]
     if sigma_columns[0] in table:
         sigmas: list[tuple[float, float] | None] = list(
-            zip(table.positive_numbers(sigma_columns[0]), table.positive_numbers(sigma_columns[1]), strict=True)
+            zip(*(table.positive_numbers(column, _MAX_SIGMA) for column in sigma_columns), strict=True)
         )
     else:
         sigmas = [None] * len(table)

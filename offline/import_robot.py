@@ -20,6 +20,8 @@ UNKNOWN_MOUNT_SIGMA_YAW_DEG: Final = 2.0
 _NOMINAL_RADIUS_M: Final = 0.1
 _NOMINAL_TICKS_PER_TURN: Final = 1000
 _NOMINAL_TRACK_M: Final = 0.5  # where odometry holds poses, nothing but the look of robot.yaml depends on it
+# Fewer states a second tell no path, more no robot has; and stamps are whole nanoseconds that 63 bits hold.
+_STATE_RATES_HZ: Final = (0.1, 1000.0)
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -42,6 +44,11 @@ class ImportOptions:
     def __post_init__(self) -> None:
         for option in ("track_width_m", "state_rate_hz", "wheel_radius_m", "ticks_per_turn"):
             self._check_number(option, positive=True)
+        least_hz, most_hz = _STATE_RATES_HZ
+        if self.state_rate_hz is not None and not least_hz <= self.state_rate_hz <= most_hz:
+            raise OfflineError(
+                f"--state-rate-hz is {self.state_rate_hz}, must be {least_hz:g} to {most_hz:g} states a second"
+            )
         for option in ("camera_x_m", "camera_y_m", "camera_yaw_deg"):
             self._check_number(option, positive=False)
         for option in ("run_id", "robot_id"):

@@ -43,7 +43,7 @@ class ImportReport:
 
 
 def check_output(output: Path, run_folder: Path) -> None:
-    """`output` may hold other runs, nothing else.
+    """`output` may hold other runs and what is hidden, nothing else.
 
     Raises:
         OfflineError: it does, or holds this run already.
@@ -55,6 +55,8 @@ def check_output(output: Path, run_folder: Path) -> None:
     if not output.exists():
         return
     for entry in sorted(output.iterdir()):
+        if entry.name.startswith("."):  # of another import under way, or of a desktop
+            continue
         if not (entry.is_dir() and any(entry.rglob("*.mcap"))):
             raise OfflineError(f"{output}: is not empty: {entry.name} is no run's log; give a new or empty folder")
 

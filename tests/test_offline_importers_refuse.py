@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import GroundsbotError
+from offline.csv_table import read_table
 from offline.import_robot import ImportOptions
 from offline.importers import import_folder
 from onboard.log_writer import LogWriter
@@ -45,6 +46,15 @@ def test_bad_odometry_is_refused_and_nothing_is_left(tmp_path: Path, text: str, 
     assert not (tmp_path / "logs").exists()
 
 
+def test_lines_end_where_csv_ends_them(tmp_path: Path) -> None:
+    """Not at what else Unicode takes for the end of one, nor within quotes; lines are counted as editors do."""
+    path = tmp_path / "table.csv"
+    path.write_bytes('name,x\r\n"a\u2028b",1\r\n"c\x0b\x1cd",2\r\n"e\nf",3\r\n'.encode())
+    table = read_table(path)
+    assert table.text("name") == ["a\u2028b", "c\x0b\x1cd", "e\nf"]
+    assert table.lines == [2, 3, 5]
+
+
 BAD_OBSERVATIONS = [
     ("", "observations.csv: is empty"),
     ("t_s,x_m,y_m\n0,1,1\n", "column 'tag_id' is missing"),
@@ -52,6 +62,7 @@ BAD_OBSERVATIONS = [
     ("t_s,tag_id,x_m,y_m,sigma_x_m\n0,1,1,1,1\n", "column 'sigma_y_m' is missing beside 'sigma_x_m'"),
     ("t_s,tag_id,x_m,y_m,sigma_range_m\n0,1,1,1,1\n", "'sigma_range_m' does not go with x_m,y_m"),
     ("t_s,tag_id,x_m,y_m,sigma_x_m,sigma_y_m\n0,1,1,1,0,1\n", "column sigma_x_m: '0' must be above 0"),
+    ("t_s,tag_id,x_m,y_m,sigma_x_m,sigma_y_m\n0,1,1,1,1e200,1\n", "sigma_x_m: '1e200' must be below 1000"),
     ("t_s,tag_id,x_m,y_m\n0,-1,1,1\n", "column tag_id: '-1' is outside 0 to 586"),
     ("t_s,tag_id,x_m,y_m\n0,587,1,1\n", "column tag_id: '587' is outside 0 to 586"),
     ("t_s,tag_id,x_m,y_m\n0,1.5,1,1\n", "column tag_id: '1.5' is not a whole number"),
@@ -120,6 +131,19 @@ def test_what_is_missing_is_said(tmp_path: Path, files: dict[str, str], options:
 def test_options_must_be_sane(value: float) -> None:
     with pytest.raises(GroundsbotError, match=r"--track-width-m is .*, must be above 0"):
         ImportOptions(track_width_m=value)
+
+
+@pytest.mark.parametrize("rate_hz", [1e12, 1e-300, 1e-9])
+def test_states_come_as_often_as_a_robot_has_them(rate_hz: float) -> None:
+    with pytest.raises(GroundsbotError, match=r"--state-rate-hz is .*, must be 0\.1 to 1000 states a second"):
+        ImportOptions(state_rate_hz=rate_hz)
+
+
+def test_what_is_hidden_in_the_output_is_no_hindrance(tmp_path: Path) -> None:
+    """Another import may be under way, and some desktops leave files of their own."""
+    (tmp_path / "logs" / ".monday.77.partial").mkdir(parents=True)
+    (tmp_path / "logs" / ".DS_Store").touch()
+    assert imported(tmp_path).run_folder.is_dir()
 
 
 def test_an_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
