@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from itertools import pairwise
-from math import hypot
+from math import hypot, isfinite
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -29,7 +29,8 @@ _NS_PER_S: Final = 1_000_000_000
 _EARLIEST_NS: Final = 946_684_800 * _NS_PER_S  # 2000-01-01: no log is older
 _GAP_S: Final = 0.5  # wheel readings missing for longer leave the motion unknown
 _GAP_INTERVALS: Final = 5  # and in a slow log, as long as this many usual intervals
-_STREAMS: Final = ("/wheels", "/odometry", "/tags/detections", "/camera/image")
+_WHEELS: Final = ("/wheels", "/odometry")
+_STREAMS: Final = (*_WHEELS, "/tags/detections", "/camera/image")
 _GAPS_SHOWN: Final = 5
 _PLACES_TOLD: Final = 20
 
@@ -62,7 +63,7 @@ class LogInfo:
     software_version: str
     start_utc: str | None  # the first measurement, to the second; None where the log's clock tells no date
     duration_s: float
-    distance_m: float | None  # by the wheels; None where the log has none
+    distance_m: float | None  # by the wheels; None where the log has none, or such as are no numbers
     n_wheel_restarts: int
     n_wheel_lines_lost: int  # by their sequence numbers
     n_pictures: int | None  # None: an imported log
@@ -100,6 +101,8 @@ class LogInfo:
         return f"{self.duration_s:.1f} s" if self.start_utc is None else f"{self.start_utc}, {self.duration_s:.1f} s"
 
     def _distance(self) -> str:
+        if self.distance_m is None and any(each.topic in _WHEELS for each in self.topics):
+            return "wheel readings that are no numbers, so no map can use it"
         if self.distance_m is None:
             return "no wheel readings, so no map can use it"
         return f"{self.distance_m:.2f} m driven"
@@ -148,6 +151,7 @@ def describe_log(log: Path) -> LogInfo:
     stamps = [stamp for stamps in collected.stamps_ns.values() for stamp in stamps]
     first_ns = min(stamps, default=0)
     topics = sorted(collected.counts, key=list(TOPICS).index)
+    distance_m = _distance_m(collected, wheels)
     return LogInfo(
         log=log,
         run_id=run.run_id,
@@ -155,7 +159,7 @@ def describe_log(log: Path) -> LogInfo:
         software_version=run.software_version,
         start_utc=_utc(first_ns),
         duration_s=(max(stamps, default=0) - first_ns) / _NS_PER_S,
-        distance_m=_distance_m(collected, wheels),
+        distance_m=distance_m if distance_m is not None and isfinite(distance_m) else None,
         n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
         n_wheel_lines_lost=_missing(collected.wheel_lines),
         n_pictures=collected.counts.get("/tags/detections"),

@@ -64,11 +64,16 @@ def read_truth(path: Path) -> Truth:
         runs = {name: _true_run(path, name, entry) for name, entry in data["runs"].items()}
         names = [(tag["family"], int(tag["tag_id"]), tag.get("instance") or "") for tag in data["tags"]]
         places = [np.array(tag["position_m"][:2], dtype=np.float64) for tag in data["tags"]]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise OfflineError(
-            f"{path}: lacks or misspells a key ({error!r}); it holds runs{{name: {{poses}}}} and "
-            "tags[{family, tag_id, position_m}]"
+            f"{path}: lacks or misspells a key, or a number is out of range ({error!r}); it holds "
+            "runs{name: {poses}} and tags[{family, tag_id, position_m}]"
         ) from error
+    for (_, tag_id, _), place in zip(names, places, strict=True):
+        if place.shape != (2,) or not np.isfinite(place).all():
+            raise OfflineError(
+                f"{path}: position_m of tag {tag_id} is {place.tolist()}, must be two finite numbers; correct it"
+            )
     twice = frozenset(name for name in names if names.count(name) > 1)
     return Truth(runs, dict(zip(names, places, strict=True)), twice)
 

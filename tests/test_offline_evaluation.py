@@ -195,6 +195,13 @@ def test_truth_json_is_read_without_losing_nanoseconds(tmp_path: Path) -> None:
         ('{"runs": {"a": {"poses": [[1, 2, 3]]}}, "tags": []}', "runs.a.poses must hold rows"),
         ('{"runs": {"a": {"poses": [[2, 0, 0, 0], [1, 0, 0, 0]]}}, "tags": []}', "times that do not rise"),
         ('{"runs": {"a": {"poses": [[2, NaN, 0, 0]]}}, "tags": []}', "not finite"),
+        ('{"runs": {"a": {"poses": [[1%s, 0, 0, 0]]}}, "tags": []}' % ("0" * 30), "lacks or misspells a key"),
+        ('{"runs": {}, "tags": [{"family": "a", "tag_id": Infinity, "position_m": [0, 0]}]}', "lacks or misspells"),
+        ('{"runs": {}, "tags": [{"family": "a", "tag_id": 3, "position_m": [0]}]}', "tag 3 is [0.0], must be two"),
+        (
+            '{"runs": {}, "tags": [{"family": "a", "tag_id": 3, "position_m": [NaN, 0]}]}',
+            "tag 3 is [nan, 0.0], must",
+        ),
     ],
 )
 def test_a_bad_truth_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:

@@ -114,6 +114,16 @@ def test_an_odometry_of_poses_has_a_distance(tmp_path: Path) -> None:
     assert describe_log(tmp_path / "poses").distance_m == pytest.approx(6)
 
 
+def test_a_log_whose_wheels_are_no_numbers_is_described_too(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "spoilt", head(), 0, durable=False) as writer:
+        for k, left_m in enumerate([0.0, float("nan"), 1.0]):
+            distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=0.5)
+            writer.write("/odometry", PlanarOdometry(stamp_ns=k, wheels=distances), k * MS, k * MS)
+    info = describe_log(tmp_path / "spoilt")
+    assert json.loads(json.dumps(info.as_json(), allow_nan=False))["distance_m"] is None
+    assert any("wheel readings that are no numbers, so no map can use it" in line for line in info.lines())
+
+
 def test_a_log_of_nothing_is_described_too(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "nothing", head(), 0, durable=False):
         pass
