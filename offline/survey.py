@@ -27,6 +27,8 @@ DEFAULT_SIGMA_M: Final = 0.02
 # An entry of a good survey is named once in a thousand surveys.
 _FALSE_ALARM: Final = 1e-3
 _MAX_STEPS: Final = 20
+_MAX_PLACE_M: Final = 1e8  # no place on the earth is farther from the origin of any grid
+_MAX_SIGMA_M: Final = 1000.0  # as far as a tag is ever read from
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,9 @@ def read_survey(path: Path) -> list[SurveyEntry]:
     if missing:
         raise OfflineError(f"{path}: has no column {', '.join(missing)}; a survey has tag_id,x_m,y_m and maybe sigma_m")
     n = len(table)
-    ids, x_m, y_m = table.integers("tag_id", minimum=0), table.numbers("x_m"), table.numbers("y_m")
-    sigmas = table.positive_numbers("sigma_m") if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
+    ids = table.integers("tag_id", minimum=0)
+    x_m, y_m = (table.numbers_below(column, _MAX_PLACE_M) for column in ("x_m", "y_m"))
+    sigmas = table.positive_numbers("sigma_m", _MAX_SIGMA_M) if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
     families = table.text("family") if "family" in table else [""] * n
     instances = table.text("instance") if "instance" in table else [""] * n
     entries = [
@@ -76,13 +79,15 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
     """Compares every component that shares three entries or more.
 
     Raises:
-        OfflineError: no component does.
+        OfflineError: no component does, two entries mean one tag, or their places tell no direction.
     """
     components, found = [], set()
     for component in result.components:
         matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry)]
         found |= {k for _, k in matched}
+        _check_different(component, [i for i, _ in matched])
         if len(matched) >= 3:
+            _check_extent(component, [entries[k] for _, k in matched])
             components.append(_judge(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
     if not components:
         raise OfflineError(
@@ -102,6 +107,29 @@ def _tags_of(component: Component, entry: SurveyEntry) -> list[int]:
         if tag.tag_id == entry.tag_id and tag.instance == entry.instance and entry.family in ("", tag.family)
     ]
     return fits if len(fits) == 1 else []
+
+
+def _check_different(component: Component, tags: Sequence[int]) -> None:
+    """Refuses a tag that two entries mean: once with its family, say, and once without."""
+    for i in tags:
+        if tags.count(i) > 1:
+            tag = component.tags[i]
+            raise OfflineError(
+                f"the survey has tag {tag.tag_id}{tag.instance} of {tag.family} twice, once without its family; leave "
+                "one row out, or say the family of both"
+            )
+
+
+def _check_extent(component: Component, entries: Sequence[SurveyEntry]) -> None:
+    """Refuses entries so close together that their turn about their middle is known no better than to a radian."""
+    places_m = np.array([entry.position_m for entry in entries])
+    weight = np.array([entry.sigma_m for entry in entries]) ** -2.0
+    from_middle_m = places_m - weight @ places_m / weight.sum()
+    if weight @ (from_middle_m**2).sum(axis=1) <= 1.0:
+        raise OfflineError(
+            f"the survey has the tags of {component.frame_run}'s component all in one place (within sigma_m), which "
+            "tells no direction; measure tags farther apart"
+        )
 
 
 @dataclass(frozen=True)
@@ -134,15 +162,20 @@ def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> 
         placed = se2.apply(T_map_survey, survey_m)
         jacobian = _by_transform(placed)
         normal = jacobian.T @ information @ jacobian
-        step = np.linalg.solve(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
+        step = _solved(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
         T_map_survey = se2.compose(np.array([0.0, 0.0, step[2]]), T_map_survey) + np.array([step[0], step[1], 0.0])
         if np.abs(step).max() < 1e-12:
             break
     placed = se2.apply(T_map_survey, survey_m)
     jacobian = _by_transform(placed)
     weighted = information @ jacobian
-    reliability: FloatArray = information - weighted @ np.linalg.solve(jacobian.T @ weighted, weighted.T)
+    reliability: FloatArray = information - weighted @ _solved(jacobian.T @ weighted, weighted.T)
     return _Adjusted(T_map_survey, (map_m - placed).reshape(-1), reliability)
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Of all solutions the shortest: where the entries that are left lie in one place, any turn will do."""
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
 
 def _by_transform(placed_m: FloatArray) -> FloatArray:

@@ -112,11 +112,38 @@ def test_two_shared_tags_are_too_few() -> None:
         judge_survey(result, survey[:2])
 
 
+def test_a_tag_with_and_without_its_family_is_no_third_tag() -> None:
+    result, survey = _map_and_survey(5)
+    again = replace(survey[1], family="tag36h11")
+    with pytest.raises(OfflineError, match="has tag 1 of tag36h11 twice, once without its family"):
+        judge_survey(result, [*survey[:2], again])
+
+
+def test_entries_in_one_place_tell_no_direction() -> None:
+    result, survey = _map_and_survey(6)
+    piled = [replace(entry, position_m=np.zeros(2)) for entry in survey]
+    with pytest.raises(OfflineError, match="all in one place"):
+        judge_survey(result, piled)
+
+
+def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
+    """The odd one is left out, and the others tell no direction then."""
+    result, survey = _map_and_survey(6)
+    (component,) = result.components
+    board = tuple(replace(tag, position_m=np.zeros(2)) for tag in component.tags[:3])
+    result = made_map(replace(component, tags=(*board, *component.tags[3:])))
+    piled = [replace(entry, position_m=np.zeros(2)) for entry in survey[:3]]
+    (judged,) = judge_survey(result, [*piled, replace(survey[14], position_m=np.array([1e3, 0.0]))]).components
+    assert [entry.tag.tag_id for entry in judged.odd] == [14]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("tag_id,x_m\n1,2\n", "has no column y_m"),
         ("tag_id,x_m,y_m\n1,2,3\n1,4,5\n", "line 3, column tag_id: '1' is there twice"),
+        ("tag_id,x_m,y_m\n1,2,1e200\n", "line 2, column y_m: '1e200' must be below 1e"),
+        ("tag_id,x_m,y_m,sigma_m\n1,2,3,1e200\n", "line 2, column sigma_m: '1e200' must be below 1000"),
         ("tag_id,x_m,y_m\n1,2,nan\n", "line 2, column y_m: 'nan' is not finite"),
         ("tag_id,x_m,y_m,sigma_m\n1,2,3,0\n", "column sigma_m: '0' must be above 0"),
         ("", "is empty"),
