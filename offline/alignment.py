@@ -7,7 +7,7 @@ sure if nothing else explains the tags almost as well.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import lgamma, log, pi
+from math import log, pi
 from typing import Final
 
 import numpy as np
@@ -15,17 +15,13 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray
+from offline.alignment_rivals import MARGIN_NATS, Rivalry
 from offline.alignment_search import Explanation, explanations, settled, without
-from offline.condensed import CondensedMap, quarter_turned
-from offline.joint_fit import FALSE_ALARM, REACH_M, Held, JointFit, hold
+from offline.condensed import CondensedMap
+from offline.joint_fit import FALSE_ALARM, REACH_M, JointFit
 from offline.measured import Placement
 from offline.run import TagKey
 
-# Sure is what explains the tags a hundred times better than anything else, chance included.
-MARGIN_NATS: Final = log(100.0)
-# Tags that moved together fit together, whichever of two groups they are: no likelihood tells which one stayed. The
-# larger one did if it has this many times the tags of the other.
-GROUP_MARGIN: Final = 2.0
 # Other choices of tags count down to this much less evidence than the best has, up to so many tags fewer, and of each
 # number so many.
 _DOUBT_NATS: Final = 2.0 * MARGIN_NATS
@@ -94,55 +90,6 @@ def align(a: CondensedMap, b: CondensedMap, placement: Placement | None = None) 
     return _Judge(a, b, shared, placement).verdict()
 
 
-class Rivalry:
-    """Which explanations of some shared tags leave it open which of them is true."""
-
-    def __init__(self, n_shared: int) -> None:
-        """Of so many."""
-        self.n_shared = n_shared
-
-    def evidence(self, explanation: Explanation) -> float:
-        """Log of the likelihood of the shared tags over that of all being wrong."""
-        return evidence_nats(explanation.held, self.n_shared)
-
-    def is_rival(self, evidence: float, other: Explanation, best_evidence: float, best: Explanation) -> bool:
-        """Whether another explanation leaves it open that the best is true."""
-        if evidence > best_evidence - MARGIN_NATS and not self.is_same_place(other, best):
-            return True
-        own, best_own = other.members & ~best.members, best.members & ~other.members
-        if (own & ~best.fits).sum() < 2 or (moved := self._as_group(own, other)) <= 0.0:
-            return False
-        # A group that rather moved as one than each tag on its own, so it may as well be what stayed. What fits the
-        # group may be of it.
-        n_group = (other.fits & ~best.members).sum()
-        if best.n < GROUP_MARGIN * n_group:
-            return True
-        # The same where tags that fit both stayed too: these tell which.
-        best_moved = max(self._as_group(best_own, best), 0.0)
-        tells_little = evidence + best_moved > best_evidence + moved - MARGIN_NATS
-        return bool(best_own.sum() < GROUP_MARGIN * n_group and tells_little)
-
-    def _as_group(self, tags: BoolArray, explanation: Explanation) -> float:
-        """Evidence that these of its tags fit together."""
-        if tags.sum() < 2:
-            return 0.0
-        return self.evidence(Explanation(tags, explanation.linear, hold(explanation.linear, tags)))
-
-    def is_same_place(self, one: Explanation, other: Explanation) -> bool:
-        """Whether chance explains how far apart they put the other map."""
-        off = se2.log(se2.between(one.T_a_b, other.T_a_b))
-        covariance = self.covariance(one) + self.covariance(other)
-        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
-
-    def covariance(self, explanation: Explanation) -> FloatArray:
-        """(3, 3) of the right tangent of T_a_b."""
-        by_motion = np.eye(3)
-        by_motion[:2, 2] = -quarter_turned(explanation.linear.centre)
-        by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
-        covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
-        return covariance
-
-
 class _Judge(Rivalry):
     """Weighs what the shared tags of two maps say."""
 
@@ -163,11 +110,12 @@ class _Judge(Rivalry):
             self.placement = None  # a slip of the tape or of the pen: it tells none of them from the others
         found = self._united(explained)
         evidence, best = found[0]
+        groups = [each for _, each in found]
         each_once = {each.members.tobytes(): (its, each) for its, each in found + self._doubted(evidence, best)}
         found = sorted(each_once.values(), key=lambda f: -f[0])
         rivals: list[Explanation] = []
-        for its, each in found:
-            if self.is_rival(its, each, evidence, best) and not any(self.is_same_place(each, r) for r in rivals):
+        for each in self.rivals(best, found, groups):
+            if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
         told = tuple(self._told(rival, found, (), is_sure=False) for rival in rivals)
         beats_chance = best.n == len(self.shared) or evidence > MARGIN_NATS
@@ -240,19 +188,20 @@ class _Judge(Rivalry):
         covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
         return se2.log(se2.between(placement.T_a_b, explanation.T_a_b)), covariance
 
-    def _mixed_covariance(self, explanation: Explanation, found: Sequence[tuple[float, Explanation]]) -> FloatArray:
+    def _covering_covariance(self, explanation: Explanation, found: Sequence[tuple[float, Explanation]]) -> FloatArray:
         """(3, 3) of the right tangent of T_a_b, with the doubt of which tags fit.
 
-        A mixture of what other choices of tags make of the same place, each by its evidence; second moments about this
-        one.
+        True whichever choice of tags is that puts the map in the same place, of those that are not a hundred times less
+        likely, tags that it leaves out as a group included; second moments about this one.
         """
         near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
-        evidence = np.array([its for its, _ in near])
-        weight = np.exp(evidence - evidence.max())
-        off = np.array([se2.log(se2.between(explanation.T_a_b, each.T_a_b)) for _, each in near])
-        each = np.array([self.covariance(each) for _, each in near]) + off[:, :, None] * off[:, None, :]
-        mixed: FloatArray = np.tensordot(weight / weight.sum(), each, 1)
-        return mixed
+        worth = [its + self.of_group(each, [explanation]) for its, each in near]
+        covering = self.covariance(explanation)
+        for its, (_, each) in zip(worth, near, strict=True):
+            if its > max(worth) - MARGIN_NATS:
+                off = se2.log(se2.between(explanation.T_a_b, each.T_a_b))
+                covering = covariance_union(covering, self.covariance(each) + np.outer(off, off))
+        return covering
 
     def _told(
         self,
@@ -267,7 +216,7 @@ class _Judge(Rivalry):
         apart = self.fit.places_a[inlier] - se2.apply(explanation.T_a_b, self.fit.places_b[inlier])
         return Alignment(
             T_a_b=explanation.T_a_b,
-            covariance=self._mixed_covariance(explanation, found),
+            covariance=self._covering_covariance(explanation, found),
             shared=self.shared,
             inlier=inlier,
             off_m=np.where(inlier, 0.0, np.linalg.norm(off_m, axis=1)),
@@ -280,19 +229,17 @@ class _Judge(Rivalry):
         )
 
 
-def evidence_nats(held: Held, n: int) -> float:
-    """Log of the likelihood of n shared tags, of which some fit, over that of all being wrong.
+def covariance_union(one: FloatArray, other: FloatArray) -> FloatArray:
+    """The least covariance (n, n) that is no less than either, in axes in which both are diagonal.
 
-    A wrong tag is anywhere in reach, and so is map b where no tag fits, its heading anything; how many tags fit may be
-    any number, and which of them any choice.
+    Uhlmann, "Covariance consistency methods for fault-tolerant distributed data fusion" (2003).
     """
-    k = len(held.rows) // 2
-    log_likelihood = -0.5 * (held.rise + held.log_determinant + 2 * k * log(2.0 * pi))
-    # Over all transforms, each as likely as any other.
-    log_likelihood += 0.5 * (3.0 * log(2.0 * pi) - float(np.linalg.slogdet(held.information)[1]))
-    log_likelihood -= log(2.0 * pi * _AREA_M2)
-    log_choices = lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)
-    return log_likelihood + k * log(_AREA_M2) - log_choices
+    root = np.linalg.cholesky(one)
+    back = np.linalg.inv(root)
+    times, axes = np.linalg.eigh(back @ other @ back.T)
+    axes = root @ axes
+    union: FloatArray = (axes * np.maximum(times, 1.0)) @ axes.T
+    return union
 
 
 def fit_transform(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ Andersson and Nygards, "C-SAM: Multi-robot SLAM using square root information sm
 "DDF-SAM" (2010), condense local maps too, in map axes.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,15 +92,16 @@ class AnchorTree:
     def places(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, 2) tags in the frame of the start, and (n, 3) anchors."""
         n = len(self.step)
-        moved = se2.compose(self.step, se2.exp(xi[: 3 * n].reshape(n, 3)))
-        anchors = np.empty((n + 1, 3))
-        anchors[-1] = self.root
-        for node in self.order:
-            x, y, theta = anchors[self.parent[node]]
-            cos, sin = np.cos(theta), np.sin(theta)
+        moved = se2.compose(self.step, se2.exp(xi[: 3 * n].reshape(n, 3))).tolist()
+        parent = self.parent.tolist()
+        along = [*moved, self.root.tolist()]  # overwritten in order; plain numbers, as arrays of three cost more
+        for node in self.order.tolist():
+            x, y, theta = along[parent[node]]
+            cos, sin = math.cos(theta), math.sin(theta)
             dx, dy, turn = moved[node]
-            anchors[node] = x + cos * dx - sin * dy, y + sin * dx + cos * dy, theta + turn
-        return se2.apply(anchors[:n], self.tag_m + xi[3 * n :].reshape(n, 2)), anchors[:n]
+            along[node] = x + cos * dx - sin * dy, y + sin * dx + cos * dy, theta + turn
+        anchors = np.array(along[:n])
+        return se2.apply(anchors, self.tag_m + xi[3 * n :].reshape(n, 2)), anchors
 
     def jacobian(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, 2) tags in the frame of the start, and their derivatives (2 n, 5 n) by xi."""

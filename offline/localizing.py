@@ -13,7 +13,7 @@ import numpy as np
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from calib.words import counted
-from offline.alignment import MARGIN_NATS
+from offline.alignment_rivals import MARGIN_NATS
 from offline.chain import chains_of
 from offline.errors import OfflineError
 from offline.held_run import HeldRun, solve_held

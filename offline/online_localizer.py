@@ -15,7 +15,7 @@ from scipy.special import chdtri
 
 from calib.arrays import FloatArray, IntArray
 from calib.robot import Robot
-from offline.alignment import GROUP_MARGIN
+from offline.alignment_rivals import GROUP_MARGIN
 from offline.errors import OfflineError
 from offline.factors import ReadingFactors, whitening
 from offline.graph import (

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray, IntArray
-from offline.alignment import MARGIN_NATS, Rivalry
+from offline.alignment_rivals import MARGIN_NATS, Rivalry
 from offline.alignment_search import Explanation, distances, is_same_distance, through
 from offline.condensed import quarter_turned
 from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold, ill_fitting
@@ -97,7 +97,7 @@ class StartSearch:
         rivalry = Rivalry(n)
         found = sorted(((rivalry.evidence(each), each) for each in self._found), key=lambda f: -f[0])
         evidence, best = found[0]
-        if any(rivalry.is_rival(its, other, evidence, best) for its, other in found[1:]):
+        if rivalry.rivals(best, found, [each for _, each in found]):
             self.reason = "ambiguous, because two groups of tags put the start in different places"
             return None
         fitting = {self._pairs[i][0] for i in np.flatnonzero(best.members)}

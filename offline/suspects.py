@@ -6,6 +6,7 @@ all runs of a component together, begun with those tags apart that alignments fo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -32,6 +33,9 @@ from offline.suspects_sightings import (
 # Each search is linearised where the last one led; two do where a move is far beyond its sigma.
 _MOST_SEARCHES: Final = 5
 _LOOSER: Final = 1e3
+# Two tags have one id now and then, three hardly: then other ways to join its sightings are tried, so many at most.
+_MANY_PLACES: Final = 3
+_MOST_JOINS: Final = 12
 
 
 @dataclass(frozen=True)
@@ -98,9 +102,9 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
         factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
         sightings = _sightings(found.graph, found.solution.state, factors)
         if len(sightings) > len(sightings.ids):
-            found = _settled_alone(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
+            found = _in_few_places(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
-    return _settled_alone(found, noise_scales([found.goodness]), false_alarm)
+    return _in_few_places(found, noise_scales([found.goodness]), false_alarm)
 
 
 def joined(local_map: LocalMap) -> LocalMap:
@@ -110,6 +114,44 @@ def joined(local_map: LocalMap) -> LocalMap:
     sightings = sightings_of([local_map.chain])
     ids = [sightings.ids[i] for i in sightings.id]
     return solve_local_map(with_instances([local_map.chain], sightings, ids)[0])
+
+
+def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
+    """Splits and joins until nothing changes; where an id comes out in many places, also from other joins.
+
+    Two tags with one id that are passed again after a long way are both off by what is not known of the way. One may
+    come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
+    """
+    found = _settled_alone(local_map, scales, false_alarm)
+    for tag in [each for each in {key.whole: 0 for key in found.chain.tags} if _n_places(found, each) >= _MANY_PLACES]:
+        seen = _looked_at(local_map.graph, local_map.solution, scales)
+        for place in _joins(seen, tag)[:_MOST_JOINS]:
+            other = _settled_alone(_relabelled(local_map, seen.sightings, place), scales, false_alarm)
+            if other.goodness.fits >= found.goodness.fits and _n_places(other, tag) < _n_places(found, tag):
+                found = other
+            if _n_places(found, tag) < _MANY_PLACES:
+                break
+    return found
+
+
+def _joins(seen: Searched, tag: TagKey) -> list[IntArray]:
+    """(S,) each: the places with two of an id joined, the surest first.
+
+    However far apart they are: what turns by an angle moves on an arc, and a linearisation knows of no arcs.
+    """
+    which, places = seen.evidence.which, seen.places
+    own = np.array([seen.sightings.ids[i] == tag for i in seen.sightings.id[which]], dtype=np.bool_)
+    found = []
+    for p, q in combinations(np.unique(places.place[own]).tolist(), 2):
+        off, covariance = places.apart(seen.evidence, p, q)
+        one, other = (seen.place[which[places.place == label][0]] for label in (p, q))
+        joined = np.where(seen.place == other, one, seen.place)
+        found.append((float(off @ np.linalg.solve(covariance, off)), joined))
+    return [place for _, place in sorted(found, key=lambda each: each[0])]
+
+
+def _n_places(local_map: LocalMap, tag: TagKey) -> int:
+    return sum(key.whole == tag for key in local_map.chain.tags)
 
 
 def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:

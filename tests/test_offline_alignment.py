@@ -11,7 +11,8 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import FloatArray
-from offline.alignment import MARGIN_NATS, Alignment, align, fit_transform
+from offline.alignment import Alignment, align, covariance_union, fit_transform
+from offline.alignment_rivals import MARGIN_NATS
 from offline.condensed import CondensedMap
 from offline.measured import Placement
 from offline.run import TagKey
@@ -168,6 +169,26 @@ def test_a_symmetric_layout_is_ambiguous() -> None:
     assert {tuple(alignment.inlier), tuple(rival.inlier)} == {tuple(stayed), tuple(~stayed)}
 
 
+def test_a_loose_group_is_a_rival_where_the_others_may_have_moved_as_one() -> None:
+    """Five tags known to 5 cm say one thing, and four that are known to 0.4 m another: these alone prove nothing."""
+    near = np.array([[0.0, 0.0], [3.0, 0.5], [1.0, 4.0], [5.0, 3.0], [-2.0, 2.0]])
+    far = np.array([[9.0, -3.0], [12.0, 1.0], [10.0, 5.0], [13.0, -4.0]])
+    moved = np.concatenate([se2.apply([2.0, -3.0, 0.3], near), far])
+
+    def loose(points: FloatArray, name: str) -> CondensedMap:
+        tight = seen(named(points), name)
+        covariance = tight.covariance.copy()
+        covariance[-8:, -8:] = 0.4**2 * np.eye(8)
+        return replace(tight, covariance=covariance)
+
+    alignment = align(loose(moved, "a"), loose(np.concatenate([near, far]), "b"))
+    assert alignment is not None
+    assert not alignment.is_sure
+    (rival,) = alignment.rivals
+    assert alignment.evidence_nats > rival.evidence_nats + MARGIN_NATS
+    assert rival.inlier.tolist() == 5 * [False] + 4 * [True]
+
+
 def test_a_corridor_with_a_pattern_that_repeats_and_ids_put_up_anew_is_ambiguous() -> None:
     """Door posts every 4 m on both sides; every other tag was put up again one pair of doors further."""
     b = np.array([[4.0 * door, side] for door in range(7) for side in (-1.0, 1.0)])
@@ -235,6 +256,18 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
     assert alignment is not None
     assert by_near_end is not None
     assert alignment.evidence_nats > by_near_end.evidence_nats + MARGIN_NATS
+
+
+@given(st.integers(0, 1000))
+def test_a_union_is_no_less_than_either_and_no_more_than_need_be(seed: int) -> None:
+    roots = np.random.default_rng(seed).standard_normal((2, 3, 3))
+    one, other = (root @ root.T + 0.1 * np.eye(3) for root in roots)
+    union = covariance_union(one, other)
+    rounding = 1e-9 * np.trace(union)
+    assert all(np.linalg.eigvalsh(union - each)[0] > -rounding for each in (one, other))
+    # Along each of the common axes it is one or the other.
+    np.testing.assert_allclose((union - one) @ np.linalg.solve(union, union - other), 0.0, atol=rounding)
+    np.testing.assert_allclose(union, covariance_union(other, one), atol=rounding)
 
 
 @given(ANY, st.integers(0, 1000))

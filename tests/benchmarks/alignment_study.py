@@ -25,7 +25,8 @@ from scipy.stats import chi2
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.noise import NoiseParameters
-from offline.alignment import GROUP_MARGIN, Alignment, align
+from offline.alignment import Alignment, align
+from offline.alignment_rivals import GROUP_MARGIN
 from offline.condensed import CondensedMap, condense
 from offline.local_map import solve_local_map
 from offline.run import TagKey
