@@ -1,5 +1,6 @@
 """Files and folders that are there whole or not at all."""
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator
@@ -21,11 +22,16 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def folder_written_whole(folder: Path) -> Iterator[Path]:
+def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yields an empty folder beside `folder`, which takes its place if the block ends well.
 
-    Whatever `folder` held is gone then. If the block fails, everything is as it was before; folders that were missing
-    on the way to it are not left behind either.
+    If the block fails, everything is as it was before; folders that were missing on the way to it are not left behind
+    either.
+
+    Args:
+        folder: missing or empty.
+        replace: it may hold something, which is gone then. Else what came into it meanwhile stays, not what the block
+            wrote.
 
     Raises:
         CalibError: the folder cannot be made or replaced.
@@ -42,7 +48,7 @@ def folder_written_whole(folder: Path) -> Iterator[Path]:
             partial.mkdir(parents=True)
         yield partial
         with _told(folder):
-            if folder.exists():
+            if replace and folder.exists():
                 folder.rename(replaced)
             partial.rename(folder)
     finally:
@@ -60,4 +66,6 @@ def _told(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            raise CalibError(f"{folder}: holds something by now, which stays; name another folder") from error
         raise CalibError(f"{folder}: cannot be written ({error.strerror}); name a folder that you may write") from error

@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calib.yaml_file import parse_mapping, read_text, validated, write_model
 
-Sigma = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+# Wider than anything that drives, and within what sums of squares can hold.
+Sigma = Annotated[float, Field(ge=1e-9, le=1e3)]
 
 
 class NoiseParameters(BaseModel):

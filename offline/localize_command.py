@@ -77,13 +77,13 @@ def localize_log(options: LocalizeOptions) -> Localization:
         check_robots([run], robot_files)
         found = localize(run, known, options.map, noise=noise, component=options.component, stages=Stages(show))
     if options.output is not None:
-        _write(found, options.output)
+        _write(found, options.output, overwrite=options.overwrite)
     return found
 
 
-def _write(found: Localization, output: Path) -> None:
+def _write(found: Localization, output: Path, *, overwrite: bool) -> None:
     try:
-        with folder_written_whole(output) as folder:
+        with folder_written_whole(output, replace=overwrite) as folder:
             text = json.dumps(as_json(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
             with written_whole(folder / JSON_FILE) as partial:
                 partial.write_text(text, encoding="utf-8")

@@ -75,7 +75,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             workings=workings,
             extending=extending,
         )
-        with folder_written_whole(options.output) as folder:
+        with folder_written_whole(options.output, replace=options.overwrite) as folder:
             _write_files(result, workings, folder, options.output, stages)
     return result, stages.costs
 

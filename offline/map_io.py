@@ -4,10 +4,12 @@ docs/formats.md describes every key and column.
 """
 
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -46,6 +48,19 @@ from offline.trajectory_file import read_tum, write_tum
 JSON_FILE: Final = "map.json"
 ARRAYS_FILE: Final = "map.npz"
 TAGS_FILE: Final = "tags.csv"
+# What reading a damaged map.json or map.npz raises.
+_DAMAGE: Final = (
+    AttributeError,
+    BadZipFile,
+    CalibError,
+    EOFError,
+    IndexError,
+    KeyError,
+    OverflowError,
+    TypeError,
+    ValueError,
+    zlib.error,
+)
 
 
 def write_map(result: MapResult, folder: Path) -> None:
@@ -80,6 +95,8 @@ def read_map(folder: Path) -> MapResult:
         )
     try:
         with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+            if not data["components"]:
+                raise ValueError("no components")
             components = tuple(_component(data, index, arrays, folder) for index in range(len(data["components"])))
             kept = _kept(arrays)
         return MapResult(
@@ -99,7 +116,7 @@ def read_map(folder: Path) -> MapResult:
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
-    except (KeyError, IndexError, TypeError, ValueError, CalibError) as error:
+    except _DAMAGE as error:
         raise OfflineError(
             f"{folder}: the map's files are damaged or incomplete ({error}); make the map again"
         ) from error
@@ -152,6 +169,8 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     if joint.shape != (3 * len(runs) + 2 * len(tags),) * 2:
         raise ValueError(f"{key}joint_covariance has the shape {joint.shape}")
     names = {run.name for run in runs}
+    if entry["frame_run"] not in names:
+        raise ValueError(f"component {index}: frame_run {entry['frame_run']!r} is none of its runs")
     return Component(
         frame_run=entry["frame_run"],
         runs=runs,

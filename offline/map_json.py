@@ -51,11 +51,11 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
             for pair in component.start_to_start
         ],
         "noise": result.noise.model_dump(),
-        "noise_fit": None if result.noise_fit is None else asdict(result.noise_fit),
-        "calibration": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.calibration],
-        "measurements": [{name: _plain(value) for name, value in vars(entry).items()} for entry in result.measurements],
-        "checks": [{"sigmas": _plain(entry.sigmas)} | vars(entry) for entry in result.checks],
-        "metres": [vars(entry) for entry in result.metres],
+        "noise_fit": None if result.noise_fit is None else _plain(asdict(result.noise_fit)),
+        "calibration": [_plain(vars(entry)) for entry in result.calibration],
+        "measurements": [_plain(vars(entry)) for entry in result.measurements],
+        "checks": [_plain({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
+        "metres": [_plain(vars(entry)) for entry in result.metres],
         "suspect_tags": [_suspect_json(suspect) for suspect in result.suspects],
         "advice": [advice_as_json(advice) for advice in result.advice],
         "warnings": list(result.warnings),
@@ -143,8 +143,12 @@ def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
     return [{"family": family, "tag_id": tag_id} for family, tag_id in tags]
 
 
-def _plain(value: FloatArray | float | int | str | None) -> Any:  # noqa: ANN401 - nested lists of any depth
-    """Numbers and nested lists for JSON, which has no NaN: null instead."""
+def _plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any depth
+    """Numbers, texts, nested lists and mappings for JSON, which has no NaN: null instead."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
     if isinstance(value, np.ndarray):
         return [_plain(entry) for entry in value] if value.ndim else _plain(float(value))
     if isinstance(value, float | np.floating):

@@ -8,6 +8,7 @@ FAMILY:ID where an id hangs in several families.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Final
 
 import numpy as np
 
@@ -15,6 +16,11 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.errors import OfflineError
 from offline.run import TagKey
+
+# No tape is longer, none is finer, and a measurement that says less says nothing; squares of these are still numbers.
+_FARTHEST_M: Final = 1e5
+_LEAST_SIGMA: Final = 1e-5
+_LARGEST_SIGMA: Final = 1e3
 
 
 @dataclass(frozen=True)
@@ -151,8 +157,8 @@ def parse_distance(text: str, runs: Sequence[str], tags: Sequence[TagKey]) -> Me
     ends = [_end(option, name.strip(), runs, tags) for name in names.split(",")]
     if len(ends) != 2 or ends[0] == ends[1]:
         raise OfflineError(f"{option}: {names!r} must name two different runs or tags; write A,B=metres,sigma_m")
-    if distance_m < 0.0:
-        raise OfflineError(f"{option}: the distance is {distance_m:g} m, must be 0 or more")
+    if not 0.0 <= distance_m <= _FARTHEST_M:
+        raise OfflineError(f"{option}: the distance is {distance_m:g} m, must be from 0 to {_FARTHEST_M:g}")
     _check_sigmas(option, {"sigma_m": sigma_m})
     return MeasuredDistance(ends[0], ends[1], distance_m, sigma_m)
 
@@ -176,8 +182,8 @@ def _split(option: str, text: str, form: str, n: int) -> tuple[str, list[float]]
 
 def _check_sigmas(option: str, sigmas: dict[str, float]) -> None:
     for name, value in sigmas.items():
-        if value <= 0.0:
-            raise OfflineError(f"{option}: {name} is {value:g}, must be greater than 0")
+        if not _LEAST_SIGMA <= value <= _LARGEST_SIGMA:
+            raise OfflineError(f"{option}: {name} is {value:g}, must be from {_LEAST_SIGMA:g} to {_LARGEST_SIGMA:g}")
 
 
 def _end(option: str, name: str, runs: Sequence[str], tags: Sequence[TagKey]) -> str | TagKey:

@@ -1,5 +1,6 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
+from offline.graph import TAG_SCALE
 from offline.kept_maps import (
     check_can_be_extended,
     check_sizes_in_map,
@@ -274,16 +276,30 @@ def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, so
 
 
 def _check_distinct(runs: Sequence[Run]) -> None:
+    """Refuses a drive that is given twice, and runs and stretches that would have one name."""
     if not runs:
         raise OfflineError("no log given; name at least one log file or run folder")
     seen: dict[str, Run] = {}
     for run in runs:
         if run.name in seen:
+            other = seen[run.name]
+            if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
+                raise OfflineError(
+                    f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
+                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them apart"
+                )
             raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {seen[run.name].log}); "
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
                 "leave one out, or a drive would count as two"
             )
         seen[run.name] = run
+    for run in runs:
+        stretch = re.fullmatch(r"(.+)_stretch\d+", run.name)
+        if stretch and stretch[1] in seen:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a stretch of {stretch[1]}, which "
+                f"{seen[stretch[1]].log} is; map them apart"
+            )
 
 
 def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool) -> None:
@@ -293,7 +309,7 @@ def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters
         raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
-    names = {each.run for each in extending.kept}
+    names = {name for each in extending.kept for name in (each.run, each.name)}
     for run in runs:
         if run.name in names:
             raise OfflineError(
@@ -305,12 +321,17 @@ def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters
 
 def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
     """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
-    told = {(check.component, name) for check in checks if check.contradicts for name in COMPARED[check.name]}
+    told = {
+        (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)
+        for check in checks
+        if check.contradicts
+        for name in COMPARED[check.name]
+    }
     return [
         f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
         "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
         for entry in calibration
-        if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.name) not in told
+        if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.owner, entry.name) not in told
     ]
 
 

@@ -42,9 +42,9 @@ def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
             continue
         try:
             stamp, x, y, _, _, _, qz, qw = line.split()
-            stamps_ns.append(int(Decimal(stamp) * _NS_PER_S))
+            stamps_ns.append(np.int64(int(Decimal(stamp) * _NS_PER_S)))
             poses.append([float(x), float(y), 2.0 * np.arctan2(float(qz), float(qw))])
-        except (ValueError, InvalidOperation) as error:
+        except (ValueError, OverflowError, InvalidOperation) as error:
             raise OfflineError(f"{path} line {number}: {line[:80]!r} is no pose; make the map again") from error
     if not poses:
         raise OfflineError(f"{path}: holds no pose; make the map again")

@@ -41,10 +41,33 @@ def test_a_folder_appears_whole_with_the_folders_on_the_way(tmp_path: Path) -> N
 def test_a_folder_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     (folder / "sub").mkdir(parents=True)
-    with folder_written_whole(folder) as partial:
+    with folder_written_whole(folder, replace=True) as partial:
         (partial / "new").write_text("")
         assert (folder / "sub").is_dir()
     assert all_below(tmp_path) == [folder, folder / "new"]
+
+
+def test_what_came_into_the_folder_meanwhile_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+
+    def write_beside_another() -> None:
+        with folder_written_whole(folder) as partial:
+            (partial / "file").write_text("new")
+            folder.mkdir()
+            (folder / "file").write_text("precious")
+
+    with pytest.raises(CalibError, match="folder: holds something by now, which stays; name another folder"):
+        write_beside_another()
+    assert (folder / "file").read_text() == "precious"
+    assert all_below(tmp_path) == [folder, folder / "file"]
+
+
+def test_an_empty_folder_is_filled(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with folder_written_whole(folder) as partial:
+        (partial / "file").write_text("new")
+    assert all_below(tmp_path) == [folder, folder / "file"]
 
 
 @pytest.mark.parametrize("existing", [False, True])
@@ -74,7 +97,7 @@ def test_what_was_there_comes_back_if_it_cannot_be_replaced(tmp_path: Path, monk
     monkeypatch.setattr(Path, "rename", fail)
     with (
         pytest.raises(CalibError, match=r"folder: cannot be written \(Input/output error\); name a folder"),
-        folder_written_whole(folder) as partial,
+        folder_written_whole(folder, replace=True) as partial,
     ):
         (partial / "file").write_text("new")
     assert (folder / "file").read_text() == "old"

@@ -23,9 +23,11 @@ def test_what_the_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("sigma_corner_px: 0", ["sigma_corner_px", "0", "greater than 0"]),
-        ("sigma_corner_px: -0.1", ["sigma_corner_px", "-0.1", "greater than 0"]),
-        ("sigma_corner_px: .inf", ["sigma_corner_px", "inf", "finite"]),
+        ("sigma_corner_px: 0", ["sigma_corner_px", "0", "greater than or equal to 0.000000001"]),
+        ("sigma_corner_px: -0.1", ["sigma_corner_px", "-0.1", "greater than or equal to 0.000000001"]),
+        ("sigma_corner_px: 1e-200", ["sigma_corner_px", "1e-200", "greater than or equal to 0.000000001"]),
+        ("sigma_distance_m_per_sqrt_m: 1.0e+200", ["1e+200", "less than or equal to 1000"]),
+        ("sigma_corner_px: .inf", ["sigma_corner_px", "inf", "less than or equal to 1000"]),
         ("sigma_corner_px: true", ["sigma_corner_px", "True", "number"]),
         ("sigma_corner_px: 0.2 px", ["sigma_corner_px", "'0.2 px'", "number"]),
         ("sigma_corners_px: 0.2", ["sigma_corners_px", "0.2", "did you mean sigma_corner_px?"]),

@@ -7,9 +7,10 @@ from calib import se2
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline.checks import check_warnings
+from offline.graph import TAG_SCALE
 from offline.measured import TapeOptions
-from offline.pipeline import build_map
-from offline.result import CheckResult, MapResult
+from offline.pipeline import _calibration_warnings, build_map
+from offline.result import CalibrationResult, CheckResult, MapResult
 from offline.run import TagKey
 from offline.stages import Stages
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
@@ -97,3 +98,19 @@ def test_sigmas_count_both_what_readings_and_what_robot_yaml_leave_open() -> Non
     checks = [CheckResult("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
     assert checks[0].sigmas == pytest.approx(0.05 / np.hypot(0.003, 0.01))
     assert len(check_warnings(checks)) == 1
+
+
+def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
+    """What a check tells of is not told twice; another robot's wheels and other prints are another matter."""
+    told = CheckResult("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
+    corrections = [
+        CalibrationResult(owner, name, 0, value=0.05, sigma=0.001, prior_sigma=0.005)
+        for owner, name in (
+            ("carl", "wheel_scale"),
+            ("printed", TAG_SCALE),
+            ("dora", "wheel_scale"),
+            ("new", TAG_SCALE),
+        )
+    ]
+    warnings = _calibration_warnings(corrections, [told])
+    assert [warning.partition(" came out")[0] for warning in warnings] == ["wheel_scale of dora", "tag_scale of new"]

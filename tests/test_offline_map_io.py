@@ -123,6 +123,21 @@ def test_a_trajectory_keeps_its_nanoseconds_and_headings_at_any_turn(tmp_path: P
     np.testing.assert_allclose(se2.log(se2.between(poses, poses_back)), 0, atol=2e-9)
 
 
+def _spoilt_in_the_middle(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def _changed(path: Path, **changes: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def _of_another_frame(path: Path) -> None:
+    components = json.loads(path.read_text())["components"]
+    _changed(path, components=[components[0] | {"frame_run": "nobody"}, *components[1:]])
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -132,9 +147,18 @@ def test_a_trajectory_keeps_its_nanoseconds_and_headings_at_any_turn(tmp_path: P
         (lambda d: (d / "map.json").write_text('{"format_version": 9}'), "format_version is 9, this program reads 1"),
         (lambda d: (d / "map.npz").unlink(), "map.npz: cannot be read"),
         (lambda d: (d / "map.npz").write_bytes(b"nonsense"), "damaged"),
+        (lambda d: (d / "map.npz").write_bytes(b""), "damaged"),
+        (lambda d: (d / "map.npz").write_bytes((d / "map.npz").read_bytes()[:-300]), "damaged"),
+        (lambda d: _spoilt_in_the_middle(d / "map.npz"), "damaged"),
+        (lambda d: _changed(d / "map.json", components=[]), "damaged or incomplete (no components)"),
+        (lambda d: _changed(d / "map.json", runs=None), "damaged"),
+        (lambda d: _changed(d / "map.json", metres=[7]), "damaged"),
+        (lambda d: _of_another_frame(d / "map.json"), "frame_run 'nobody' is none of its runs"),
         (lambda d: (d / "red_one.tum").unlink(), "red_one.tum: cannot be read"),
         (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is no pose"),
         (lambda d: (d / "red_one.tum").write_text(""), "holds no pose"),
+        (lambda d: (d / "red_one.tum").write_text("Infinity 0 0 0 0 0 0 1\n"), "line 1: 'Infinity"),
+        (lambda d: (d / "red_one.tum").write_text("1e30 0 0 0 0 0 0 1\n"), "line 1: '1e30"),
     ],
 )
 def test_a_damaged_map_is_refused_in_one_line(tmp_path: Path, spoil: Callable[[Path], object], said: str) -> None:

@@ -46,7 +46,8 @@ def test_sigmas_are_along_the_axes_of_the_map() -> None:
         ("1,2,3,4,5,6", "write RUN=x_m"),
         ("b_one=1,2,x,1,1,1", "'x' is not a number"),
         ("b_one=1,2,nan,1,1,1", "'nan' is not a number"),
-        ("b_one=1,2,3,0.1,0,0.1", "sigma_y_m is 0, must be greater than 0"),
+        ("b_one=1,2,3,0.1,0,0.1", "sigma_y_m is 0, must be from 1e-05 to 1000"),
+        ("b_one=1,2,3,1,1,1e200", "sigma_theta_rad is 1e+200, must be from 1e-05 to 1000"),
         ("z=1,2,3,1,1,1", "there is no run 'z'; the runs are a_one, b_one"),
         ("a_one=1,2,3,1,1,1", "a_one is the first run, whose start is the frame"),
     ],
@@ -76,8 +77,10 @@ def test_distances_are_between_starts_or_tags() -> None:
         ("8,8=1,0.1", "must name two different"),
         ("a_one,7=1,0.1", "several families; write one of tag36h11:7, tag25h9:7"),
         ("a_one,9=1,0.1", "'9' is neither a run"),
-        ("a_one,8=-1,0.1", "the distance is -1 m"),
-        ("a_one,8=1,-0.1", "sigma_m is -0.1, must be greater than 0"),
+        ("a_one,8=-1,0.1", "the distance is -1 m, must be from 0 to 100000"),
+        ("a_one,8=1e300,1", "the distance is 1e+300 m, must be from 0 to 100000"),
+        ("a_one,8=1,1e-200", "sigma_m is 1e-200, must be from 1e-05 to 1000"),
+        ("a_one,8=1,-0.1", "sigma_m is -0.1, must be from 1e-05 to 1000"),
     ],
 )
 def test_a_distance_that_cannot_be_is_refused_in_one_line(text: str, told: str) -> None:

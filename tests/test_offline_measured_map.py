@@ -173,7 +173,7 @@ def test_the_command_takes_and_prints_them(run: Program, tmp_path: Path) -> None
     for option, given, told in (
         ("--start", "b_one=nan,0,0,1,1,1", "'nan' is not a number"),
         ("--distance", "0,0=1,1", "must name two different"),
-        ("--distance", "0,1=1,-1", "sigma_m is -1, must be greater than 0"),
+        ("--distance", "0,1=1,-1", "sigma_m is -1, must be from 1e-05 to 1000"),
     ):
         refused = run("map", tmp_path / "logs", "-o", tmp_path / "none", option, given)
         assert refused.code == 1

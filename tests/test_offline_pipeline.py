@@ -25,7 +25,7 @@ from offline.truth import read_truth
 from onboard.log_reader import find_logs, read_log
 from onboard.messages import TagDetections
 from tests.benchmarks.accuracy_study import medians, missed_bounds, run_study, study_seed
-from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, made_run, write_drive
 
 ROUND = [(0.4, 0.4, 3.0), (0.5, 0.3, 4.0), (-0.2, 0.2, 5.0), (0.3, 0.5, 3.0), (0.4, 0.4, 1.5), (0.2, -0.2, 6.0)]
 BACK = [(0.0, 0.0, 1.0), (-0.25, 0.25, 4.0), (0.4, 0.5, 4.0), (0.45, 0.35, 4.0), (-0.3, -0.3, 1.0), (-0.25, 0.25, 4.0)]
@@ -252,6 +252,23 @@ def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
     log = exact_log(tmp_path, "a")
     with pytest.raises(OfflineError, match="run one of robot a is given twice"):
         map_of(log, log)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "told"),
+    [
+        (("a_b", "c"), ("a", "b_c"), "run b_c of robot a would be named a_b_c, as run c of robot a_b in"),
+        (("a", "c"), ("a", "c_stretch2"), "run c_stretch2 of robot a is named like a stretch of a_c"),
+        (("a", "c_stretch2"), ("a", "c"), "run c_stretch2 of robot a is named like a stretch of a_c"),
+    ],
+)
+def test_runs_of_one_name_are_refused(one: tuple[str, str], other: tuple[str, str], told: str) -> None:
+    run = made_run([drive_of("a").track])
+    runs = [
+        replace(run, name=f"{robot_id}_{run_id}", robot_id=robot_id, run_id=run_id) for robot_id, run_id in (one, other)
+    ]
+    with pytest.raises(OfflineError, match=told):
+        build_map(runs)
 
 
 def flat_room() -> World:
