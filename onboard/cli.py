@@ -36,7 +36,9 @@ def record(
     """
     import contextlib
     import os
+    import sys
 
+    from onboard.console_lines import ConsoleLines
     from onboard.ending import told_to_end
     from onboard.housekeeping import Housekeeper
     from onboard.live_recorder import LiveRecorder
@@ -51,22 +53,24 @@ def record(
     path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
 
     def tell_event(event: "Event") -> None:
-        _say(f"{event.kind}: {event.text}")
+        console.say(f"{event.kind}: {event.text}")
         keeper.note(event)
 
-    recorder = LiveRecorder(files, output, stop, tell_event, _say)
-    keeper = Housekeeper(recorder, path, Notifier())
-    keeper.start()
-    try:
-        recorder.run()
-    finally:
-        keeper.end()
-    core = recorder.core
-    counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.counts.items()))
-    _say(f"{core.folder}: {counts}")
+    with ConsoleLines(sys.stdout) as console:
+        recorder = LiveRecorder(files, output, stop, tell_event, console.say)
+        keeper = Housekeeper(recorder, path, Notifier())
+        keeper.start()
+        try:
+            recorder.run()
+        finally:
+            keeper.end()
+        core = recorder.core
+        counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.counts.items()))
+        console.say(f"{core.folder}: {counts}")
+        if core.losses:
+            lost = ", ".join(f"{count} {what}" for what, count in sorted(core.losses.items()))
+            console.say(f"lost: {lost}")
     if core.losses:
-        lost = ", ".join(f"{count} {what}" for what, count in sorted(core.losses.items()))
-        _say(f"lost: {lost}")
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 
@@ -172,14 +176,6 @@ def status(
         raise typer.Exit(EXIT_REFUSED)
     if shown.losses or shown.problems:
         raise typer.Exit(EXIT_WITH_LOSSES)
-
-
-def _say(text: str) -> None:
-    """Whoever listened may be gone; the recording goes on."""
-    import contextlib
-
-    with contextlib.suppress(OSError):
-        typer.echo(text)
 
 
 def main() -> None:

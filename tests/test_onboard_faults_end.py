@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -54,14 +54,14 @@ os.fdatasync = stalling
 
 
 @contextmanager
-def recorder(folder: Path, robot: Path, before: str = "", **environment: str) -> Iterator["subprocess.Popen[str]"]:
+def recorder(
+    folder: Path, robot: Path, before: str = "", stdout: int = subprocess.PIPE, **environment: str
+) -> Iterator["subprocess.Popen[str]"]:
     """`groundsbot-onboard record` as a process of its own, working in `folder`."""
     program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **environment}
-    process = subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    )
+    process = subprocess.Popen(command, cwd=folder, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment)
     try:
         yield process
     finally:
@@ -82,14 +82,17 @@ def wait_for(process: "subprocess.Popen[str]", *words: str) -> None:
 def wait_for_load(folder: Path) -> None:
     """Waits until the recorder says by its status that all is flowing."""
 
-    def flows() -> bool:
-        try:
-            counts = read_status(folder / "logs").counts
-        except OnboardError:
-            return False
-        return counts.get("/wheels", 0) > 1000 and counts.get("/tags/detections", 0) > 30
+    until(
+        lambda: counts(folder).get("/wheels", 0) > 1000 and counts(folder).get("/tags/detections", 0) > 30, "the load"
+    )
 
-    until(flows, "the load")
+
+def counts(folder: Path) -> dict[str, int]:
+    """Of the messages so far, as the recorder's status says."""
+    try:
+        return read_status(folder / "logs").counts
+    except OnboardError:
+        return {}
 
 
 def only_log(folder: Path) -> Path:
@@ -188,6 +191,25 @@ def test_row_18_told_to_end_while_port_camera_and_detection_block(tmp_path: Path
     check_finished(log)
     sequences = [reading.sequence for reading in wheels_of(log)]
     assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+
+
+def test_row_18_a_terminal_that_takes_no_more_lines_holds_up_neither_recording_nor_end(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
+    read_fd, write_fd = os.pipe()
+    os.set_blocking(write_fd, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(write_fd, b"\n")
+    os.set_blocking(write_fd, True)
+    with full_load(tmp_path), recorder(tmp_path, robot, stdout=write_fd) as process:
+        os.close(write_fd)
+        until(lambda: counts(tmp_path).get("/wheels", 0) > 1000, "readings")
+        process.send_signal(signal.SIGTERM)
+        ended_within(process, LIMIT_S)
+    os.close(read_fd)
+    assert process.returncode == 0
+    check_finished(only_log(tmp_path))
+    assert len(wheels_of(only_log(tmp_path))) > 1000
 
 
 class Systemd:
