@@ -95,7 +95,10 @@ def _is_sound(local_map: LocalMap) -> bool:
 
 def _shared(parts: Sequence[FittedPart]) -> tuple[FloatArray, bool]:
     """(2,) variance that readings of a tag share within a cell, as a multiple of their own; and whether enough tell."""
-    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in parts]
+    read = [each for each in parts if len(each.chain.readings)]  # the beginning of a run may have none
+    if not read:
+        return np.zeros(2), False
+    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in read]
     weight = np.array([each.shared_redundancy for each in errors])
     shared = (weight * np.array([each.shared for each in errors])).sum(axis=0) / weight.sum(axis=0)
     return shared, bool(weight.sum(axis=0)[0] >= _LEAST_CELLS)

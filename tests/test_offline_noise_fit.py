@@ -8,7 +8,8 @@ import pytest
 
 from calib.noise import NoiseParameters
 from fixtures.simulate import simulate
-from offline.chain import chains_of
+from offline import noise_fit
+from offline.chain import Chain, chains_of
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import ODOMETRY_NOISE
 from offline.pipeline import build_map, read_runs
@@ -93,6 +94,26 @@ def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no
     assert alone.noise == PRIOR
     assert {each.kept for each in alone.fitted.parameters} == {"no run has tag readings that fit together"}
     assert alone.maps[0] is odd
+
+
+@pytest.mark.parametrize("n_late", [1, 2])
+def test_of_long_runs_beginnings_may_be_without_tags(
+    maps: list[LocalMap], monkeypatch: pytest.MonkeyPatch, n_late: int
+) -> None:
+    late = [_read_late(each.chain) for each in maps[:n_late]]
+    both = [*(solve_local_map(chain) for chain in late), *maps[n_late:2]]
+    monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.chain.stamps_ns) for each in both)))
+    found = fit_and_weigh(both, PRIOR)
+    by_name = {each.name: each for each in found.fitted.parameters}
+    assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
+    assert (found.fitted.shared_range, found.fitted.shared_bearing) == (0.0, 0.0) or n_late == 1
+
+
+def _read_late(chain: Chain) -> Chain:
+    """Without the readings of its first half."""
+    readings = chain.readings.where(chain.readings.keyframe >= len(chain.stamps_ns) // 2)
+    seen, tag = np.unique(readings.tag, return_inverse=True)
+    return replace(chain, tags=tuple(chain.tags[i] for i in seen), readings=replace(readings, tag=tag))
 
 
 def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
