@@ -25,7 +25,12 @@ def small_pipe() -> Iterator[tuple[int, TextIO]]:
 
 def say_all(console: ConsoleLines, lines: list[str]) -> None:
     """In a thread, so that one who waits for ever fails and does not hang."""
-    thread = threading.Thread(target=lambda: [console.say(line) for line in lines], daemon=True)
+
+    def say() -> None:
+        for line in lines:
+            console.say(line)
+
+    thread = threading.Thread(target=say, daemon=True)
     thread.start()
     thread.join(LIMIT_S)
     assert not thread.is_alive()

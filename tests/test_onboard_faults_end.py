@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -55,12 +55,16 @@ os.fdatasync = stalling
 
 @contextmanager
 def recorder(
-    folder: Path, robot: Path, before: str = "", stdout: int = subprocess.PIPE, **environment: str
+    folder: Path,
+    robot: Path,
+    before: str = "",
+    stdout: int = subprocess.PIPE,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator["subprocess.Popen[str]"]:
     """`groundsbot-onboard record` as a process of its own, working in `folder`."""
     program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **environment}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **(environment or {})}
     process = subprocess.Popen(command, cwd=folder, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment)
     try:
         yield process
@@ -238,7 +242,7 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
     systemd = Systemd(tmp_path / "notify")
     listening = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "2000000"}
     with full_load(tmp_path):
-        with recorder(tmp_path, robot, STALLED, **listening) as process:
+        with recorder(tmp_path, robot, STALLED, environment=listening) as process:
             wait_for(process, "port_connected")
             until(lambda: systemd.listen(0.1)[:1] == ["READY=1"], "READY=1")
             assert systemd.listen(2.0).count("WATCHDOG=1") >= 2
@@ -249,7 +253,7 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
             process.kill()
             process.wait()
             safe.unlink()
-        with recorder(tmp_path, robot, STALLED, **listening) as process:
+        with recorder(tmp_path, robot, STALLED, environment=listening) as process:
             wait_for(process, "port_connected")
             assert "WATCHDOG=1" in systemd.listen(3.0)
             process.send_signal(signal.SIGTERM)
