@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray
-from offline.alignment_search import Explanation
+from offline.alignment_search import Explanation, without
 from offline.condensed import quarter_turned
 from offline.joint_fit import FALSE_ALARM, REACH_M, Held, hold
 
@@ -59,7 +59,11 @@ class Rivalry:
                 continue
             if self.is_same_place(other, best) and not self._has_group_of_its_own(other, best):
                 continue
-            if is_alike or its + self.of_group(other, groups) > best_worth - MARGIN_NATS:
+            worth = its + self.of_group(other, groups)
+            if _has_two_of_its_own(other, best):  # what fits both may be of either group
+                own = without(other, np.flatnonzero(other.members & best.members))
+                worth = max(worth, self.evidence(own) + self.of_group(own, groups))
+            if is_alike or worth > best_worth - MARGIN_NATS:
                 rivals.append(other)
         return rivals
 
@@ -88,6 +92,11 @@ class Rivalry:
         by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
         covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
         return covariance
+
+
+def _has_two_of_its_own(other: Explanation, best: Explanation) -> bool:
+    """Whether two tags at least are not of the best."""
+    return bool((other.members & ~best.members).sum() > 1)
 
 
 def _as_group(explanation: Explanation, tags: BoolArray, n: int) -> float:
