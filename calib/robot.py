@@ -41,7 +41,11 @@ def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's 
 
 
 class Wheels(_Section):
-    """The differential drive. Errors of the two radii are independent: their common scale has sigma / sqrt(2)."""
+    """The differential drive.
+
+    Errors of the two radii are independent, so that their common scale has sigma / sqrt(2), unless it is said how well
+    that scale and the right radius over the left are known, as shares: drives tell the latter far better.
+    """
 
     radius_left_m: Length
     radius_left_m_sigma: Positive = _share_of("radius_left_m", RELATIVE_RADIUS_SIGMA)
@@ -50,6 +54,8 @@ class Wheels(_Section):
     track_m: Length
     track_m_sigma: Positive = _share_of("track_m", RELATIVE_TRACK_SIGMA)
     ticks_per_turn: Positive
+    radii_scale_sigma: Positive | None = None
+    radii_ratio_sigma: Positive | None = None
 
     @property
     def metres_per_tick(self) -> tuple[float, float]:
@@ -154,10 +160,12 @@ class Robot(_Section):
     wheels: Wheels
     mount: Mount = Mount()
     camera: Annotated[str, Field(min_length=1)] | None = None
+    focal_scale_sigma: NotNegative = 0.0
     readout_s: NotNegative = 0.0
     time_offset_s: Finite = 0.0
     time_offset_s_sigma: Positive = 0.002
     tags: list[TagBatch] = []
+    imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
 

@@ -10,6 +10,7 @@ from calib.command_line import run as run_program
 from calib.errors import GroundsbotError
 from offline.export_options import ExportFormat, ExportOptions
 from offline.map_model import MapModel
+from offline.self_calibration_option import AUTO, OFF
 
 app = new_app("Turns run logs into one map of tags and trajectories, and tells what is in them.")
 
@@ -137,6 +138,14 @@ def map_command(
             help="What the map is solved on last: tags' corners in pixels, or their places on the floor only."
         ),
     ] = MapModel.FLOOR,
+    calibrate: Annotated[
+        str,
+        typer.Option(
+            help="Which numbers of robot.yaml the drives may set beyond its sigmas: off, auto (those that drives "
+            "contradict), or names.",
+            metavar="off|auto|PARAM,...",
+        ),
+    ] = OFF,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
@@ -161,6 +170,7 @@ def map_command(
         keep_suspects,
         corners=model is MapModel.CORNERS,
         extend=extend,
+        calibrate=calibrate,
     )
     result, costs = make_map(options)
     if json_output:
@@ -169,6 +179,49 @@ def map_command(
         for line in [*summary(result, output), *(stage_lines(costs) if verbose else [])]:
             typer.echo(line)
     raise typer.Exit(exit_code(result))
+
+
+@app.command()
+def calibrate(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="New robot.yaml; or a new folder, for several robots.", metavar="OUT")
+    ],
+    robot: Annotated[
+        list[Path] | None,
+        typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
+    ] = None,
+    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(help="Between two runs' starts or tags, as measured: A,B=metres,sigma_m; repeatable."),
+    ] = None,
+    model: Annotated[
+        MapModel, typer.Option(help="Ask tags' corners in pixels (focal length too), or their places on the floor.")
+    ] = MapModel.FLOOR,
+    calibrate: Annotated[str, typer.Option(help="As for `map`: what is freed.", metavar="auto|PARAM,...")] = AUTO,
+    json_output: JsonFlag = False,
+) -> None:
+    """Learns wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
+
+    The camera's file is written beside it. Of each number it says what was learnt, and which drive would tell more.
+    The drives need not hang together. Exit 3: a log is damaged, and the rest of it was used.
+    """
+    import json
+
+    from offline.calibrate_command import CalibrateOptions, as_json, calibrate_robots, summary
+
+    options = CalibrateOptions(
+        logs, output, robot or (), noise, distance or (), corners=model is MapModel.CORNERS, calibrate=calibrate
+    )
+    calibrated = calibrate_robots(options)
+    if json_output:
+        typer.echo(json.dumps(as_json(calibrated), indent=2, allow_nan=False))
+    else:
+        for line in summary(calibrated):
+            typer.echo(line)
+    if calibrated.result.losses:
+        raise typer.Exit(EXIT_WITH_LOSSES)
 
 
 @app.command()

@@ -21,7 +21,9 @@ from calib.camera_model import CameraModel
 from offline.factors import Columns, Linearised, State
 from offline.tag_pose import UNIT_CORNERS
 
-# The calibration numbers that corners depend on, besides the time offset and the scale of the tag's batch.
+# By how much camera.yaml's focal lengths are off, as a share: both alike, about the principal point, which is held.
+FOCAL_SCALE: Final = "focal_scale"
+# The other calibration numbers that corners depend on, besides the time offset and the scale of the tag's batch.
 CORNER_MOUNT: Final = ("mount_x_m", "mount_y_m", "mount_z_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad")
 # How a picture's base may stand on an uneven floor.
 WOBBLE: Final = ("roll_rad", "pitch_rad", "height_m")
@@ -69,7 +71,8 @@ class Looks:
         moved: (M, 4, 3) T_keyframe_base by the wheels, when each corner's row was read out.
         twist: (M, 3) velocity of base (x, y, theta per second) at the keyframe.
         mount: (M, 6) nominal CORNER_MOUNT.
-        mount_parameters: (M, 6), time_parameter: (M,) and scale_parameter: (M,): indices into the calibration.
+        mount_parameters: (M, 6), time_parameter: (M,), scale_parameter: (M,), focal_parameter: (M,): indices into the
+            calibration.
     """
 
     pose: IntArray
@@ -84,6 +87,7 @@ class Looks:
     mount_parameters: IntArray
     time_parameter: IntArray
     scale_parameter: IntArray
+    focal_parameter: IntArray
 
     def __len__(self) -> int:
         """Number of looks."""
@@ -131,7 +135,7 @@ class CornerFactors:
         return Linearised(self._residual(seen), ((self.columns(columns), self._jacobian(state, seen)),)), whitened
 
     def by_columns(self, state: SpatialState) -> tuple[FloatArray, FloatArray]:
-        """Residuals (M, 8) and their derivatives (M, 8, 17), in the order of `columns`."""
+        """Residuals (M, 8) and their derivatives (M, 8, 18), in the order of `columns`."""
         seen = self._seen(state)
         return self._residual(seen), self._jacobian(state, seen)
 
@@ -145,6 +149,7 @@ class CornerFactors:
         scale = 1.0 + state.calibration[looks.scale_parameter]
         by_scale = by_tag @ (corners / scale[:, None, None])[..., None]
         by_late = -_by_moving(seen.by_base, seen.in_base) @ looks.twist[:, None, :, None]
+        by_focal = (seen.pixels - self._centres()) / self._focal(state)[:, None, None]
         jacobian = np.concatenate(
             [
                 _by_moving(by_keyframe, seen.in_keyframe),
@@ -153,6 +158,7 @@ class CornerFactors:
                 self._by_mount(state, seen),
                 by_late,
                 by_scale,
+                by_focal[..., None],
             ],
             axis=-1,
         )
@@ -160,7 +166,7 @@ class CornerFactors:
         return whitened
 
     def columns(self, columns: SpatialColumns) -> IntArray:
-        """(M, 17) of pose, tag's place, its turn, mount, time and scale."""
+        """(M, 18) of pose, tag's place, its turn, mount, time, scale and focal length."""
         looks = self.looks
         return np.concatenate(
             [
@@ -171,6 +177,7 @@ class CornerFactors:
                 columns.calibration[looks.mount_parameters],
                 columns.calibration[looks.time_parameter][:, None],
                 columns.calibration[looks.scale_parameter][:, None],
+                columns.calibration[looks.focal_parameter][:, None],
             ],
             axis=-1,
         )
@@ -218,7 +225,17 @@ class CornerFactors:
         mount, rotation = self._mount(state)
         in_camera = (in_base - mount[:, None, :3]) @ rotation
         pixels, by_camera = self._projected(in_camera)
+        focal, centres = self._focal(state)[:, None, None], self._centres()
+        pixels, by_camera = centres + focal * (pixels - centres), focal[..., None] * by_camera
         return Seen(in_base, pixels, by_camera @ rotation[:, None].swapaxes(-1, -2), in_keyframe, rotation)
+
+    def _focal(self, state: SpatialState) -> FloatArray:
+        """(M,) true focal length over that of the camera's file."""
+        return np.asarray(1.0 + state.calibration[self.looks.focal_parameter], dtype=np.float64)
+
+    def _centres(self) -> FloatArray:
+        """(M, 1, 2) principal points."""
+        return np.array([[each.cx_px, each.cy_px] for each in self.cameras])[self.looks.camera][:, None]
 
     def _projected(self, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         if len(self.cameras) == 1:

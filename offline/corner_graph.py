@@ -10,7 +10,7 @@ from calib import wheels
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
 from offline.chain import Chain
-from offline.corner_factors import CORNER_MOUNT, CornerFactors, Looks, SpatialState
+from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
 from offline.corner_problem import CornerProblem, columns_of
 from offline.corner_start import tags_hung
 from offline.factors import CalibrationPrior, ReadingFactors, State
@@ -59,8 +59,9 @@ def corner_graph(
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
     """
     chains = graph.chains
-    heights = sorted({_height_parameter(chain) for chain in chains if _from_corners(chain).any()})
-    parameters = (*graph.parameters, *heights)
+    seeing = [chain for chain in chains if _from_corners(chain).any()]
+    of_corners = sorted({each for chain in seeing for each in (_height_parameter(chain), _focal_parameter(chain))})
+    parameters = (*graph.parameters, *of_corners)
     looks, cameras = _looks(graph, parameters)
     floor = graph.problem
     n_tags = len(graph.tags)
@@ -80,7 +81,7 @@ def corner_graph(
     start = SpatialState(
         poses=state.poses,
         tags=state.tags,
-        calibration=np.concatenate([state.calibration, np.zeros(len(heights))]),
+        calibration=np.concatenate([state.calibration, np.zeros(len(of_corners))]),
         heights_m=np.where(seen, np.nan, 0.0),
         turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
     )
@@ -130,6 +131,7 @@ def _looks(graph: Graph, parameters: Sequence[Parameter]) -> tuple[Looks, tuple[
                 mount_parameters=np.tile(mount, (n, 1)),
                 time_parameter=np.full(n, index[time]),
                 scale_parameter=scales[readings.tag],
+                focal_parameter=np.full(n, index[_focal_parameter(chain)]),
             )
         )
     whole = Looks(*(np.concatenate([getattr(each, field.name) for each in found]) for field in fields(Looks)))
@@ -159,6 +161,13 @@ def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: 
 def _height_parameter(chain: Chain) -> Parameter:
     mount = chain.run.robot.mount
     return Parameter(chain.run.robot_id, "mount_z_m", (mount.z_m,), mount.z_m_sigma)
+
+
+def _focal_parameter(chain: Chain) -> Parameter:
+    """Held where robot.yaml gives it no sigma."""
+    run = chain.run
+    nominal = () if run.camera is None else (run.camera.fx_px, run.camera.fy_px)
+    return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)
 
 
 def _readings_where(readings: ReadingFactors, kept: BoolArray) -> ReadingFactors:

@@ -22,7 +22,7 @@ from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
 # How a picture stands and which of its looks count settle together in a few rounds; most of them in one.
 _WEIGHT_ROUNDS: Final = 3
-_N_LOOK: Final = 17
+_N_LOOK: Final = 18
 
 
 class Normal(NamedTuple):
@@ -231,7 +231,7 @@ class CornerProblem:
         heavy = weighed.weight[:, None, None] * wobble
         own = self._by_picture(wobble.swapaxes(-1, -2) @ heavy)
         own += np.diag(1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2)
-        coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 17)
+        coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 18)
         taken = np.linalg.solve(own[picture], coupled)
         matrix = matrix - coupled.swapaxes(-1, -2) @ taken
         a, b = self.pairs.T

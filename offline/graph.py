@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.robot import RELATIVE_TAG_SIZE_SIGMA, Mount, Robot
+from calib.robot import Mount, Robot
 from offline.chain import Chain
 from offline.factors import (
     MOUNT_PARAMETERS,
@@ -24,6 +24,7 @@ from offline.run import TagKey
 from offline.solver import Problem
 
 TAG_SCALE: Final = "tag_scale"
+IMPORTED_BATCH: Final = "imported "  # and the family: of positions that somebody else worked out
 _MOUNT: Final = "mount_"
 
 
@@ -218,13 +219,17 @@ def _parameters(chain: Chain) -> list[Parameter]:
 
 
 def parameters_of_wheels(robot: Robot) -> list[Parameter]:
-    """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent."""
+    """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent where the file says nothing else."""
     wheels = robot.wheels
     nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
     relative_left = wheels.radius_left_m_sigma / wheels.radius_left_m
     relative_right = wheels.radius_right_m_sigma / wheels.radius_right_m
     ratio_sigma = float(np.hypot(relative_left, relative_right))
-    sigmas = (0.5 * ratio_sigma, ratio_sigma, wheels.track_m_sigma / wheels.track_m)
+    sigmas = (
+        wheels.radii_scale_sigma or 0.5 * ratio_sigma,
+        wheels.radii_ratio_sigma or ratio_sigma,
+        wheels.track_m_sigma / wheels.track_m,
+    )
     return [
         Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(WHEEL_PARAMETERS, sigmas, strict=True)
     ]
@@ -265,7 +270,7 @@ def scale_parameter_of(chain: Chain, tag: TagKey) -> Parameter:
 def parameter_of_scale(robot: Robot, tag: TagKey) -> Parameter:
     """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
     if not any(batch.family == tag.family for batch in robot.tags):
-        return Parameter(f"imported {tag.family}", TAG_SCALE, (), RELATIVE_TAG_SIZE_SIGMA)
+        return Parameter(f"{IMPORTED_BATCH}{tag.family}", TAG_SCALE, (), robot.imported_tag_scale_sigma)
     size_m, sigma_m, batch = robot.tag_size_m(tag.family, tag.tag_id)
     return Parameter(f"{batch} {tag.family}", TAG_SCALE, (), sigma_m / size_m)
 

@@ -26,6 +26,8 @@ from offline.report_words import advice_sentence
 from offline.result import AlignmentResult, Component, FittedNoise, MapResult, MeasurementResult, MetreResult
 from offline.run import RobotFile, read_robot_file
 from offline.run_noise import NOT_NEEDED
+from offline.self_calibration_option import OFF, parse_calibrate
+from offline.self_calibration_words import freed_lines
 from offline.stages import StageCost, Stages
 from offline.workings import Workings
 from onboard.log_reader import find_logs
@@ -47,6 +49,7 @@ class MapOptions:
     keep_suspects: bool = False
     corners: bool = False
     extend: Path | None = None
+    calibrate: str = OFF
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -63,6 +66,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     extending = None if options.extend is None else _read_extended(options.extend, options)
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
+    calibrate = parse_calibrate(options.calibrate)
     with compilation_announced(say), progress_bar() as show:
         stages, workings = Stages(show), Workings()
         result = build_map(
@@ -72,6 +76,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             TapeOptions(options.starts, options.distances),
             keep_suspects=options.keep_suspects,
             corners=options.corners,
+            calibrate=calibrate,
             workings=workings,
             extending=extending,
         )
@@ -138,7 +143,8 @@ def summary(result: MapResult, output: Path) -> list[str]:
         for pair in component.start_to_start
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
-    lines += [_metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+    lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+    lines += freed_lines(result)
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     if result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
@@ -204,7 +210,7 @@ def _measurement_line(measurement: MeasurementResult) -> str:
     return f"measured {what}: {figures} in the map ({off}{unit})"
 
 
-def _metre_line(metre: MetreResult, *, several: bool) -> str:
+def metre_line(metre: MetreResult, *, several: bool) -> str:
     """What the length of a metre rests on."""
     of = f" of component {metre.component}" if several else ""
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)

@@ -33,6 +33,7 @@ from offline.map_json import (
 )
 from offline.map_model import MapModel
 from offline.result import (
+    CalibrationChoice,
     CalibrationResult,
     Component,
     GraphEdges,
@@ -105,6 +106,7 @@ def read_map(folder: Path) -> MapResult:
             noise=NoiseParameters.model_validate(data["noise"]),
             noise_fit=noise_fit_from(data.get("noise_fit")),
             calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
+            choices=tuple(CalibrationChoice(**entry) for entry in data.get("choices", ())),
             measurements=tuple(measurement_from(entry) for entry in data["measurements"]),
             checks=tuple(check_from(entry) for entry in data["checks"]),
             metres=tuple(MetreResult(**entry) for entry in data["metres"]),

@@ -34,6 +34,7 @@ from offline.odometry_breaks import split_where_broken
 from offline.result import (
     MAX_SIGMAS,
     AdviceResult,
+    CalibrationChoice,
     CalibrationResult,
     CheckResult,
     Component,
@@ -44,6 +45,8 @@ from offline.result import (
 )
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
+from offline.self_calibration import about_the_files, free_what_is_told
+from offline.self_calibration_option import Calibrate
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import RunsAlone, joined, split_together, with_outliers_apart
@@ -99,6 +102,7 @@ def build_map(
     *,
     keep_suspects: bool = False,
     corners: bool = False,
+    calibrate: Calibrate = Calibrate(),
     workings: Workings | None = None,
     extending: MapResult | None = None,
 ) -> MapResult:
@@ -112,6 +116,7 @@ def build_map(
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
         corners: the solved map is refined on the tags' corners, where logs have them.
+        calibrate: which numbers of robot.yaml the drives may set.
         workings: takes what the map was made from.
         extending: a map that was kept, whose runs come first, and under whose noise all is solved.
 
@@ -123,13 +128,11 @@ def build_map(
     check_tag_sizes(runs)
     noise_fit = None
     if extending is not None:
-        _check_new(runs, extending, noise, corners=corners)
+        _check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
-    chains: list[Chain] = []
-    with stages.stage("keyframes and readings", len(runs)) as done:
-        for run in runs:
-            chains += [told_apart(chain) for chain in chains_of(run, noise or prior_noise)]
-            done()
+    workings = workings or Workings()
+    workings.runs += runs
+    runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
     measurements = _measurements(tape, runs, chains, extending)
     known: list[LocalMap] = []
     if extending is not None:
@@ -145,7 +148,6 @@ def build_map(
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
-    workings = workings or Workings()
     workings.maps += maps
     found = _Found()
     for members in merged.groups:
@@ -158,7 +160,7 @@ def build_map(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged),
         noise=noise,
-        calibration=tuple(found.calibration),
+        calibration=tuple(about_the_files(found.calibration, choices)),
         measurements=tuple(found.measured),
         checks=tuple(found.checks),
         metres=tuple(found.metres),
@@ -167,8 +169,31 @@ def build_map(
         suspects=tuple(found.suspects),
         noise_fit=noise_fit,
         advice=tuple(found.advice),
+        choices=choices,
         kept=kept,
     )
+
+
+def _calibrated(
+    runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
+) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...]]:
+    """The runs as their robots are to be taken, their stretches, and what self-calibration freed."""
+    chains = _chains(runs, noise, stages)
+    if not calibrate.is_on:
+        return runs, chains, ()
+    with stages.stage("self-calibration"):
+        freed, choices = free_what_is_told(runs, chains, noise, calibrate.names, corners=corners)
+    return freed, _chains(freed, noise, stages) if any(each.is_freed for each in choices) else chains, choices
+
+
+def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:
+    """All stretches of the runs, two tags with one id apart."""
+    chains: list[Chain] = []
+    with stages.stage("keyframes and readings", len(runs)) as done:
+        for run in runs:
+            chains += [told_apart(chain) for chain in chains_of(run, noise)]
+            done()
+    return chains
 
 
 def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) -> tuple[list[LocalMap], list[str]]:
@@ -302,11 +327,15 @@ def _check_distinct(runs: Sequence[Run]) -> None:
             )
 
 
-def _check_new(runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool) -> None:
-    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, and corners."""
+def _check_new(
+    runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
+) -> None:
+    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
     check_can_be_extended(extending)
     if corners:
         raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+    if calibrate.is_on:
+        raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
     names = {name for each in extending.kept for name in (each.run, each.name)}

@@ -18,7 +18,7 @@ _ASSETS: Final = "offline.report_assets"
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)
 _MIDDLE: Final = ("advice", "alignments", "holding", "starts", "checks", "metres", "measurements")
-_BELOW: Final = ("runs", "tags", "noise", "calibration")
+_BELOW: Final = ("runs", "tags", "noise", "calibration", "choices")
 
 
 def page(

@@ -46,6 +46,7 @@ def tables(document: dict[str, Any]) -> list[Table]:
         _tags(document),
         _noise(document),
         _calibration(document),
+        _choices(document),
     ]
     return [table for table in made if table.rows]
 
@@ -307,6 +308,23 @@ def _calibration(document: dict[str, Any]) -> Table:
     columns = ("of", "correction", "component", "value", "sigma", "sigma before")
     note = "What the map corrects of robot.yaml: scales as a share, the mount in metres and radians."
     return _table("calibration", "Calibration", note, columns, rows)
+
+
+def _choices(document: dict[str, Any]) -> Table:
+    rows = [
+        (
+            each["owner"],
+            each["name"],
+            _correction(each["value"], signed=True),
+            _correction(each["sigma"]),
+            _correction(each["prior_sigma"]),
+            "freed" if each["is_freed"] else each["reason"],
+        )
+        for each in document["choices"]
+    ]
+    columns = ("of", "correction", "by the drives", "sigma", "sigma in robot.yaml", "freed, or why not")
+    note = "What stretches of the drives, each on its own, tell of each number, and what self-calibration made of that."
+    return _table("choices", "Self-calibration", note, columns, rows)
 
 
 def _correction(value: float | None, *, signed: bool = False) -> str:

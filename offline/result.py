@@ -213,6 +213,32 @@ class CalibrationResult:
 
 
 @dataclass(frozen=True)
+class CalibrationChoice:
+    """Whether self-calibration freed one number of robot.yaml, and why not.
+
+    Attributes:
+        owner: robot id, or the printed batch of tags.
+        name: as in CalibrationResult.
+        value: the correction by the drives alone, with its sigma.
+        prior_sigma: what robot.yaml says of it.
+        off_sigmas: how far drives and robot.yaml differ.
+        held_out_gain: log likelihood of each stretch by what the other stretches tell, over that by robot.yaml; summed.
+            None where no two stretches tell anything of it.
+        reason: why it stays as robot.yaml has it; empty where it is freed.
+    """
+
+    owner: str
+    name: str
+    is_freed: bool
+    value: float
+    sigma: float
+    prior_sigma: float
+    off_sigmas: float
+    held_out_gain: float | None
+    reason: str
+
+
+@dataclass(frozen=True)
 class MeasurementResult:
     """What a person measured, and what the map makes of it."""
 
@@ -326,6 +352,7 @@ class MapResult:
     suspects: tuple[SuspectTag, ...] = ()
     noise_fit: FittedNoise | None = None  # None: the noise was given
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
+    choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none where it was off
     kept: tuple[KeptChain, ...] = ()  # each run's measurements, to solve them again together with another run's
 
     @property

@@ -7,6 +7,7 @@ from calib.arrays import FloatArray
 from offline.graph import Graph
 from offline.local_map import LocalMap
 from offline.merge import Group
+from offline.run import Run
 from offline.solver import Solution
 
 
@@ -38,7 +39,9 @@ class Workings:
     Attributes:
         maps: the local maps as they were aligned.
         solved: the components, largest first.
+        runs: as they were given.
     """
 
     maps: list[LocalMap] = field(default_factory=list)
     solved: list[Solved] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)

@@ -21,7 +21,7 @@ CAMERAS = {
     "equidistant": (-0.01, 0.004, -0.002, 0.0003),
 }
 N_POSES, N_TAGS, N_LOOKS = 5, 3, 12
-SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01])
+SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
 WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces somebody who looks along x
 
 
@@ -53,6 +53,7 @@ def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFa
         mount_parameters=np.tile(np.arange(1, 7), (N_LOOKS, 1)),
         time_parameter=np.full(N_LOOKS, 7),
         scale_parameter=np.full(N_LOOKS, 8),
+        focal_parameter=np.full(N_LOOKS, 9),
     )
     return CornerFactors(looks, (camera, replace(camera, fx_px=700.0)))
 

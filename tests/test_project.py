@@ -24,6 +24,7 @@ COMMANDS = [
     ("onboard.cli", "status"),
     ("offline.cli",),
     ("offline.cli", "map"),
+    ("offline.cli", "calibrate"),
     ("offline.cli", "localize"),
     ("offline.cli", "import"),
     ("offline.cli", "info"),
