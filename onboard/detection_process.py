@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.camera_model import CameraModel
 from calib.picture_bytes import is_jpeg
+from onboard.ending import ENDING_SIGNALS
 from onboard.errors import OnboardError
 from onboard.picture import decode, decode_grey, encode_jpeg, to_grey
 from onboard.tag_detector import Detection, TagDetector
@@ -85,6 +86,8 @@ class ChildDetector:
         self._on_restart = on_restart
         self._job_limit_s = job_limit_s
         self._closing = threading.Event()
+        self._lock = threading.Lock()  # whoever holds it starts or ends a child
+        self._n_jobs = 0
         self._jobs: queue.SimpleQueue[tuple[Picture, bool, Callable[[DetectionResult], None]] | None]
         self._jobs = queue.SimpleQueue()
         self._start_child()
@@ -105,8 +108,9 @@ class ChildDetector:
         """Ends the child; pictures still queued after half a second come to nothing."""
         self._jobs.put(None)
         self._thread.join(_END_LIMIT_S)
-        self._closing.set()  # from here on nobody starts another
-        self._process.kill()
+        with self._lock:
+            self._closing.set()  # from here on nobody starts another
+            self._process.kill()
         self._thread.join()
         self._stop_child()
 
@@ -120,15 +124,36 @@ class ChildDetector:
             on_result(result)
 
     def _run(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
+        overdue = threading.Event()
+        process = self._process
+
+        def end_child() -> None:
+            overdue.set()
+            process.kill()
+
+        # A child that has stopped takes no picture either: `send` would wait for it for ever.
+        limit = threading.Timer(self._job_limit_s, end_child)
+        limit.daemon = True
+        limit.start()
         try:
-            self._connection.send((picture, want_jpeg))
-            if self._connection.poll(self._job_limit_s):
-                result: DetectionResult = self._connection.recv()
-                return result
-            reason = f"detection gave no answer for {self._job_limit_s:g} s"
+            return self._answer(picture, want_jpeg)
         except (OSError, EOFError):
-            reason = "detection crashed"
+            reason = (
+                f"detection gave no answer for {self._job_limit_s:g} s" if overdue.is_set() else "detection crashed"
+            )
+        except Exception as error:  # a fault of ours or of a library's costs this picture, not all that come after it
+            reason = f"detection failed: {error!r}"
+        finally:
+            limit.cancel()
         return DetectionResult([], (0, 0), None, self._replace_child(reason))
+
+    def _answer(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
+        self._n_jobs += 1
+        self._connection.send((self._n_jobs, picture, want_jpeg))
+        number, result = self._connection.recv()
+        if number != self._n_jobs or not isinstance(result, DetectionResult):
+            raise OnboardError(f"an answer to picture {number} came for picture {self._n_jobs}")
+        return result
 
     def _replace_child(self, reason: str) -> str:
         """Returns the reason with what became of it."""
@@ -138,7 +163,7 @@ class ChildDetector:
         try:
             self._stop_child()
             self._start_child()
-        except OnboardError as error:
+        except Exception as error:  # the next picture tries again
             reason = f"{reason}; {error}"
         else:
             reason = f"{reason}; its process was started again"
@@ -148,24 +173,34 @@ class ChildDetector:
 
     def _start_child(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(
+        ours, theirs = context.Pipe()
+        process = context.Process(
             target=_child, args=(theirs, self._settings), name="groundsbot-detection", daemon=True
         )
-        with _signals_held_back():
-            self._process.start()
+        with self._lock:
+            if self._closing.is_set():
+                raise OnboardError("the recording is at its end")
+            with _signals_held_back():
+                process.start()
+            self._connection, self._process = ours, process
         theirs.close()
-        if self._closing.is_set():  # close() may have ended the one before this
-            self._process.kill()
+        try:
+            self.library, self.settings = self._greeting()
+        except BaseException:
+            self._stop_child()  # a greeting that comes late must not be taken for an answer
+            raise
+
+    def _greeting(self) -> tuple[str, str]:
+        """The name of the library and how it is set, once the child is ready."""
         try:
             if not self._connection.poll(_START_LIMIT_S):
                 raise OnboardError(f"detection process did not start within {_START_LIMIT_S:g} s; try again")
-            answer = self._connection.recv()
+            greeting: tuple[str, str] | str = self._connection.recv()
         except (OSError, EOFError) as error:
             raise OnboardError("detection process died at its start; try the other recorder.detector") from error
-        if isinstance(answer, str):
-            raise OnboardError(answer)
-        self.library, self.settings = answer
+        if isinstance(greeting, str):
+            raise OnboardError(greeting)
+        return greeting
 
     def _stop_child(self) -> None:
         self._connection.close()
@@ -175,8 +210,8 @@ class ChildDetector:
 
 @contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """A child started herein holds back Ctrl-C until it can say that it wants none; this thread only meanwhile."""
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    """A child started herein holds back what ends programs until it can ignore it; this thread only meanwhile."""
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     try:
         yield
     finally:
@@ -185,9 +220,9 @@ def _signals_held_back() -> Iterator[None]:
 
 def _child(connection: Connection, settings: DetectorSettings) -> None:
     """Runs in the child: answers until the parent is gone."""
-    for each in (signal.SIGINT, signal.SIGTERM):  # the parent decides when recording ends
+    for each in ENDING_SIGNALS:  # the parent decides when recording ends
         signal.signal(each, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, 0)  # the recorder goes first, also where it is allowed to be in a hurry
     # A detection that hangs would not notice that its parent was killed.
@@ -203,8 +238,8 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
     connection.send((detector.library, detector.settings))
     while True:
         try:
-            picture, want_jpeg = connection.recv()
-            connection.send(_detect(detector, picture, want_jpeg, settings.jpeg_quality))
+            number, picture, want_jpeg = connection.recv()
+            connection.send((number, _detect(detector, picture, want_jpeg, settings.jpeg_quality)))
         except (EOFError, OSError):
             return
 

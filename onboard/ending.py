@@ -5,7 +5,7 @@ import signal
 import threading
 from typing import Final
 
-_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def told_to_end() -> threading.Event:
@@ -19,7 +19,7 @@ def told_to_end() -> threading.Event:
     read_fd, write_fd = os.pipe()
     os.set_blocking(write_fd, False)
     signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
-    for each in _ENDING_SIGNALS:
+    for each in ENDING_SIGNALS:
         if signal.getsignal(each) is not signal.SIG_IGN:
             signal.signal(each, lambda *_: None)
 

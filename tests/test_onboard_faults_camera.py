@@ -172,6 +172,9 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
     monkeypatch.setattr("onboard.detection_process._JOB_LIMIT_S", 0.5)
     monkeypatch.setattr("onboard.detection_process.ChildDetector.__init__.__defaults__", (None, 0.5))
     camera, picture = PictureFolder(tmp_path / "pictures"), tag_jpeg()
+    # More than the pipe to a process holds, so that one which takes nothing cannot be handed it.
+    noise = np.random.default_rng(36).integers(0, 255, (1000, 1000), np.uint8)
+    large = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     with Driver(tmp_path / "wheels") as driver:
         driver.plug_in()
         with recording(both, tmp_path / "logs") as made:
@@ -182,7 +185,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
             assert detector is not None
             first = detector._process.pid or 0
             os.kill(first, fault)
-            camera.show(picture)
+            camera.show(large)
             made.wait_for(EventKind.DETECTOR_RESTARTED)
             camera.show(picture)
             made.wait_for_messages("/tags/detections", 2)

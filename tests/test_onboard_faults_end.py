@@ -65,7 +65,15 @@ def recorder(
     program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **(environment or {})}
-    process = subprocess.Popen(command, cwd=folder, stdout=stdout, stderr=subprocess.STDOUT, text=True, env=environment)
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        stdout=stdout,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
     try:
         yield process
     finally:
@@ -144,11 +152,12 @@ def both(tmp_path: Path) -> Path:
     return robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}", "{picture_rate_hz: 30}")
 
 
-@pytest.mark.parametrize("number", BOTH_SIGNALS)
+@pytest.mark.parametrize("number", [*BOTH_SIGNALS, signal.SIGHUP])
 def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: signal.Signals) -> None:
+    """With its detection, as a terminal does: by Ctrl-C, or where it is closed."""
     with full_load(tmp_path), recorder(tmp_path, both) as process:
         wait_for_load(tmp_path)
-        process.send_signal(number)
+        os.killpg(process.pid, number)
         said = ended_within(process, LIMIT_S)
     assert process.returncode == 0, said
     log = only_log(tmp_path)
