@@ -36,7 +36,7 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
         apart_x, apart_y = values.poses[last, 0] - values.poses[i, 0], values.poses[last, 1] - values.poses[i, 1]
         x, y = cos_i * apart_x + sin_i * apart_y, cos_i * apart_y - sin_i * apart_x
         t = wheel_correction(odometry, m, values.calibration)
-        e, J = _error(motion_at(odometry, m, t), x, y, values.poses[last, 2] - values.poses[i, 2])
+        e, J = error_of(motion_at(odometry, m, t), x, y, values.poses[last, 2] - values.poses[i, 2])
         s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
         L = _scaled(odometry.information[m], s)
         f = _times_vector(L, e)
@@ -49,7 +49,7 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
         _add_blocks(system, i, H, A)
         _add_gradient(system.gradient, 3 * i, f, J, A)
         if odometry.slots[m, 0] >= 0 or odometry.slots[m, 1] >= 0 or odometry.slots[m, 2] >= 0:
-            _by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
+            error_by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
             _unpacked(M, L, A, f, scratch)
             _add_wheels(odometry, m, free, scratch, system)
     return total
@@ -86,7 +86,7 @@ def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, floa
 
 
 @inner
-def _error(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
+def error_of(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
     """log(motion^-1 o moved), and (a, b, p, q) of Jr^-1 with the rows (a, -b, p), (b, a, q), (0, 0, 1)."""
     dx, dy, omega = x - motion[0], y - motion[1], wrapped(turn - motion[2])
     cos, sin = motion[3], motion[4]
@@ -205,7 +205,7 @@ def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) 
 
 
 @inner
-def _by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
+def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
     """C <- S^-1 d(S e)/dc: log(exp(-(t + dt)) o G) with t = K c, the change enters on the left."""
     along, even, odd = series(t[2])
     across = t[2] * even

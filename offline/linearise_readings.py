@@ -25,7 +25,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
-        _reading_factor(readings, m, values, by_calibration, r, J)
+        reading_factor(readings, m, values, by_calibration, r, J)
         rho, w = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
         total += rho
         a0, a1, a2, b0, b1, b2 = J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2]
@@ -84,7 +84,7 @@ def _add_calibration(
 
 
 @inlined
-def _reading_factor(
+def reading_factor(
     readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
     """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `factors.ReadingFactors`."""

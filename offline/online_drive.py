@@ -1,29 +1,23 @@
-"""What a robot has driven and read since it was put down, to be solved as a whole when there is time."""
+"""What a robot has driven and read since it was put down: as factors for a sweep, and as a chain for a solve."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from math import cos, sin
+from typing import Any, Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
+from calib.arrays import FloatArray, IntArray
 from calib.robot import Robot
 from offline.chain import Chain
-from offline.goodness import Goodness
-from offline.graph import Parameter, build_graph
-from offline.held_run import solve_held
+from offline.factors import whitening
+from offline.graph import NO_PARAMETER, Parameter, mount_parameters_of, parameters_of_camera, parameters_of_wheels
 from offline.kept_maps import measured_chain, run_without_log
-from offline.known_map import KnownMap
-from offline.local_map import LocalMap, solve_local_map
-from offline.located import Located, locate
-from offline.online_filter import OnlineFilter
+from offline.online_kernels import Motions, Sights
 from offline.run import TagKey
-from offline.solver import Solution
 
 _NAME: Final = "the drive"
-_COMPONENT: Final = 0  # there is one only
-_UNJUDGED: Final = Goodness(0.0, 0, 0.0, 1.0, 1.0)
+_ROOM: Final = 1024
 
 
 @dataclass(frozen=True)
@@ -48,106 +42,124 @@ class TagReading:
     in_camera: bool = True
 
 
+class Table:
+    """Rows of named arrays that grow: copied when they double, so an hour's drive is copied in under a millisecond."""
+
+    def __init__(self, **columns: tuple[tuple[int, ...], type]) -> None:
+        """Without rows; shape and type of each column."""
+        self.n = 0
+        self._columns: dict[str, Any] = {
+            name: np.empty((_ROOM, *shape), kind) for name, (shape, kind) in columns.items()
+        }
+
+    def append(self, **row: Any) -> None:  # noqa: ANN401 (what a column takes)
+        """One more."""
+        if self.n == len(next(iter(self._columns.values()))):
+            self._columns = {name: np.concatenate([each, np.empty_like(each)]) for name, each in self._columns.items()}
+        for name, value in row.items():
+            self._columns[name][self.n] = value
+        self.n += 1
+
+    def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (of the column's type)
+        """A column; what is written to it stays."""
+        return self._columns[name][: self.n]
+
+
 class Drive:
-    """Motions and readings in order of time: some 10 MB in an hour."""
+    """Motions and readings in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
 
-    def __init__(self, robot: Robot) -> None:
-        """Has not moved yet."""
-        self._robot = robot
-        self._motions: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        self._poses = [np.zeros(3)]
-        self._readings: list[tuple[int, TagKey, TagReading]] = []
-
-    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray, pose: FloatArray) -> None:
-        """A motion, and the pose that it led to."""
-        self._motions.append((motion, covariance, by_wheels))
-        self._poses.append(pose)
-
-    def add_reading(self, tag: TagKey, reading: TagReading) -> None:
-        """Of a tag, from the last pose."""
-        self._readings.append((len(self._motions), tag, reading))
-
-    def move_frame(self, T_new_old: FloatArray) -> None:
-        """All poses into another frame."""
-        self._poses = list(se2.compose(T_new_old, np.array(self._poses)))
-
-    def settle(
-        self,
-        state: OnlineFilter,
-        known: KnownMap,
-        parameters: Sequence[Parameter],
-        tags: Sequence[TagKey],
-        held: Mapping[TagKey, TagKey],
-        loose: Mapping[TagKey, TagKey],
-        placed: Located | None = None,
-    ) -> dict[TagKey, TagKey]:
-        """Solves it all, tags that were moved apart, and gives the filter what comes of it.
+    def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
+        """Has not moved yet.
 
         Args:
-            state: takes mean and covariance; calibration that nothing read depends on stays.
-            known: the map.
-            parameters: of the filter.
-            tags: of the filter, in its order.
-            held: the map's tag of each of those that hold the robot.
-            loose: likewise of those that do not.
-            placed: where the drive lies by `judged`, which the solve then starts from; else from where the filter is.
-
-        Returns:
-            The map's tag of each that holds it now.
+            robot: whose.
+            parameters: of calibration, which factors index.
         """
-        if placed is None or placed.alignment is None:
-            start = self._poses[0]
-            member = self._local_map(state, tags, parameters, start)
-        else:
-            start, member = placed.alignment.T_a_b, placed.local_map
-        found = solve_held([member], start[None], [dict(held)], [dict(loose)], known)
-        solution, columns = found.solution, found.graph.problem.columns
-        self._poses = list(solution.state.poses)
-        own = {parameter: i for i, parameter in enumerate(found.graph.parameters)}
-        at = [own.get(parameter, -1) for parameter in parameters]
-        where = [found.graph.tags.index(found.called[0].get(tag, tag)) for tag in tags]
-        of_numbers = np.array([-1 if i < 0 else columns.calibration[i] for i in at], dtype=np.int64)
-        wanted = np.concatenate([columns.poses[-1], of_numbers, columns.tags[where].reshape(-1)])
-        values = [state.calibration[n] if i < 0 else solution.state.calibration[i] for n, i in enumerate(at)]
-        covariance = solution.covariance(wanted)
-        state.set_to(self._poses[-1], np.array(values), solution.state.tags[where], covariance, of_numbers >= 0)
-        return {tag: name for tag, name in found.called[0].items() if name in known.index}
+        self._robot = robot
+        index = {parameter: i for i, parameter in enumerate(parameters)}
+        self._wheels = [index[each] for each in parameters_of_wheels(robot)]
+        self._of_mount = [index[each] for each in mount_parameters_of(robot)]
+        self._of_camera = [index[each] for each in parameters_of_camera(robot)]
+        self._none = index[NO_PARAMETER]
+        square = ((3, 3), float)
+        self._motions = Table(
+            motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
+        )
+        self._poses = Table(T=((3,), float))
+        self._poses.append(T=np.zeros(3))
+        self._readings = Table(
+            keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
+            in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, 3), float),
+            parameters=((7,), int),
+        )  # fmt: skip
 
-    def judged(self, known: KnownMap) -> Located | None:
-        """Where it lies in the map as `localize` would say, whatever the filter holds; None without tags of the map."""
-        tags = {tag for _, tag, _ in self._readings}
-        if not tags & known.instances.keys():
-            return None
-        return locate(solve_local_map(self._chain(sorted(tags))), known, _COMPONENT)
+    @property
+    def poses(self) -> FloatArray:
+        """(K, 3) about where each keyframe is; the factors are linearised there. May be written to."""
+        poses: FloatArray = self._poses["T"]
+        return poses
 
-    def _local_map(
-        self, state: OnlineFilter, tags: Sequence[TagKey], parameters: Sequence[Parameter], start: FloatArray
-    ) -> LocalMap:
-        """In the frame of its start, as the filter has it."""
-        chain = self._chain(tags)
-        graph = build_graph([chain])
-        T_start_map = se2.inverse(start)
-        places = dict(zip(tags, se2.apply(T_start_map, state.tags), strict=True))
-        numbers = dict(zip(parameters, state.calibration.tolist(), strict=True))
-        begun = graph.start(se2.compose(T_start_map, np.array(self._poses)), places, numbers)
-        unsolved = Solution(begun, (graph.problem.cost(begun),), "as filtered", converged=False, problem=graph.problem)
-        return LocalMap(chain, graph, unsolved, _UNJUDGED)
+    @property
+    def keyframe(self) -> IntArray:
+        """(R,) of each reading."""
+        keyframe: IntArray = self._readings["keyframe"]
+        return keyframe
 
-    def _chain(self, seen_tags: Sequence[TagKey]) -> Chain:
-        tags = tuple(sorted(seen_tags))
-        index = {tag: i for i, tag in enumerate(tags)}
-        keyframe, seen, readings = zip(*self._readings, strict=True)
-        by_camera = [np.zeros((2, 3)) if each.by_camera is None else each.by_camera for each in readings]
+    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
+        """A motion; `poses` ends with what it leads on from twice."""
+        x, y, theta = np.asarray(motion).tolist()
+        self._motions.append(
+            motion=(x, y, theta, cos(theta), sin(theta)),
+            covariance=covariance,
+            whitening=whitening(np.asarray(covariance)),
+            jacobian=by_wheels,
+            parameters=self._wheels,
+        )
+        self._poses.append(T=self._poses["T"][-1])
+
+    def add_reading(self, tag: int, reading: TagReading, scale: int) -> None:
+        """Of a tag, by its index, from the last pose; which parameter scales its size."""
+        in_camera, mount = reading.in_camera, self._robot.mount
+        of_mount = self._of_mount if in_camera else [self._none] * 3
+        of_camera = self._of_camera if in_camera and reading.by_camera is not None else [self._none] * 3
+        self._readings.append(
+            keyframe=self._poses.n - 1,
+            tag=tag,
+            value=reading.value,
+            covariance=reading.covariance,
+            polar=reading.polar,
+            in_camera=in_camera,
+            whitening=whitening(np.asarray(reading.covariance, dtype=np.float64)),
+            mount=(mount.x_m, mount.y_m, mount.yaw_rad) if in_camera else 0.0,
+            by_camera=0.0 if reading.by_camera is None else reading.by_camera,
+            parameters=[*of_mount, scale, *of_camera],
+        )
+
+    def motions(self, begin: int, end: int) -> Motions:
+        """The motions to the keyframes after `begin` up to `end`."""
+        return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
+
+    def sights(self, begin: int, end: int, keyframe: int) -> Sights:
+        """Some readings, poses counted from a keyframe."""
+        table = self._readings
+        return Sights(table["keyframe"][begin:end] - keyframe, *(table[name][begin:end] for name in Sights._fields[1:]))
+
+    def chain(self, tags: Mapping[TagKey, int]) -> Chain:
+        """All of it, as from a log; the tags by their indices."""
+        ordered = tuple(sorted(tags))
+        place = np.empty(len(tags), dtype=np.int64)
+        place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
+        motions, readings = self._motions, self._readings
         return measured_chain(
-            run_without_log(_NAME, self._robot, tags),
-            np.arange(len(self._poses)),
-            tuple(np.array(each) for each in zip(*self._motions, strict=True)),
-            tags,
-            np.array(keyframe),
-            np.array([index[tag] for tag in seen]),
-            np.array([each.value for each in readings], dtype=np.float64),
-            np.array([each.covariance for each in readings], dtype=np.float64),
-            np.array(by_camera, dtype=np.float64),
-            np.array([each.polar for each in readings]),
-            np.array([each.in_camera for each in readings]),
+            run_without_log(_NAME, self._robot, ordered),
+            np.arange(self._poses.n),
+            (motions["motion"][:, :3], motions["covariance"], motions["jacobian"]),
+            ordered,
+            readings["keyframe"],
+            place[readings["tag"]],
+            readings["value"],
+            readings["covariance"],
+            readings["by_camera"],
+            readings["polar"],
+            readings["in_camera"],
         )

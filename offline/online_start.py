@@ -20,8 +20,6 @@ from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold, ill_fittin
 from offline.known_map import KnownMap
 from offline.run import TagKey
 
-# Of pairs of tags, looked at in one call.
-_PAIRS_A_CALL: Final = 1
 _STEPS: Final = 4
 # Two tags are held against each other by their distance alone, which a tag that was moved aside keeps: nothing
 # contradicts a place that is off by as much. Any one of three is told by the others.
@@ -56,39 +54,35 @@ class Start:
 
 
 class StartSearch:
-    """Goes through the pairs of tags seen, and begins anew when there is another one."""
+    """Goes through the pairs of tags seen, one a call, and begins anew when there is another tag, or no verdict."""
 
     def __init__(self, known: KnownMap) -> None:
         self._known = known
         self._pairs: list[tuple[int, TagKey]] = []
-        self._left: list[tuple[int, int]] = []
+        self._left: list[tuple[int, int]] | None = None  # pairs to look at; None when it begins anew
         self._found: list[Explanation] = []
         self.reason = "no tag of the map was seen yet"
 
     def look(self, seen: SeenTags) -> Start | None:
-        """Looks at some more pairs; the start when that is sure, else None and `reason`."""
+        """Looks a little further; the start when that is sure, else None and `reason`."""
         pairs = [(i, tag) for i, own in enumerate(seen.tags) for tag in self._known.instances.get(own, ())]
-        begins = pairs != self._pairs or not self._left
-        self._pairs = pairs
         if len({i for i, _ in pairs}) < 2:
             self.reason = f"{'one tag' if pairs else 'no tag'} of the map was seen; two are needed"
             return None
+        if pairs == self._pairs and self._left is not None and not self._left:
+            self._left = None
+            return self._verdict(len(pairs))
         fit = _RigidFit(self._known, seen, pairs)
-        if begins:  # all of it anew: by now the places are better known
-            self._found, self._left = [], fit.same_distances()
-        for _ in range(_PAIRS_A_CALL):
-            if not self._left:
-                break
-            i, j = self._left.pop(0)
-            found = fit.grown(i, j)
+        if pairs != self._pairs or self._left is None:  # all of it anew: by now the places are better known
+            self._pairs, self._found, self._left = pairs, [], fit.same_distances()
+        else:
+            found = fit.grown(*self._left.pop(0))
             if found is not None:
                 self._found.append(found)
                 known = np.flatnonzero(found.members).tolist()
                 self._left = [pair for pair in self._left if not set(pair) <= set(known)]
-        if self._left:
-            self.reason = "looking for the start"
-            return None
-        return self._verdict(len(pairs))
+        self.reason = "looking for the start"
+        return None
 
     def _verdict(self, n: int) -> Start | None:
         if not self._found:

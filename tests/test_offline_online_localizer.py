@@ -1,4 +1,4 @@
-"""The class for the robot: reading by reading, with the sigmas of the batch, and settled with its result."""
+"""The class for the robot: reading by reading, with the result of the batch."""
 
 from dataclasses import replace
 
@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import offline
-from calib import se2
 from offline.chain import Chain
 from offline.errors import OfflineError
+from offline.localization import LocatedRun
 from offline.localizing import localize_maps
 from offline.online_drive import TagReading
-from offline.online_filter import OnlineFilter
 from offline.online_localizer import OnlineLocalizer
 from tests.benchmarks.localize_study import Scene, against, filtered, judged, made_scene, missed, taken_one_by_one
 
@@ -24,20 +23,22 @@ def scene() -> Scene:
 
 
 def test_the_study_in_small(scene: Scene) -> None:
-    """Its bounds, of one seed with moved tags and one without; sigmas of the filter alone, too."""
+    """Its bounds, of one seed with moved tags and one without, the online class within 2 % of a sigma of the batch."""
     moved = made_scene(3)
     assert moved is not None
     rows = [judged(4, scene), judged(3, moved)]
-    assert [sentence for sentence in missed(rows) if "NEES" not in sentence] == []
+    assert [sentence for sentence in missed(rows) if "NEES" not in sentence and "slowest" not in sentence] == []
     assert (rows[1].moved_missed, rows[1].falsely_named) == (0, 0)
-    assert rows[0].filter_sigma is not None
-    assert rows[0].filter_sigma < 0.1  # two to three times too sure without the invariant errors
     for row in rows:
         assert row.found
         assert row.nees is not None
         assert row.nees < 6.9  # chi-square with two degrees of freedom, once in a thousand times, were all poses one
         assert row.settled_off is not None
         assert row.settled_off < 1e-3
+    assert rows[0].online_off is not None
+    assert rows[0].online_off < 1e-3
+    # Three of the four tags seen were moved: nothing is told before all is judged at once.
+    assert "may as well be those that stayed" in rows[1].online_reason
 
 
 def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None:
@@ -56,12 +57,13 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
     assert reasons[-1] == ""
 
 
-def test_settling_judges_anew_which_tags_stayed() -> None:
-    """Of a drive in which the filter took a moved tag for one that stayed, and then one that stayed for moved."""
+def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
+    """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
     made = made_scene(47)
     assert made is not None
     online = OnlineLocalizer(made.known, made.drive.chain.run.robot)
     seen, starts = set[int](), []
+    doubted = set[int]()
     for motion, readings in taken_one_by_one(made.drive.chain):
         if motion is not None:
             online.add_motion(*motion)
@@ -69,13 +71,14 @@ def test_settling_judges_anew_which_tags_stayed() -> None:
             seen.add(reading.tag_id)
             if online.add_reading(reading) is not None:
                 starts.append(len(seen))
+            doubted |= {tag.tag_id for tag in online.moved_tags}
     assert starts[0] == 3  # two agree by their distance only, which a tag that was moved may keep
-    online.settle()
+    assert doubted - made.moved
+    assert {tag.tag_id for tag in online.moved_tags} == made.moved
     (run,) = localize_maps([made.local_map], made.known).runs
-    off, sigma = against(run, online)
-    assert off is not None
-    assert sigma is not None
-    assert max(off, sigma) < 0.02
+    assert _most_off(run, online) < 0.02
+    online.settle()
+    assert _most_off(run, online) < 1e-3
     assert {tag.tag_id for tag in online.moved_tags} == made.moved
 
 
@@ -130,30 +133,13 @@ def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene)
         if k == half:
             online.settle()
     (run,) = localize_maps([scene.local_map], scene.known).runs
+    assert _most_off(run, online) < 0.02
     online.settle()
+    assert _most_off(run, online) < 1e-3
+
+
+def _most_off(run: LocatedRun, online: OnlineLocalizer) -> float:
     off, sigma = against(run, online)
     assert off is not None
     assert sigma is not None
-    assert max(off, sigma) < 0.02
-
-
-def test_a_motion_of_everything_is_not_learned_from_a_reading() -> None:
-    """In a frame whose turn nothing tells of, moving the mean keeps that turn's uncertainty."""
-    state = OnlineFilter(np.zeros(1), np.zeros((1, 1)))
-    state.pose = np.array([30.0, 4.0, 0.3])
-    place_m = np.array([32.0, 5.0])
-    by_state = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    state.add_tag(place_m, by_state, 0.01 * np.eye(2))
-    turn = state._by_motion()  # about the pose
-    about_origin = turn @ np.array([-4.0, 30.0, 1.0])
-    state.covariance += 0.04**2 * np.outer(about_origin, about_origin) + 1e-4 * np.eye(len(about_origin))
-    before = state.covariance.copy()
-    columns = state.columns_of([0])
-    state.correct(columns, np.eye(2), np.array([0.05, -0.4]), 1e6 * np.eye(2))  # tells as good as nothing
-    np.testing.assert_allclose(state.covariance, before, rtol=1e-3, atol=1e-5)
-    state._step(0.02 * about_origin)
-    moved = state._by_motion() @ np.array([-state.pose[1], state.pose[0], 1.0])
-    weight = np.linalg.inv(state.covariance)
-    assert moved @ weight @ moved == pytest.approx(about_origin @ np.linalg.inv(before) @ about_origin, rel=0.01)
-    np.testing.assert_allclose(np.hypot(*state.pose[:2]), np.hypot(30.0, 4.0), rtol=1e-6)
-    assert se2.wrap_angle(state.pose[2] - 0.32) == pytest.approx(0.0, abs=1e-6)
+    return max(off, sigma)

@@ -10,9 +10,13 @@ joint solve of all.
 
 Asked for: NEES of the position, per dimension over all keyframes, 0.85 to 1.15; the start found wherever three tags
 or more were seen that hang where the map has them; nowhere wrong and sure (beyond once in a million by its own
-covariance, and 0.3 m); the last pose of the online class within 2 % of the sigma of the batch's, and its sigma too,
-once it has settled (as a filter alone it is told beside that); the extended map within 1 % of the sigmas. Exit 1 where
-one is missed.
+covariance, and 0.3 m); the last pose of the online class within 2 % of the sigma of the batch's, and its sigma too, as
+it stands after the last reading and once it has settled; each call in less than 2 ms; the extended map within 1 % of
+the sigmas. Exit 1 where one is missed.
+
+Calls are timed by their thread's processor time. On a machine that is shared, that holds what others push out of its
+caches and the time that its host takes: the same work takes three times as long once in a thousand calls. So the drive
+is gone through three times, and of each call the least counts; the slowest call of a single drive is told beside that.
 """
 
 import argparse
@@ -45,7 +49,8 @@ from offline.stages import Stages
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 
 NEES: Final = (0.85, 1.15)
-FILTER_SHARE: Final = 0.02
+ONLINE_SHARE: Final = 0.02
+SLOWEST_MS: Final = 2.0
 EXTENDED_SHARE: Final = 0.01
 N_CROSSINGS: Final = 2
 MAP_LENGTH_M: Final = 125.0
@@ -53,6 +58,7 @@ TAG_SPACING_M: Final = (2.0, 6.0)
 _WRONG: Final = float(chi2.isf(1e-6, 3))
 _WRONG_M: Final = 0.3
 _ENOUGH: Final = 3
+_REPEATS: Final = 3
 _OF_MOVED: Final = ("moved_named", "moved_missed", "falsely_named")
 _MOVED_EVERY: Final = 4
 _EXTENDED_EVERY: Final = 10
@@ -87,12 +93,14 @@ class Told:
     moved_named: int = 0
     moved_missed: int = 0
     falsely_named: int = 0
-    filter_off: float | None = None  # from the batch's last pose, in its sigmas, the worst of three
-    filter_sigma: float | None = None  # its sigmas over the batch's, less one, the worst of three
+    online_off: float | None = None  # from the batch's last pose, in its sigmas, the worst of three
+    online_sigma: float | None = None  # its sigmas over the batch's, less one, the worst of three
     settled_off: float | None = None  # the same when it has settled
     settled_sigma: float | None = None
-    median_ms: float | None = None  # of processor time, for a reading
-    slowest_ms: float | None = None  # motion or reading
+    online_reason: str = ""  # why it tells no place
+    n_calls: int = 0
+    calls_ms: tuple[float, float, float] | None = None  # of processor time: median, 99.9 %, worst
+    single_ms: float | None = None  # the worst of a single drive
     extended_off: float | None = None
     extended_sigma: float | None = None
 
@@ -155,8 +163,12 @@ def judged(seed: int, scene: Scene) -> Told:
     off = run.T_map_base - scene.T_map_base
     off[:, 2] = se2.wrap_angle(off[:, 2])
     squares = (off[:, :2] * np.linalg.solve(run.covariance[:, :2, :2], off[:, :2, None])[..., 0]).sum(axis=1)
-    online, milliseconds = filtered(scene)
-    filter_off, filter_sigma = against(run, online)
+    online, *milliseconds = filtered(scene)
+    for _ in range(_REPEATS - 1):
+        milliseconds.append(filtered(scene)[1])
+    calls_ms = np.array(milliseconds).min(axis=0)
+    online_off, online_sigma = against(run, online)
+    reason = online.reason
     online.settle()
     settled_off, settled_sigma = against(run, online)
     extended_off, extended_sigma = extended_against(scene) if seed % _EXTENDED_EVERY == 0 else (None, None)
@@ -171,12 +183,14 @@ def judged(seed: int, scene: Scene) -> Told:
         moved_named=len(named & scene.moved),
         moved_missed=len((scene.moved & in_map) - named),
         falsely_named=len(named - scene.moved),
-        filter_off=filter_off,
-        filter_sigma=filter_sigma,
+        online_off=online_off,
+        online_sigma=online_sigma,
         settled_off=settled_off,
         settled_sigma=settled_sigma,
-        median_ms=float(np.median(milliseconds)),
-        slowest_ms=float(np.max(milliseconds)),
+        online_reason=reason,
+        n_calls=len(calls_ms),
+        calls_ms=(float(np.median(calls_ms)), float(np.quantile(calls_ms, 0.999)), float(calls_ms.max())),
+        single_ms=float(np.max(milliseconds[0])),
         extended_off=extended_off,
         extended_sigma=extended_sigma,
     )
@@ -189,12 +203,12 @@ def filtered(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
     milliseconds = []
     for motion, readings in taken_one_by_one(chain):
         for reading in readings if motion is None else [None, *readings]:
-            began_ns = time.process_time_ns()
+            began_ns = time.thread_time_ns()
             if reading is not None:
                 online.add_reading(reading)
             elif motion is not None:
                 online.add_motion(*motion)
-            milliseconds.append((time.process_time_ns() - began_ns) * 1e-6)
+            milliseconds.append((time.thread_time_ns() - began_ns) * 1e-6)
     return online, milliseconds
 
 
@@ -247,25 +261,32 @@ def missed(rows: Sequence[Told]) -> list[str]:
     lost = [row.seed for row in rows if row.shared >= _ENOUGH and not row.found]
     wrong = [row.seed for row in rows if row.is_wrong]
     settled = _worst([row.settled_off for row in found], [row.settled_sigma for row in found])
-    alone = _worst([row.filter_off for row in found], [row.filter_sigma for row in found])
     extended = _worst([row.extended_off for row in found], [row.extended_sigma for row in found])
-    off = [row.filter_off for row in found if row.filter_off is not None]
-    slowest = [row.slowest_ms for row in found if row.slowest_ms is not None]
+    told = [(row.seed, max(row.online_off, row.online_sigma or 0.0)) for row in found if row.online_off is not None]
+    beyond = [(seed, round(off, 3)) for seed, off in told if off > ONLINE_SHARE]
+    in_doubt = [row.seed for row in found if row.online_off is None]
+    calls_ms = np.array([row.calls_ms for row in found if row.calls_ms is not None])
+    slowest = calls_ms[:, 2]
+    single = [row.single_ms for row in found if row.single_ms is not None]
     named, unnamed, false = (sum(getattr(row, name) for row in found) for name in _OF_MOVED)
     _tell(
         f"{len(rows)} runs, {len(found)} located; position NEES {nees:.3f}; seeds with {_ENOUGH} tags or more not "
         f"located: {lost}; wrong and sure: {wrong}\n"
         f"moved tags: {named} named, {unnamed} not, {false} falsely named\n"
-        f"online, settled: worst {settled:.2g} sigma from the batch; as a filter alone: median {np.median(off):.2g}, "
-        f"worst {alone:.2g}; a call takes {np.median([row.median_ms for row in found if row.median_ms]):.2f} ms "
-        f"(median), the slowest of a run {np.median(slowest):.2f} ms (median), {max(slowest):.2f} ms (worst)\n"
+        f"online: median {np.median([off for _, off in told]):.2g} sigma from the batch; beyond {ONLINE_SHARE}: "
+        f"{beyond}; no place told: {in_doubt}; settled: worst {settled:.2g}\n"
+        f"a call takes {np.median(calls_ms[:, 0]):.2f} ms, one in a thousand {np.median(calls_ms[:, 1]):.2f} ms, the "
+        f"slowest of a run {np.median(slowest):.2f} ms (medians over runs), {max(slowest):.2f} ms (worst); of a single "
+        f"drive, {np.median(single):.2f} ms (median), {max(single):.2f} ms (worst)\n"
         f"extended: worst {extended:.2g} sigma from the joint solve"
     )
     bounds = [
         (NEES[0] <= nees <= NEES[1], f"position NEES {nees:.3f}, must lie between {NEES[0]} and {NEES[1]}"),
         (not lost, f"{len(lost)} starts not found"),
         (not wrong, f"{len(wrong)} wrong and sure"),
-        (settled <= FILTER_SHARE, f"online {settled:.3f} sigma from the batch, at most {FILTER_SHARE}"),
+        (not beyond, f"online {len(beyond)} of {len(told)} more than {ONLINE_SHARE} sigma from the batch"),
+        (settled <= ONLINE_SHARE, f"settled {settled:.3f} sigma from the batch, at most {ONLINE_SHARE}"),
+        (max(slowest) < SLOWEST_MS, f"slowest call {max(slowest):.2f} ms, must be less than {SLOWEST_MS}"),
         (extended <= EXTENDED_SHARE, f"extended {extended:.3f} sigma from the joint solve, at most {EXTENDED_SHARE}"),
     ]
     return [sentence for holds, sentence in bounds if not holds]

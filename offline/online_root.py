@@ -1,0 +1,249 @@
+"""A Gaussian over the robot's pose, its calibration and the tags seen so far, in square root information form.
+
+All factors are linearised about fixed points, poses perturbed on the right: readings and motions can be taken in any
+order of slices, and the sum of all is exactly the step that a solver would take from these points (Bierman,
+"Factorization Methods for Discrete Sequential Estimation", 1977; Kaess, Ranganathan and Dellaert, "iSAM: Incremental
+smoothing and mapping", 2008). A motion costs as many operations as there are numbers in the border (calibration and
+tags), a reading their square.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib import se2
+from calib.arrays import FloatArray
+from offline.joint_fit import UNMODELLED_SIGMA_M
+from offline.linearise_kernels import Values
+from offline.online_answers import carried, foretold, move, snooped, through, weighed
+from offline.online_drive import Drive
+from offline.online_kernels import BY_POINTS, Border, Sights, sweep
+from offline.online_prior import OnlinePrior, padded
+from offline.run import TagKey
+from offline.solver import HUBER_THRESHOLD
+
+_DIAGONAL: Final = np.arange(3), np.arange(3)
+# Of a start that is the frame: far below what anything is known to, and far above rounding.
+_HELD_SIGMA: Final = 1e-6
+_MOST_MOTIONS: Final = 64  # in one slice
+# Multiplications in one slice: some 0.2 ms.
+SLICE: Final = 300_000
+
+
+class Lifted(NamedTuple):
+    """A tag of the map whose place there does not count: all else moves by `by_shift` (3 + n, 2) times its shift.
+
+    Attributes:
+        at: its first column in the border.
+        shift_m: (2,) from where the map has it, and covariance (2, 2).
+    """
+
+    at: int
+    by_shift: FloatArray
+    shift_m: FloatArray
+    covariance: FloatArray
+
+
+class OnlineRoot:
+    """What motions and readings up to some keyframe say.
+
+    Attributes:
+        prior: of the border, and the points of that.
+        point: (3,) that of the present pose.
+        keyframe: of that; n_readings: taken.
+    """
+
+    def __init__(self, prior: OnlinePrior, start: FloatArray, *, held: bool) -> None:
+        """Knows what is known beforehand.
+
+        Args:
+            prior: grows with this root.
+            start: (3,) first pose, about which it is linearised.
+            held: whether that is the frame.
+        """
+        self.prior, self.point = prior, start.copy()
+        self.keyframe, self.n_readings = 0, 0
+        n, room = prior.n, prior.room
+        self._pose, self._root, self._right = np.zeros((3, 4 + room)), np.zeros((room, room)), np.zeros(room)
+        self._root[:n, :n], self._right[:n] = prior.root, prior.root @ prior.off
+        if held:
+            self._pose[:, :3] = np.eye(3) / _HELD_SIGMA
+            self._pose[:, 3] = -se2.log(start) / _HELD_SIGMA
+        self._at_tags = np.array([prior.first_tag])
+        self._left: list[tuple[FloatArray, FloatArray]] = []
+        self._step: FloatArray | None = None
+
+    # What it holds.
+
+    @property
+    def step(self) -> FloatArray:
+        """(3 + n,) of pose and border, from the points."""
+        if self._step is None:
+            self._step = self.through(np.concatenate([self._pose[:, 3], self._right[: self.prior.n]]))
+        return self._step
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether anything tells where the pose is."""
+        return bool((self._pose[_DIAGONAL] != 0.0).all())
+
+    @property
+    def pose(self) -> FloatArray:
+        """(3,) x_m, y_m, theta_rad."""
+        found = np.empty(3)
+        move(self.point, self.step, found)
+        return found
+
+    @property
+    def calibration(self) -> FloatArray:
+        """(C,) numbers."""
+        return self.calibration_at(self.step)
+
+    def calibration_at(self, step: FloatArray) -> FloatArray:
+        """(C,) after a step."""
+        found, columns = self.prior.calibration.copy(), self.prior.columns
+        found[columns >= 0] += step[3 + columns[columns >= 0]]
+        return found
+
+    @property
+    def places_m(self) -> FloatArray:
+        """(T, 2) of the tags."""
+        return self.prior.places_m + self.step[3 + self.prior.first_tag :].reshape(-1, 2)
+
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3) perturbed on the right."""
+        return self.variance_of(np.eye(3, 3 + self.prior.n))
+
+    def tags_covariance(self) -> FloatArray:
+        """(2 T, 2 T) of the tags."""
+        return self.variance_of(np.eye(2 * self.prior.n_tags, 3 + self.prior.n, 3 + self.prior.first_tag))
+
+    def variance_of(self, rows: FloatArray) -> FloatArray:
+        """(m, m) of rows (m, 3 + n) times pose and border."""
+        root = self.carried(rows)
+        return root @ root.T
+
+    def carried(self, rows: FloatArray) -> FloatArray:
+        """(m, 3 + n) whose square is that."""
+        return carried(self._border, self._pose, rows, self.prior.n)
+
+    def through(self, right: FloatArray) -> FloatArray:
+        """(3 + n,) by pose and border, of a right-hand side."""
+        return through(self._border, self._pose, right, self.prior.n)
+
+    @property
+    def _border(self) -> Border:
+        return Border(self._root, self._right, self.prior.columns, self._at_tags)
+
+    # Tags.
+
+    def add_tag(self, place_m: FloatArray, of_map: TagKey | None) -> None:
+        """One more tag, linearised about a place; where the map has it, or of which nothing is known yet."""
+        n = self.prior.n
+        rows = self.prior.add(place_m, of_map)
+        room = self.prior.room
+        if room > len(self._root):
+            self._root, self._right = padded(self._root, (room, room)), padded(self._right, (room,))
+            self._pose = padded(self._pose, (3, 4 + room))
+        self._root[n : n + 2, : n + 2], self._right[n : n + 2] = rows, rows @ self.prior.off
+        self._pose[:, 4 + n : 6 + n] = 0.0
+        self._step = None
+
+    def drop_last_tag(self) -> None:
+        """Forgets the tag that was added last, before anything of it is read."""
+        self.prior.drop_last()
+        self._step = None
+
+    def foretold_m(self, of_map: TagKey) -> FloatArray:
+        """(2,) where the map has a tag, by those that hold."""
+        return self.prior.foretold_m(of_map, self.step[3:])
+
+    def held_squares(self, tag: int) -> float:
+        """Squared sigmas of a tag that holds the robot against all else, 1 cm in each coordinate allowed for."""
+        prior, at = self.prior, self.prior.first_tag + 2 * tag
+        off = self.step[3:] - prior.off
+        return snooped(self._border, self._pose, prior.root.copy(), off, prior.n, at, UNMODELLED_SIGMA_M**2)
+
+    def lifted(self, tag: int) -> Lifted:
+        """What comes of all if one tag that holds the robot did not: its shift is one more unknown."""
+        prior, at = self.prior, self.prior.first_tag + 2 * tag
+        ways = prior.root[:, at : at + 2].T @ prior.root  # of the prior's information
+        taken = self.carried(np.concatenate([np.zeros((2, 3)), ways], axis=1))
+        checked = ways[:, at : at + 2] - taken @ taken.T
+        covariance = np.asarray(np.linalg.pinv(checked, rcond=1e-9, hermitian=True), dtype=np.float64)
+        by_shift = np.column_stack([self.through(each.copy()) for each in taken])
+        return Lifted(at, by_shift, covariance @ ways @ (self.step[3:] - prior.off), covariance)
+
+    def free_squares(self, tag: int, of_map: TagKey, lifted: Lifted | None = None) -> float:
+        """Likewise of a tag that does not hold the robot, against where the map has one; as if another did not."""
+        at = 3 + self.prior.first_tag + 2 * tag
+        by, covariance = self.prior.by_others(of_map)
+        ways = np.concatenate([np.zeros((2, 3)), -by], axis=1)
+        ways[:, at : at + 2] += np.eye(2)
+        spread = self.variance_of(ways) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
+        off_m = self.places_m[tag] - self.foretold_m(of_map)
+        if lifted is not None:
+            by_shift = ways @ lifted.by_shift + by[:, lifted.at : lifted.at + 2]
+            off_m = off_m + by_shift @ lifted.shift_m
+            spread += by_shift @ lifted.covariance @ by_shift.T
+        return float(off_m @ np.linalg.solve(spread, off_m))
+
+    # Motions and readings.
+
+    def is_at_end_of(self, drive: Drive) -> bool:
+        """Whether all motions and readings are taken."""
+        return self.keyframe == len(drive.poses) - 1 and self.n_readings == len(drive.keyframe)
+
+    def advance(self, drive: Drive) -> None:
+        """Takes motions and readings of the drive, as many as make a slice, weighed by what they leave at its poses."""
+        keyframes, last = drive.keyframe, len(drive.poses) - 1
+        until = min(len(keyframes), self.n_readings + max(1, SLICE // (4 * self.prior.n**2 + 1)))
+        end = int(keyframes[until]) if until < len(keyframes) else last
+        end = min(end, self.keyframe + _MOST_MOTIONS)
+        until = min(until, int(np.searchsorted(keyframes, end, side="right")))
+        sights = drive.sights(self.n_readings, until, self.keyframe)
+        self._take(drive, end, sights, np.full(until - self.n_readings, BY_POINTS))
+
+    def take_last(self, drive: Drive) -> None:
+        """Takes what came last, one motion or one reading, all else being taken; weighed by what it leaves over."""
+        end, until = len(drive.poses) - 1, len(drive.keyframe)
+        sights = drive.sights(self.n_readings, until, self.keyframe)
+        self._take(drive, end, sights, np.array([self._weight(sights)] if until > self.n_readings else []))
+
+    def surprise(self, sights: Sights, unmodelled_m: float) -> float:
+        """Squared sigmas of the first reading from what is foretold, its tag being off by as much besides."""
+        residual, rows, by_tag = self._foretold(sights)
+        spread = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
+        return float(residual @ np.linalg.solve(spread, residual))
+
+    def _weight(self, sights: Sights) -> float:
+        at = self.prior.first_tag + 2 * int(sights.tag[0])
+        if not (self.is_determined and self._root[at, at] > 0.0 and self._root[at + 1, at + 1] > 0.0):
+            return 1.0  # nothing tells of its tag yet
+        residual, rows, _ = self._foretold(sights)
+        return weighed(residual, self.variance_of(rows), HUBER_THRESHOLD)
+
+    def _foretold(self, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return foretold(self._border, self.prior.n, sights, self._values(self.point[None]), self.step)
+
+    def _values(self, poses: FloatArray) -> Values:
+        return Values(poses, self.prior.places_m, self.prior.calibration)
+
+    def _take(self, drive: Drive, end: int, sights: Sights, weights: FloatArray) -> None:
+        n = self.prior.n
+        points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
+        left = np.empty((end - self.keyframe, 3, 7 + n))
+        motions, values = drive.motions(self.keyframe, end), self._values(points)
+        sweep(self._border, self._pose, n, motions, sights, weights, values, HUBER_THRESHOLD, left)
+        if len(left):
+            self._left.append((left, points[:-1]))
+        self.point = points[-1].copy()
+        self.keyframe, self.n_readings, self._step = end, self.n_readings + len(weights), None
+
+    def left_behind(self) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Poses that were left, in slices from the last to the first: first index, rows and points of `substituted`."""
+        found, first = [], self.keyframe
+        for rows, points in reversed(self._left):
+            first -= len(rows)
+            found.append((first, rows, points))
+        return found
