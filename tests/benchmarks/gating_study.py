@@ -1,0 +1,111 @@
+"""Whether self-calibration spoils a map whose robot.yaml is right, seed by seed.
+
+    python -m tests.benchmarks.gating_study --worlds room,nsh --seeds 0-99
+
+Drives without rendering, calibration drawn from the priors of robot.yaml; each is mapped with `--calibrate off` and
+`auto`, under the true noise and under one three times too small and too large. A row a map: RMSE of the starts and of
+the tags, as the map stands, and what was freed. Then RMSE over the seeds. Exit 1 where auto's is above 1.05 times
+off's, where one error of auto is above three times off's RMSE, or where a map came out in parts.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from calib.noise import NoiseParameters
+from fixtures.simulate import TRUTH_FILE, simulate
+from offline.pipeline import build_map, read_runs
+from offline.self_calibration_option import Calibrate
+from offline.truth import read_truth
+from onboard.log_reader import find_logs
+from tests.benchmarks.accuracy_study import figures_of
+
+MOST_RMSE: Final = 1.05
+MOST_SINGLE: Final = 3.0
+FACTORS: Final = (1.0, 1.0 / 3.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Errors of one seed's map in m, starts and tags (2,), with self-calibration off and on."""
+
+    world: str
+    seed: int
+    factor: float
+    off: tuple[float, float]
+    auto: tuple[float, float]
+    freed: tuple[str, ...]
+
+
+def study_seed(world: str, seed: int, factors: Sequence[float] = FACTORS) -> list[Pair | str]:
+    """A pair for each noise, or why there is none."""
+    true, rows = NoiseParameters(), list[Pair | str]()
+    with tempfile.TemporaryDirectory() as folder:
+        drives = Path(folder) / "drives"
+        simulate(world, seed, drives, render=False)
+        truth, runs = read_truth(drives / TRUTH_FILE), read_runs(find_logs([drives]))
+        for factor in factors:
+            noise = NoiseParameters(**{name: factor * value for name, value in true})
+            try:
+                off, auto = (build_map(runs, noise, calibrate=Calibrate(is_on=is_on)) for is_on in (False, True))
+                errors = [
+                    (f.start_rmse_m, f.tags_rmse_m) for f in (figures_of(seed, each, truth) for each in (off, auto))
+                ]
+            except ValueError as error:
+                rows.append(f"{world}, seed {seed}, noise {factor:.2g} times: {error}")
+                continue
+            freed = tuple(f"{each.name} of {each.owner}" for each in auto.choices if each.is_freed)
+            rows.append(Pair(world, seed, factor, errors[0], errors[1], freed))
+    return rows
+
+
+def summary(pairs: Sequence[Pair]) -> tuple[list[str], bool]:
+    """A line for each world and noise, and whether all bounds hold."""
+    lines, good = [], True
+    for world, factor in dict.fromkeys((each.world, each.factor) for each in pairs):
+        some = [each for each in pairs if (each.world, each.factor) == (world, factor)]
+        off, auto = np.array([each.off for each in some]), np.array([each.auto for each in some])
+        rmse = np.sqrt((off**2).mean(axis=0))
+        ratio, worst = np.sqrt((auto**2).mean(axis=0)) / rmse, auto.max(axis=0) / rmse
+        good &= bool((ratio <= MOST_RMSE).all() and (worst <= MOST_SINGLE).all())
+        n_freed = sum(bool(each.freed) for each in some)
+        lines.append(
+            f"{world:10s} noise {factor:5.2f} times, {len(some)} seeds: auto over off, starts {ratio[0]:.3f}, tags "
+            f"{ratio[1]:.3f}; largest error of auto over RMSE of off {worst[0]:.2f}, {worst[1]:.2f}; freed in {n_freed}"
+        )
+    return lines, good
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The script: 0 where every bound holds, else 1."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", default="room,nsh", help="[room,nsh]")
+    parser.add_argument("--seeds", default="0-99", help="FIRST-LAST or one seed [0-99]")
+    given = parser.parse_args(arguments)
+    first, _, last = given.seeds.partition("-")
+    pairs, failed = [], False
+    for world in given.worlds.split(","):
+        for seed in range(int(first), int(last or first) + 1):
+            for row in study_seed(world, seed):
+                _tell(str(row))
+                failed |= isinstance(row, str)
+                pairs += [row] if isinstance(row, Pair) else []
+    lines, good = summary(pairs)
+    for line in lines:
+        _tell(line)
+    return 0 if good and not failed else 1
+
+
+def _tell(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
