@@ -99,6 +99,10 @@ class Arrowhead:
         """Room for a solve, kept for the next: new memory costs as much as filling it. For one at a time."""
         return self.empty_system(), self.empty_system(), self.empty_rows()
 
+    def without_scratch(self) -> None:
+        """Lets go of that room, for who keeps the problem but solves it no more."""
+        vars(self).pop("scratch", None)
+
     def empty_system(self) -> System:
         """Blocks without values."""
         tree = self.tree

@@ -111,6 +111,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
         known = _built_up(_redrawn(_as_shown(coarse, best.goodness), rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
+    graph.problem.arrowhead.without_scratch()
     return best
 
 

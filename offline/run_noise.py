@@ -129,6 +129,7 @@ def _under(
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
     solution = solve(graph.problem, near or local_map.solution.state)
+    graph.problem.arrowhead.without_scratch()
     return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness)
 
 

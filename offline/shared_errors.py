@@ -9,6 +9,7 @@ unbiased estimator: Rao, "Estimation of variance and covariance components", 197
 a shared part of zero in the mean.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,6 +25,7 @@ from offline.solver import Solution
 _TOLD: Final = 4.0
 _TINY: Final = 1e-9
 _N_SIGNS: Final = 8
+_FEW: Final = 2**22  # numbers: more vectors at once take more memory than a solve
 _SEED: Final = 7
 
 
@@ -65,24 +67,30 @@ def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
     """
     read = _Readings(solution)
     cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
+    found, whole = np.empty((4, 4, _N_SIGNS)), np.empty((4, _N_SIGNS))
     drawn = _drawn(cell)
-    kept, length = read.left_over(drawn.reshape(len(cell) * 2, -1))
-    found = _squares(kept.reshape(drawn.shape), cells).reshape(4, 4, _N_SIGNS)  # by square, part, signs
-    traces, whole = found.mean(axis=2).T, length.reshape(4, _N_SIGNS).mean(axis=1)
-    squares = _squares(read.residual.reshape(-1, 2, 1), cells)[:, 0] - (whole - traces[:, :2].sum(axis=1))
+    at_once = 4 if 8 * _N_SIGNS * len(cell) <= _FEW else 1  # parts
+    for part in range(0, 4, at_once):
+        rows = np.stack([next(drawn) for _ in range(at_once)], axis=2).reshape(2 * len(cell), -1)
+        kept, length = read.left_over(rows)
+        own = slice(part, part + at_once)
+        found[:, own] = _squares(kept.reshape(len(cell), 2, -1), cells).reshape(4, at_once, _N_SIGNS)
+        whole[own] = length.reshape(at_once, _N_SIGNS)
+    traces, lengths = found.mean(axis=2).T, whole.mean(axis=1)
+    squares = _squares(read.residual.reshape(-1, 2, 1), cells)[:, 0] - (lengths - traces[:, :2].sum(axis=1))
     n_in_cell = np.bincount(cell)
-    return _solved(0.5 * (traces + traces.T), squares, whole, float((n_in_cell**2).sum() / n_in_cell.sum()))
+    return _solved(0.5 * (traces + traces.T), squares, lengths, float((n_in_cell**2).sum() / n_in_cell.sum()))
 
 
-def _drawn(cell: IntArray) -> FloatArray:
-    """(M, 2, 4 n) random signs in one component: reading by reading in the first 2 n, cell by cell in the others."""
+def _drawn(cell: IntArray) -> Iterator[FloatArray]:
+    """(M, 2, n) random signs in one component, four times: reading by reading twice, then cell by cell."""
     rng = np.random.default_rng(_SEED)
-    drawn = np.zeros((len(cell), 2, 4, _N_SIGNS))
     for part in range(4):
         component, by_cell = part % 2, part >= 2
         signs = rng.choice([-1.0, 1.0], (int(cell.max()) + 1 if by_cell else len(cell), _N_SIGNS))
-        drawn[:, component, part] = signs[cell] if by_cell else signs
-    return drawn.reshape(len(cell), 2, -1)
+        drawn = np.zeros((len(cell), 2, _N_SIGNS))
+        drawn[:, component] = signs[cell] if by_cell else signs
+        yield drawn
 
 
 class _Readings:
