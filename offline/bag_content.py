@@ -80,8 +80,8 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
         else:
             content.odometry.append((stamp_ns, each.content))
     clock.check([chosen.odometry] if chosen.has_pictures else [chosen.odometry, chosen.tags])
-    content.odometry, n_odometry = _each_time_once(content.odometry, [stamp for stamp, _ in content.odometry])
-    content.looks, n_looks = _each_time_once(content.looks, [look.stamp_ns for look in content.looks])
+    content.odometry, n_odometry = _each_time_once(content.odometry, _odometry_keys(content.odometry))
+    content.looks, n_looks = _each_time_once(content.looks, [(look.stamp_ns,) for look in content.looks])
     if not chosen.has_pictures and not any(look.sightings for look in content.looks):
         told = "; ".join(
             [f"no tag was seen in {counted(len(content.looks), 'picture')}", *told_left_out(content.left_out)]
@@ -135,10 +135,15 @@ class BagClock:
         ]
 
 
-def _each_time_once(rows: list[Row], stamps_ns: list[int]) -> tuple[list[Row], int]:
-    """Rows in order of time, the first of each time, and how many others there were."""
-    first = dict(zip(reversed(stamps_ns), reversed(rows), strict=True))
-    return [first[stamp] for stamp in sorted(first)], len(rows) - len(first)
+def _each_time_once(rows: list[Row], keys: list[tuple[Any, ...]]) -> tuple[list[Row], int]:
+    """Rows in order of their keys, which begin with the time; the first of each key, and how many others there were."""
+    first = dict(zip(reversed(keys), reversed(rows), strict=True))
+    return [first[key] for key in sorted(first)], len(rows) - len(first)
+
+
+def _odometry_keys(odometry: list[tuple[int, Any]]) -> list[tuple[Any, ...]]:
+    """Time, and the joints: each may come in messages of its own."""
+    return [(stamp_ns, *getattr(message, "name", ())) for stamp_ns, message in odometry]
 
 
 def _header_ns(header: Any) -> int:  # noqa: ANN401 - made by rosbags

@@ -94,11 +94,9 @@ def _odometry(
         return readings, distance_m
     joints = wheel_joints(path, chosen.odometry.name, messages, bag_options)
     content.remarks.append(f"wheels: joints {joints[0]} and {joints[1]}")
-    has_both = np.array([set(joints) <= set(message.name) for message in messages])
-    wheels = [message for message, both in zip(messages, has_both, strict=True) if both]
     # Joints give angles: a tick is a radian.
     scale = wheel_scale(replace(options, ticks_per_turn=2.0 * pi))
-    return joint_readings(where, stamps_ns[has_both], wheels, joints, scale)
+    return joint_readings(where, stamps_ns, messages, joints, scale)
 
 
 def _check_times(path: Path, readings: list[PlanarOdometry], tags: list[Entry]) -> list[str]:

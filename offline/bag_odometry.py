@@ -64,29 +64,54 @@ def joint_readings(
 
     Args:
         where: names bag and topic in errors.
-        stamps_ns: (N,) rising.
-        messages: N of sensor_msgs/JointState that name both joints.
+        stamps_ns: (N,) not falling.
+        messages: N of sensor_msgs/JointState that name both joints, one of them, or none.
         joints: of the left and the right wheel; positive positions roll forward.
         scale: a tick is here a radian.
 
     Raises:
-        OfflineError: the wheels' radius is not known, a position is missing or none, or no wheel rolls that fast.
+        OfflineError: the wheels' radius is not known, a position is missing or none, the joints were
+            not published at the same time, or no wheel rolls that fast.
     """
     if scale.metres_per_tick_left is None or scale.metres_per_tick_right is None:
         raise OfflineError(f"{where}: wheels of unknown size; give --wheel-radius-m, or --robot")
-    angles = np.array([[_position(where, message, joint) for joint in joints] for message in messages])
-    if not np.isfinite(angles).all():
-        raise OfflineError(f"{where}: a position of {' or '.join(joints)} is not finite; correct what published it")
-    for wheel in angles.T:
-        if np.ptp(wheel) <= 2.0 * pi:  # some publish the angle within one turn
-            wheel[:] = np.unwrap(wheel)
-    left_m, right_m = (angles - angles[0]).T * [[scale.metres_per_tick_left], [scale.metres_per_tick_right]]
+    stamps_ns, angles = _together(where, joints, [_angles(where, stamps_ns, messages, joint) for joint in joints])
+    left_m, right_m = (angles - angles[:, :1]) * [[scale.metres_per_tick_left], [scale.metres_per_tick_right]]
     check_wheel_speed(where, stamps_ns, left_m, right_m)
     readings = [
         PlanarOdometry(stamp_ns=stamp_ns, wheels=PlanarOdometry.WheelDistances(left_m=left, right_m=right))
         for stamp_ns, left, right in zip(stamps_ns.tolist(), left_m.tolist(), right_m.tolist(), strict=True)
     ]
     return readings, _driven_m(left_m, right_m)
+
+
+def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str) -> tuple[IntArray, FloatArray]:
+    """Stamps (K,), rising, and angles (K,) of one joint, through all its turns."""
+    named = [
+        (stamp, message) for stamp, message in zip(stamps_ns.tolist(), messages, strict=True) if joint in message.name
+    ]
+    stamps, first = np.unique(np.array([stamp for stamp, _ in named], dtype=np.int64), return_index=True)
+    angles = np.array([_position(where, named[i][1], joint) for i in first.tolist()])
+    if not np.isfinite(angles).all():
+        raise OfflineError(f"{where}: a position of {joint} is not finite; correct what published it")
+    return stamps, np.unwrap(angles) if np.ptp(angles) <= 2.0 * pi else angles  # some publish it within one turn
+
+
+def _together(
+    where: str, joints: tuple[str, str], wheels: Sequence[tuple[IntArray, FloatArray]]
+) -> tuple[IntArray, FloatArray]:
+    """The left wheel's stamps (K,) and angles (2, K) of both there: each may come in messages of its own."""
+    (stamps_ns, left), (right_ns, right) = wheels
+    inside = (stamps_ns >= right_ns[0]) & (stamps_ns <= right_ns[-1])
+    if inside.sum() < 2:
+        raise OfflineError(
+            f"{where}: {joints[0]} and {joints[1]} were not published at the same time, so how both wheels rolled "
+            "cannot be told; name other joints by --left-joint and --right-joint"
+        )
+    stamps_ns = stamps_ns[inside]
+    # From the first on, for a float holds no nanoseconds since 1970.
+    there = np.interp((stamps_ns - right_ns[0]).astype(np.float64), (right_ns - right_ns[0]).astype(np.float64), right)
+    return stamps_ns, np.stack([left[inside], there])
 
 
 def wheel_joints(path: Path, topic: str, messages: Sequence[Any], options: BagOptions) -> tuple[str, str]:

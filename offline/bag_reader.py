@@ -148,7 +148,7 @@ def _content_told(path: Path) -> Iterator[None]:
     """A message is what the bag's own definition makes of it: it may lack what its type should have."""
     try:
         yield
-    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError, IndexError) as error:
         raise OfflineError(
             f"{path}: holds a message that is not as its type should be: {error}; was it damaged, or recorded under "
             "another definition?"

@@ -18,7 +18,7 @@ from offline.bag_frames import FixedFrames, mount_of
 from offline.bag_import import import_bag
 from offline.bag_pictures import picture_of
 from offline.bag_positions import planar_covariance
-from offline.bag_reader import BagTopic
+from offline.bag_reader import BagTopic, open_bag
 from offline.bag_tags import Sighting, read_look
 from offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
 from offline.import_robot import ImportOptions
@@ -170,6 +170,52 @@ def test_joints_may_be_named_and_start_over_after_a_turn(tmp_path: Path, log: Pa
     _, run = imported(sent, tmp_path, options, wheel_radius_m=0.1, track_width_m=0.5)
     np.testing.assert_allclose(run.stretches[0].left_m, made.track.left_m, atol=1e-9)
     np.testing.assert_allclose(run.stretches[0].right_m, made.track.right_m, atol=1e-9)
+
+
+@pytest.mark.parametrize("late_ns", [0, 7_000_000])
+def test_each_joint_may_come_in_messages_of_its_own(tmp_path: Path, log: Path, late_ns: int) -> None:
+    """At the same times as the other, or between them; the wheels roll evenly, so that a line between two is right."""
+    made = BagOfLog.of(log).mount().camera_info().apriltag_msgs().joints()
+    sent = []
+    for each in made.sent:
+        if each.topic != "/joint_states":
+            sent.append(each)
+            continue
+        for i, late in ((0, 0), (2, late_ns)):
+            stamp = each.fields["header"]["stamp"]
+            own = {
+                "header": header(stamp["sec"] * 10**9 + stamp["nanosec"] + late, ""),
+                "name": [each.fields["name"][i]],
+                "position": [each.fields["position"][i]],
+            }
+            sent.append(each._replace(fields=each.fields | own))
+    _, run = imported(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
+    (track,) = run.stretches
+    (whole,) = made.run.stretches
+    there = whole.at(track.stamps_ns)
+    assert len(track.stamps_ns) == len(whole.stamps_ns) - (late_ns > 0)
+    np.testing.assert_allclose(np.diff(track.left_m), np.diff(there[0]), atol=1e-9)
+    np.testing.assert_allclose(np.diff(track.right_m), np.diff(there[1]), atol=1e-9)
+
+
+def test_joints_of_different_times_are_no_wheels(tmp_path: Path, log: Path) -> None:
+    made = BagOfLog.of(log).mount().camera_info().apriltag_msgs().joints()
+    middle_ns = int(np.median(made.track.stamps_ns))
+    sent = []
+    for each in made.sent:
+        if each.topic == "/joint_states":
+            i = 0 if each.received_ns < middle_ns else 2
+            own = {name: [each.fields[name][i]] for name in ("name", "position")}
+            each = each._replace(fields=each.fields | own)
+        sent.append(each)
+    with pytest.raises(GroundsbotError, match="wheel_left and wheel_right were not published at the same time"):
+        imported(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
+
+
+def test_a_list_shorter_than_its_type_says_is_told_in_a_line(tmp_path: Path, log: Path) -> None:
+    bag = good(log).write(tmp_path / "drive")
+    with pytest.raises(GroundsbotError, match="not as its type should be: list index out of range"), open_bag(bag):
+        raise IndexError("list index out of range")
 
 
 def test_poses_about_the_base_need_no_camera(tmp_path: Path, log: Path) -> None:
