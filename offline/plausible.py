@@ -47,6 +47,24 @@ def check_numbers(columns: Mapping[str, FloatArray], where: str) -> None:
             )
 
 
+def check_stamps(stamps_ns: IntArray, where: str) -> None:
+    """Looks for times before any clock's zero, which neither MCAP nor TUM can write.
+
+    Args:
+        stamps_ns: (N,).
+        where: names file and topic.
+
+    Raises:
+        OfflineError: naming the first.
+    """
+    wrong = np.flatnonzero(stamps_ns < 0)
+    if len(wrong):
+        raise OfflineError(
+            f"{where}: stamp_ns is {stamps_ns[wrong[0]]} in reading {wrong[0] + 1}, must not be below 0; correct what "
+            "the log was made from"
+        )
+
+
 def check_speed(stamps_ns: IntArray, wheels_m: FloatArray, where: str) -> None:
     """Looks for steps between readings that no wheel can have rolled.
 

@@ -11,7 +11,7 @@ from calib.robot import Robot
 from calib.words import counted
 from offline.errors import OfflineError
 from offline.odometry import WheelTrack
-from offline.plausible import check_numbers, check_speed
+from offline.plausible import check_numbers, check_speed, check_stamps
 from offline.step_covariance import given_covariances
 from onboard.messages import PlanarOdometry
 
@@ -54,6 +54,7 @@ def _encoder_stretches(
 ) -> tuple[list[WheelTrack], list[str]]:
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
+    check_stamps(table[:, 0], f"{log}: /wheels")
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
     most = _FREE_RESETS + int(_RESETS_AT_A_MIB * (log_bytes / 2**20) ** 0.5)
     if len(cuts) > most:
@@ -88,6 +89,7 @@ def _imported_stretch(
     warnings: list[str] = []
     where = f"{log}: /odometry"
     stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+    check_stamps(stamps_ns, where)
     left_m = np.array([reading.wheels.left_m for reading in readings])
     right_m = np.array([reading.wheels.right_m for reading in readings])
     check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)

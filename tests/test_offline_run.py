@@ -270,6 +270,17 @@ def test_odometry_that_is_no_number_is_refused(tmp_path: Path, value: float, kin
         assert part in text
 
 
+@pytest.mark.parametrize("topic", ["/wheels", "/odometry"])
+def test_times_before_zero_are_refused(tmp_path: Path, topic: str) -> None:
+    readings: dict[str, list[Message]] = {
+        "/wheels": [WheelEncoders(stamp_ns=at_ns, boot_id=1) for at_ns in (-1_500_000_000, 0)],
+        "/odometry": [PlanarOdometry(stamp_ns=at_ns, wheels={}) for at_ns in (-1_500_000_000, 0)],
+    }
+    text = refusal(write_log(tmp_path, [(topic, each) for each in readings[topic]]))
+    for part in (topic, "stamp_ns is -1500000000 in reading 1", "below 0"):
+        assert part in text
+
+
 @pytest.mark.parametrize("ticks", [10**9, -(2**62), 2**63 - 1])
 def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: int) -> None:
     text = refusal(write_log(tmp_path, [wheels(0.0, 0, 0), wheels(0.01, 0, ticks)]))
