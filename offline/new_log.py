@@ -3,7 +3,7 @@
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from calib.files import folder_written_whole
@@ -26,13 +26,24 @@ def new_log(output: Path) -> Iterator[Path]:
             yield folder
             _sync([*folder.iterdir(), folder])
         return
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", suffix=".partial", dir=output.parent) as name:
-            folder = Path(name)
-            yield folder
+    with ExitStack() as stack:
+        with _told(output):
+            made = tempfile.TemporaryDirectory(
+                prefix=f".{output.name}.", suffix=".partial", dir=output.parent, ignore_cleanup_errors=True
+            )
+            folder = Path(stack.enter_context(made))
+        yield folder
+        with _told(output):
             _sync([folder / output.name])
             (folder / output.name).rename(output)
-        _sync([output.parent])
+            _sync([output.parent])
+
+
+@contextmanager
+def _told(output: Path) -> Iterator[None]:
+    """Only of what is done to the output: what fails in the block may be another file's."""
+    try:
+        yield
     except OSError as error:
         raise OfflineError(f"{output}: cannot be written: {error.strerror or error}; choose another place") from error
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from google.protobuf.message import Message
@@ -53,6 +54,8 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     sources = files_of(log)
     if not log.is_dir() and output.suffix != ".mcap":
         raise OfflineError(f"{output}: must end in .mcap, as {log} is one file")
+    if log.is_dir() and output.suffix == ".mcap":
+        raise OfflineError(f"{output}: must not end in .mcap, as {log} is a folder, of which each file is salvaged")
     head = read_head(log)
     if "/run" not in head:
         reasons = "; ".join(line for source in sources for line in _losses_of(source).lines())
@@ -75,19 +78,18 @@ def _losses_of(source: Path) -> LogLosses:
 
 def _salvaged(source: Path, target: Path, head: Mapping[str, Message]) -> SalvagedFile:
     losses = LogLosses()
-    writer: LogWriter | None = None
-    n_messages = 0
+    messages = read_log(source, losses=losses)
     try:
-        for each in read_log(source, losses=losses):
-            writer = writer or LogWriter(target, head, each.log_time_ns, durable=False)
-            if not TOPICS[each.topic].every_file:
-                n_messages += _copied(each, writer, losses)
+        first = next(messages, None)
     except LogError as error:
-        if writer is not None:
-            raise
         losses.unusable[source] = str(error).removeprefix(f"{source}: ")
-    if writer is None:
+        first = None
+    if first is None:
         return SalvagedFile(source, None, 0, losses)
+    writer = LogWriter(target, head, first.log_time_ns, durable=False)
+    n_messages = sum(
+        _copied(each, writer, losses) for each in chain([first], messages) if not TOPICS[each.topic].every_file
+    )
     if not of_pictures([source]):
         now_ns = writer.last_log_time_ns
         writer.write("/events", _event(source, now_ns, losses), now_ns, now_ns)
