@@ -2,6 +2,7 @@
 
 import os
 import queue
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -10,8 +11,6 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from calib.errors import GroundsbotError
 from calib.picture_bytes import claimed_size
@@ -72,7 +71,7 @@ class DetectReport:
         lines = [
             f"{self.n_pictures} pictures: {_told(self.tags_before)} before, {_told(self.tags_after)} now",
             f"{self.n_kept} older detections kept, whose pictures were not" if self.n_kept else "",
-            f"{self.n_unusable} pictures are of no use" if self.n_unusable else "",
+            f"{self.n_unusable} pictures are of no use; what was found in them before stays" if self.n_unusable else "",
             *self.losses.lines(),
         ]
         return [line for line in lines if line]
@@ -125,6 +124,7 @@ class _OldDetections:
     """What a first pass over the log gathers."""
 
     n_pictures: int = 0
+    pictures_ns: set[int] = field(default_factory=set)  # of those that were kept, usable or not
     by_stamp_ns: dict[int, TagDetections] = field(default_factory=dict)  # without their tags
     wheels: list[tuple[int, int]] = field(default_factory=list)  # stamp, sequence
 
@@ -139,6 +139,7 @@ class _OldDetections:
                 old.by_stamp_ns[each.message.stamp_ns] = each.message
             else:
                 old.n_pictures += 1
+                old.pictures_ns.add(each.publish_time_ns)
         old.wheels.sort()
         return old
 
@@ -151,7 +152,7 @@ class _OldDetections:
             message.has_wheel_sequence = old.has_wheel_sequence
             message.wheel_sequence = old.wheel_sequence
             return
-        index = int(np.searchsorted([stamp for stamp, _ in self.wheels], message.stamp_ns, side="right")) - 1
+        index = bisect_right(self.wheels, message.stamp_ns, key=lambda wheel: wheel[0]) - 1
         if index >= 0:
             message.has_wheel_sequence = True
             message.wheel_sequence = self.wheels[index][1]
@@ -253,10 +254,8 @@ def _write(
             report.tags_before.update((tag.family, tag.tag_id) for tag in each.message.detections)
             if each.message.stamp_ns in found:
                 each.message.ParseFromString(found[each.message.stamp_ns])
-            elif options.drop_others:
+            elif not _stays(each.message, old, options, report):
                 continue
-            else:
-                report.n_kept += 1
         writer.write(each.topic, each.message, at_ns, each.publish_time_ns)
         if each.topic == PICTURE_TOPIC and each.publish_time_ns not in old.by_stamp_ns:
             data = found.get(each.publish_time_ns)  # a picture whose tags nobody had looked for
@@ -265,6 +264,14 @@ def _write(
     if writer is not None:
         _tell(writer, log, report)
         writer.close()
+
+
+def _stays(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
+    """Whether detections stay that were not looked for again."""
+    if message.stamp_ns in old.pictures_ns:  # of no use now, and better known when it was taken
+        return True
+    report.n_kept += not options.drop_others
+    return not options.drop_others
 
 
 def _tell(writer: LogWriter, log: Path, report: DetectReport) -> None:

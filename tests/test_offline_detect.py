@@ -64,6 +64,7 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
     outcome = run("detect", recorded, "-o", tmp_path / "again", "--processes", 2)
     assert outcome.code == 3
     assert "1 pictures are of no use" in outcome.out
+    assert "4 older detections kept, whose pictures were not" in outcome.out
     assert "4 pictures" in outcome.out
     assert found_in(tmp_path / "again") == {0: [0], 1: [99], 2: [2], 3: [99], 4: [4], 5: [99], 6: [99], 7: [99]}
     assert {path.name: path.read_bytes() for path in recorded.iterdir()} == before
@@ -98,13 +99,13 @@ def test_a_file_that_holds_nothing_is_told_of(tmp_path: Path, run: Run) -> None:
 def test_without_the_detections_of_pictures_that_were_not_kept(recorded: Path, tmp_path: Path, run: Run) -> None:
     output = tmp_path / "again.mcap"
     assert run("detect", recorded, "-o", output, "--processes", 1, "--drop-others", "--decimate", 2).code == 3
-    assert found_in(output) == {0: [0], 2: [2], 4: [4]}
+    assert found_in(output) == {0: [0], 2: [2], 4: [4], 6: [99]}  # picture 6 was kept, if of no use
     assert len(list(read_log(output, ["/wheels"]))) == 100
 
 
 def test_another_family(recorded: Path, tmp_path: Path, run: Run) -> None:
     assert run("detect", recorded, "-o", tmp_path / "a", "--processes", 1, "--family", "tag25h9", "--drop-others").code
-    assert found_in(tmp_path / "a") == {0: [], 2: [], 4: []}
+    assert found_in(tmp_path / "a") == {0: [], 2: [], 4: [], 6: [99]}
 
 
 def test_what_cannot_be_is_one_line_and_leaves_nothing(recorded: Path, tmp_path: Path, run: Run) -> None:
