@@ -98,6 +98,8 @@ def find_break(local_map: LocalMap) -> Break | None:
     if ahead is None or behind is None:
         return None
     places = _places(chain, ahead, behind)
+    if not places:
+        return None
     middle = places[len(places) // 2]
     starts = [
         _start(local_map.graph, ahead, behind, place, T_ahead_behind)
@@ -171,14 +173,20 @@ def _wild_in_a_row(local_map: LocalMap) -> bool:
 
 
 def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
-    """Where the break may be: what lies between the two parts, or wherever they overlap."""
-    if behind.first > ahead.end:
-        return [_between_readings(chain, _Place(ahead.end, behind.first))]
-    reading = np.unique(chain.readings.keyframe)
-    cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
-    cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
-    cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
-    return list(dict.fromkeys(_between_readings(chain, _Place(cut, cut)) for cut in cuts.tolist()))
+    """Where the break may be: what lies between the two parts, or wherever they overlap.
+
+    Not where all was read on one side, for nothing tells of a break there. A place with a single keyframe on one side
+    stays: it cannot be a break, since no part can be solved there, but where it explains most none other may.
+    """
+    wanted = [_Place(ahead.end, behind.first)]
+    if behind.first <= ahead.end:
+        reading = np.unique(chain.readings.keyframe)
+        cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
+        cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
+        cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
+        wanted = [_Place(cut, cut) for cut in cuts.tolist()]
+    places = dict.fromkeys(_between_readings(chain, each) for each in wanted)
+    return [each for each in places if each.end > 0 and each.begin < len(chain.stamps_ns)]
 
 
 def _seconds_between(chain: Chain, place: _Place) -> float:

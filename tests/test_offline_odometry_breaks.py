@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from calib import se2
+from offline.grown_parts import Grown
 from offline.local_map import solve_local_map
 from offline.odometry import WheelTrack
-from offline.odometry_breaks import find_break, split_where_broken
+from offline.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
 from offline.pipeline import build_map
 from offline.result import MapResult
 from offline.run import TagKey
@@ -57,6 +58,18 @@ def test_nothing_is_split_where_nothing_broke(seed: int) -> None:
 def test_a_tag_that_was_moved_is_no_break() -> None:
     drive = made_clean_drive(1)
     assert find_break(solve_local_map(with_a_moved_tag(drive))) is None
+
+
+@pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
+def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
+    drive = made_clean_drive(0).chain
+    readings = drive.readings.where(np.arange(len(where)))
+    chain = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
+    whole = Grown(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
+    places = _places(chain, whole, whole)
+    assert all(0 < place.end <= place.begin < 10 for place in places)
+    assert all(np.isfinite(_seconds_between(chain, place)) for place in places)
+    assert (places == []) == (len(where) == 1)
 
 
 PLACES = {1: (2.0, 1.0), 2: (4.0, -2.0), 3: (7.0, 1.0), 4: (8.0, 3.0), 5: (0.0, 4.0)}
