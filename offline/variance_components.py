@@ -58,9 +58,14 @@ class FittedVariances:
     converged: bool
 
     def interval(self, quantile: float) -> tuple[FloatArray, FloatArray]:
-        """Bounds (K,) between which each sigma lies, `quantile` normal deviations of its logarithm either way."""
-        spread = np.exp(quantile * np.sqrt(np.diag(self.log_covariance)))
-        return self.sigma / spread, self.sigma * spread
+        """Bounds (K,) between which each sigma lies, `quantile` normal deviations either way.
+
+        Upwards of its logarithm, downwards of its square: beside other noise the square is what is estimated without
+        bias and with an error that hardly depends on it, and only what comes out large is believed. By the logarithm
+        nothing could come out too large by much.
+        """
+        spread = quantile * np.sqrt(np.diag(self.log_covariance))
+        return self.sigma * np.sqrt(np.maximum(1.0 - 2.0 * spread, 0.0)), self.sigma * np.exp(spread)
 
 
 def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | None = None) -> FittedVariances:

@@ -49,6 +49,18 @@ def test_sigmas_are_found_from_ten_times_too_large_and_too_small(start: list[flo
     assert 0.5 < np.std(deviations) < 1.6
 
 
+def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
+    """Only what comes out large is believed, so it may have done so by chance; a sigma of many squares may not."""
+    deviation = np.array([1.0 / np.sqrt(10.0), 0.01])
+    fitted = FittedVariances(
+        np.array([2.0, 2.0]), np.diag(deviation**2), np.array([5.0, 5000.0]), np.ones(2) > 0, (), True
+    )
+    low, high = fitted.interval(norm.ppf(0.995))
+    assert low[0] == 0.0
+    assert low[1] == pytest.approx(2.0 * np.sqrt(1.0 - 2.0 * 0.02576), rel=1e-4)
+    np.testing.assert_allclose(high, 2.0 * np.exp(2.5758 * deviation), rtol=1e-4)
+
+
 def test_where_the_search_begins_does_not_matter() -> None:
     near, far = _fitted(3, np.array([0.7, 0.7])), _fitted(3, np.array([7.0, 0.07]))
     assert near.converged
