@@ -402,7 +402,10 @@ def export(
         typer.Option(help="frc, limelight: copy of tags.csv in which z_m and yaw_rad are filled in, as measured."),
     ] = None,
     tag_height_m: Annotated[
-        float | None, typer.Option(help="frc, limelight: taken for the height of tags that --tag-poses does not tell.")
+        float | None,
+        typer.Option(
+            help="frc, limelight: taken for the height of tags of which neither --tag-poses nor the map tells."
+        ),
     ] = None,
     face_viewers: Annotated[
         bool,

@@ -1,11 +1,11 @@
 """Tags as FRC tools have them: WPILib's AprilTagFieldLayout and Limelight's .fmap.
 
-Both want a tag's pose in space. Their tag frame has x out of the printed face and z up; a tag that hangs upright is
-turned about z only.
+Both want a tag's pose in space. Their tag frame has x out of the printed face and z up.
 """
 
-from math import cos, sin
 from typing import Any, Final
+
+import numpy as np
 
 from offline.errors import OfflineError
 from offline.export_options import ExportOptions, numbers
@@ -83,14 +83,16 @@ def _one_family(component: Component, wanted: str | None) -> str:
 
 def _wpilib_pose(each: PlacedTag) -> dict[str, Any]:
     x_m, y_m = each.tag.position_m.tolist()
-    half = 0.5 * each.yaw_rad
+    x, y, z, w = each.R_map_tag.as_quat(canonical=True).tolist()
     return {
         "translation": {"x": x_m, "y": y_m, "z": each.z_m},
-        "rotation": {"quaternion": {"W": cos(half), "X": 0.0, "Y": 0.0, "Z": sin(half)}},
+        "rotation": {"quaternion": {"W": w, "X": x, "Y": y, "Z": z}},
     }
 
 
 def _row_major(each: PlacedTag) -> list[float]:
     x_m, y_m = each.tag.position_m.tolist()
-    c, s = cos(each.yaw_rad), sin(each.yaw_rad)
-    return [c, -s, 0.0, x_m, s, c, 0.0, y_m, 0.0, 0.0, 1.0, each.z_m, 0.0, 0.0, 0.0, 1.0]
+    T_map_tag = np.eye(4)
+    T_map_tag[:3, :3], T_map_tag[:3, 3] = each.R_map_tag.as_matrix(), (x_m, y_m, each.z_m)
+    row_major: list[float] = T_map_tag.ravel().tolist()
+    return row_major

@@ -158,16 +158,17 @@ def _tags_scene(component: Component, frame: str, stamp_ns: int) -> SceneUpdate:
 
 
 def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
-    """A ball on the floor plan, its one-sigma ellipse, and its number. Heights are not estimated: all lie at z = 0."""
+    """A ball, its one-sigma ellipse on the floor plan, and its number; at z = 0 where the map knows no height."""
     x, y = tag.position_m.tolist()
+    z_m = 0.0 if tag.pose is None else tag.pose.height_m
     name = f"{tag.family}:{tag.tag_id}{tag.instance}"
     ball = SpherePrimitive(
-        pose=_pose(x, y, 0.0),
+        pose=Pose(position=Vector3(x=x, y=y, z=z_m), orientation=_orientation(tag)),
         size=Vector3(x=_TAG_DIAMETER_M, y=_TAG_DIAMETER_M, z=_TAG_DIAMETER_M),
         color=_TAG_COLOR,
     )
     text = TextPrimitive(
-        pose=Pose(position=Vector3(x=x, y=y, z=_TAG_DIAMETER_M), orientation=_turned(0.0)),
+        pose=Pose(position=Vector3(x=x, y=y, z=z_m + _TAG_DIAMETER_M), orientation=_turned(0.0)),
         billboard=True,
         font_size=_TEXT_M,
         color=_TAG_COLOR,
@@ -184,11 +185,21 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         "runs": " ".join(tag.runs),
     }
     entity = _entity(name, frame, stamp_ns, said)
+    if tag.pose is not None:
+        entity.metadata.append(KeyValuePair(key="height_m", value=f"{tag.pose.height_m:.4f}"))
     entity.spheres.append(ball)
     entity.texts.append(text)
     if np.isfinite(tag.covariance).all():
         entity.cylinders.append(_ellipse(tag))
     return entity
+
+
+def _orientation(tag: TagResult) -> Quaternion:
+    """R_map_tag, z out of the face; none where the map knows none."""
+    if tag.pose is None:
+        return _turned(0.0)
+    x, y, z, w = tag.pose.quaternion_xyzw.tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _ellipse(tag: TagResult) -> CylinderPrimitive:

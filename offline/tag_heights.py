@@ -1,11 +1,16 @@
-"""Heights and directions of tags, which a map of the floor does not estimate: as measured, or as somebody assumes."""
+"""Heights and directions of tags: as measured, as a map of corners holds them, or as somebody assumes.
+
+A map of the floor estimates neither.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import atan2, isfinite
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from offline.csv_table import CsvTable, read_table
 from offline.errors import OfflineError
@@ -14,14 +19,17 @@ from offline.result import Component, TagResult
 
 _Key = tuple[str, int, str]
 
+# Layouts have x out of the face, y to the viewer's right and z up; the map's tags z out of it, x to the right and y up.
+_TO_LAYOUT: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+
 
 @dataclass(frozen=True)
 class PlacedTag:
-    """A tag that hangs upright."""
+    """A tag in space."""
 
     tag: TagResult
     z_m: float  # of its centre above the floor
-    yaw_rad: float  # in map, where its face looks
+    R_map_tag: Rotation  # of a tag frame with x out of the face, and z up where it hangs upright
 
 
 @dataclass(frozen=True)
@@ -35,7 +43,9 @@ class _Measured:
 def tags_in_space(
     component: Component, tags: Sequence[TagResult], options: ExportOptions
 ) -> tuple[list[PlacedTag], list[str]]:
-    """Some of a component's tags with what --tag-poses, --tag-height-m and --face-viewers say.
+    """Some of a component's tags: as --tag-poses says, else as the map has it, else by --tag-height-m, --face-viewers.
+
+    Where the map has a tag's tilt, a direction that --tag-poses gives turns it about the vertical only.
 
     Returns:
         The tags, and what was assumed of how many.
@@ -48,17 +58,21 @@ def tags_in_space(
     measured = {} if options.tag_poses is None else _read(options.tag_poses, component)
     viewed = _towards_viewers(component) if options.face_viewers else {}
     placed = []
-    n_heights = n_directions = 0
+    n_heights = n_directions = n_upright = 0
     for tag in tags:
         row = measured.get(_key(tag), _Measured(None, None))
-        z_m = options.tag_height_m if row.z_m is None else row.z_m
-        yaw_rad = viewed.get(_key(tag)) if row.yaw_rad is None else row.yaw_rad
+        known = _Measured(None, None) if tag.pose is None else _Measured(tag.pose.height_m, tag.pose.yaw_rad)
+        z_m, yaw_rad = _first(row.z_m, known.z_m), _first(row.yaw_rad, known.yaw_rad)
+        n_heights += z_m is None
+        n_directions += yaw_rad is None
+        n_upright += tag.pose is None
+        z_m, yaw_rad = _first(z_m, options.tag_height_m), _first(yaw_rad, viewed.get(_key(tag)))
         if z_m is None or yaw_rad is None:
             raise OfflineError(_what_is_missing(tag, z_m, options))
-        n_heights += row.z_m is None
-        n_directions += row.yaw_rad is None
-        placed.append(PlacedTag(tag, z_m, yaw_rad))
-    said = ["taken for upright, with x out of the face"]
+        placed.append(PlacedTag(tag, z_m, _turned(tag, yaw_rad)))
+    said = [] if tags and not n_upright else ["taken for upright, with x out of the face"]
+    if 0 < n_upright < len(placed):
+        said = [f"taken for upright, with x out of the face: {n_upright} of {len(placed)} tags"]
     if n_heights:
         said.append(f"assumed: {n_heights} of {len(placed)} tags hang {options.tag_height_m} m above the floor")
     if n_directions:
@@ -67,6 +81,18 @@ def tags_in_space(
             "by tens of degrees"
         )
     return placed, said
+
+
+def _first(value: float | None, otherwise: float | None) -> float | None:
+    return otherwise if value is None else value
+
+
+def _turned(tag: TagResult, yaw_rad: float) -> Rotation:
+    """R_map_tag in the axes of layouts, the face to a direction, tilted as the map has it."""
+    if tag.pose is None:
+        return Rotation.from_euler("z", yaw_rad)
+    turn = Rotation.from_euler("z", yaw_rad - tag.pose.yaw_rad)
+    return turn * Rotation.from_quat(tag.pose.quaternion_xyzw) * _TO_LAYOUT
 
 
 def _what_is_missing(tag: TagResult, z_m: float | None, options: ExportOptions) -> str:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import se2
 from offline.map_io import read_map, write_map
-from offline.result import Component, GraphEdges, TagResult
+from offline.result import Component, GraphEdges, TagPose, TagResult
 from tests.made_maps import made_component, made_map
 from tests.programs import Run
 
@@ -137,6 +137,43 @@ def test_what_was_measured_wins_over_what_is_assumed(component: Component, expor
     assert [entry["pose"]["translation"]["z"] for entry in layout["tags"]] == [0.7, 1.25, 1.25]
     assert "assumed: 2 of 3 tags hang 1.25 m above the floor" in said
     assert any(line.startswith("assumed: 1 of 3 tags face") for line in said)
+
+
+R_TILTED = Rotation.from_euler("ZYX", [0.4, 0.2, 0.1])  # of x out of the face, y to the viewer's right, z up
+
+
+def hung(component: Component) -> Component:
+    """Two of three tags with the pose that a map of corners has: its z out of the face, x to the right, y up."""
+    right, up, out = R_TILTED.as_matrix()[:, [1, 2, 0]].T
+    quaternion = Rotation.from_matrix(np.column_stack([right, up, out])).as_quat()
+    pose = TagPose(1.7, quaternion, 1e-4 * np.eye(6))
+    first, second, third = component.tags
+    return replace(component, tags=(replace(first, pose=pose), replace(second, pose=pose), third))
+
+
+def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
+    component: Component, export: Export, tmp_path: Path
+) -> None:
+    made = hung(component)
+    write_map(made_map(made), tmp_path / "map")
+    assert made.tags[0].pose is not None
+    face = R_TILTED.apply([1.0, 0.0, 0.0])
+    assert made.tags[0].pose.yaw_rad == pytest.approx(np.arctan2(face[1], face[0]))
+    rows = [("", ""), ("0.7", repr(made.tags[0].pose.yaw_rad + 0.3)), ("0.9", "0.5")]
+    layout, said = export("frc", *FIELD, "--tag-poses", filled_in(tmp_path / "map", rows))
+    wanted = [(1.7, R_TILTED), (0.7, Rotation.from_euler("z", 0.3) * R_TILTED), (0.9, Rotation.from_euler("z", 0.5))]
+    for entry, (z_m, rotation) in zip(layout["tags"], wanted, strict=True):
+        assert entry["pose"]["translation"]["z"] == pytest.approx(z_m)
+        q = entry["pose"]["rotation"]["quaternion"]
+        turn = Rotation.from_quat([q["X"], q["Y"], q["Z"], q["W"]])
+        assert (turn.inv() * rotation).magnitude() == pytest.approx(0.0, abs=1e-9)
+    assert "taken for upright, with x out of the face: 1 of 3 tags" in said
+    (tmp_path / "out.json").unlink()
+    fmap, said = export("limelight", *ASSUMED)
+    matrix = np.reshape(fmap["fiducials"][0]["transform"], (4, 4))
+    np.testing.assert_allclose(matrix[:3, :3], R_TILTED.as_matrix(), atol=1e-9)
+    assert matrix[2, 3] == pytest.approx(1.7)
+    assert "assumed: 1 of 3 tags hang 1.25 m above the floor" in said
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from offline.map_mcap import write_mcap
-from offline.result import MapResult
+from offline.result import MapResult, TagPose
 from onboard.messages import TOPICS, nanoseconds
 from tests.made_maps import made_component, made_map
 
@@ -85,6 +85,22 @@ def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -
         said = {pair.key: pair.value for pair in entity.metadata}
         assert said["runs"] == " ".join(tag.runs)
         assert said["n_observations"] == str(tag.n_observations)
+
+
+def test_tags_hang_where_a_map_of_corners_has_them(tmp_path: Path) -> None:
+    component = made_component()
+    pose = TagPose(1.7, Rotation.from_euler("ZYX", [0.4, 0.2, 1.5]).as_quat(), 1e-4 * np.eye(6))
+    first, *others = component.tags
+    component = replace(component, tags=(replace(first, pose=pose), *others))
+    (scene,) = of_topic(read_back(made_map(component), tmp_path / "map.mcap"), "/map/tags")
+    hung, flat, _ = scene.entities
+    q = hung.spheres[0].pose.orientation
+    assert [q.x, q.y, q.z, q.w] == pose.quaternion_xyzw.tolist()
+    assert hung.spheres[0].pose.position.z == 1.7
+    assert flat.spheres[0].pose.position.z == 0.0
+    assert hung.cylinders[0].pose.position.z == 0.0
+    assert hung.texts[0].pose.position.z > 1.7
+    assert {pair.key: pair.value for pair in hung.metadata}["height_m"] == "1.7000"
 
 
 def test_trajectories_are_there_whole_as_lines_and_poses(tmp_path: Path) -> None:
