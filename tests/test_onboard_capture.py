@@ -30,6 +30,7 @@ from onboard.detection_process import Picture
 from onboard.errors import OnboardError
 from onboard.messages import StampSource
 from tests.board_views import good_views, rendered
+from tests.live_recording import PATIENCE_S, until
 
 MS = 1_000_000
 STEP_NS = 110 * MS
@@ -281,9 +282,13 @@ def hold_up(camera: PictureFolder, pictures: Path, process: "subprocess.Popen[st
     """Holds up one view after the other, each until it was taken."""
     for before, index in enumerate(which, start=len(list(pictures.glob("0*")))):
         picture = jpeg(rendered()[index])
-        while process.poll() is None and len(list(pictures.glob("0*"))) == before:
+
+        def taken(picture: bytes = picture, before: int = before) -> bool:
             camera.show(picture)
             time.sleep(0.05)
+            return process.poll() is not None or len(list(pictures.glob("0*"))) > before
+
+        until(taken, "a picture taken")
 
 
 def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> None:
@@ -293,7 +298,7 @@ def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> No
         (pictures / f"{number:04}.jpg").write_bytes(jpeg(picture))
     with program(tmp_path, "--views", "8") as process:
         hold_up(camera, pictures, process, [10, 11])
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, said
     lines = said.splitlines()
     assert "11 of 8: taken; bring the board nearer" in lines
@@ -309,7 +314,7 @@ def test_whoever_ends_it_keeps_what_there_is(tmp_path: Path, ending: signal.Sign
     with program(tmp_path) as process:
         hold_up(camera, tmp_path / "pictures", process, range(2))
         process.send_signal(ending)
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 3, said
     assert f"{tmp_path / 'pictures'}: 2 pictures" in said
     assert "still missing: show the board at the picture's" in said
@@ -319,11 +324,15 @@ def test_whoever_ends_it_keeps_what_there_is(tmp_path: Path, ending: signal.Sign
 def test_without_any_picture_it_fails(tmp_path: Path) -> None:
     camera = PictureFolder(tmp_path / "camera", keep=20)
     with program(tmp_path) as process:
-        while not (tmp_path / "capture.jpg").exists():
+
+        def looked() -> bool:
             camera.show(jpeg(EMPTY))
             time.sleep(0.05)
+            return (tmp_path / "capture.jpg").exists()
+
+        until(looked, "a look")
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert f"{tmp_path / 'pictures'}: no picture was taken" in said
     assert not (tmp_path / "pictures").exists()

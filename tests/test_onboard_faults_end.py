@@ -9,17 +9,18 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
+from fixtures.devices import PictureFolder, PtyPort, paced, wheel_line
 from onboard.errors import OnboardError
 from onboard.log_reader import find_logs, read_log
 from onboard.status import read_status
-from tests.live_recording import robot_yaml, tag_jpeg, until
+from tests.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
 from tests.made_cores import frames_of, wheels_of
 from tests.processor_wait import ended_within
 
@@ -30,16 +31,24 @@ BLOCKED = """
 import os, signal, time
 from onboard.encoder_port import EncoderPort
 from onboard.picture_folder import FolderCamera
+from functools import partial
+from onboard import live_recorder
 reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}
 def blocking(device):
+    given = False  # what the devices gave last is still under way then
     def read(self, timeout_s):
-        if os.path.exists("block"):
+        nonlocal given
+        if given:
             print("blocked", device.__name__, flush=True)
             time.sleep(1e6)
-        return reads[device](self, timeout_s)
+        last = os.path.exists("block")
+        found = reads[device](self, timeout_s)
+        given = last and bool(found)
+        return found
     return read
 for device in reads:
     device.read = blocking(device)
+live_recorder.ChildDetector = partial(live_recorder.ChildDetector, job_limit_s=1e6)
 """
 # A disk that never comes back from a sync.
 STALLED = """
@@ -133,10 +142,12 @@ def full_load(folder: Path) -> Iterator[None]:
     over = threading.Event()
 
     def drive() -> None:
-        at_rate(1000.0, 60.0, lambda i: None if over.is_set() else port.send(wheel_line(i, time.monotonic_ns())))
+        for index in takewhile(lambda _: not over.is_set(), paced(1000.0)):
+            port.send(wheel_line(index, time.monotonic_ns()))
 
     def show() -> None:
-        at_rate(30.0, 60.0, lambda _: None if over.is_set() else (camera.show(picture), None)[1])
+        for _ in takewhile(lambda _: not over.is_set(), paced(30.0)):
+            camera.show(picture)
 
     threads = [threading.Thread(target=each, daemon=True) for each in (drive, show)]
     for each in threads:
@@ -155,7 +166,7 @@ def both(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("number", [*BOTH_SIGNALS, signal.SIGHUP])
 def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: signal.Signals) -> None:
     """With its detection, as a terminal does: by Ctrl-C, or where it is closed."""
-    with full_load(tmp_path), recorder(tmp_path, both) as process:
+    with full_load(tmp_path), recorder(tmp_path, both, PATIENT) as process:
         wait_for_load(tmp_path)
         os.killpg(process.pid, number)
         said = ended_within(process, LIMIT_S)
@@ -193,7 +204,6 @@ def test_row_18_told_to_end_while_port_camera_and_detection_block(tmp_path: Path
         for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
             if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
                 os.kill(int(child), signal.SIGSTOP)
-        time.sleep(0.2)
         (tmp_path / "block").touch()
         wait_for(process, "blocked EncoderPort", "blocked FolderCamera")
         process.send_signal(signal.SIGTERM)
@@ -231,18 +241,27 @@ class Systemd:
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
-        self._socket.settimeout(0.05)
+        self._socket.settimeout(PATIENCE_S)
         self.heard: list[str] = []
 
-    def listen(self, seconds: float) -> list[str]:
-        """What comes within the time."""
-        end_s, before = time.monotonic() + seconds, len(self.heard)
-        while time.monotonic() < end_s:
-            try:
-                self.heard += self._socket.recv(4096).decode().splitlines()
-            except TimeoutError:
-                continue
-        return self.heard[before:]
+    def next(self) -> str:
+        """The next notice."""
+        self.heard.append(self._socket.recv(4096).decode())
+        return self.heard[-1]
+
+    def wait_for(self, text: str, times: int = 1) -> None:
+        """Listens until so many notices had the text."""
+        while times:
+            times -= text in self.next()
+
+    def rest(self) -> list[str]:
+        """What was said and not yet heard, by one who is gone."""
+        self._socket.setblocking(False)
+        said = []
+        with suppress(BlockingIOError):
+            while True:
+                said.append(self.next())
+        return said
 
 
 def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> None:
@@ -253,22 +272,26 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
     with full_load(tmp_path):
         with recorder(tmp_path, robot, STALLED, environment=listening) as process:
             wait_for(process, "port_connected")
-            until(lambda: systemd.listen(0.1)[:1] == ["READY=1"], "READY=1")
-            assert systemd.listen(2.0).count("WATCHDOG=1") >= 2
+            assert systemd.next() == "READY=1"
+            systemd.wait_for("WATCHDOG=1", 2)
+            until(lambda: counts(tmp_path).get("/wheels", 0) > 1000, "readings")
+            systemd.wait_for("WATCHDOG=1", 2)  # meanwhile those are safe
             safe = tmp_path / "stall"
             safe.touch()
-            systemd.listen(1.6)  # the log has not come forward for half the watchdog's time after this
-            assert "WATCHDOG=1" not in systemd.listen(1.5)
+            systemd.wait_for("the log has not come forward")
+            assert not [said for said in (systemd.next() for _ in range(3)) if "WATCHDOG=1" in said]
             process.kill()
             process.wait()
             safe.unlink()
         with recorder(tmp_path, robot, STALLED, environment=listening) as process:
             wait_for(process, "port_connected")
-            assert "WATCHDOG=1" in systemd.listen(3.0)
+            systemd.wait_for("READY=1")
+            systemd.wait_for("WATCHDOG=1")
             process.send_signal(signal.SIGTERM)
             ended_within(process, LIMIT_S)
-    systemd.listen(0.5)
-    assert systemd.heard[-1] == "STOPPING=1"
+    said = systemd.rest()
+    assert said.count("STOPPING=1") == 1
+    assert not [each for each in said[said.index("STOPPING=1") :] if "WATCHDOG=1" in each]
     first, second = find_logs([tmp_path / "logs"])
     assert len(wheels_of(first)) > 1000  # what came before the stall
     check_finished(second)
@@ -296,7 +319,7 @@ def test_row_41_a_bad_file_is_one_line_at_the_start(tmp_path: Path, old: str, ne
     assert old in robot.read_text()
     robot.write_text(robot.read_text().replace(old, new))
     with recorder(tmp_path, robot) as process:
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert said.startswith("error: ")
     assert said.count("\n") == 1

@@ -57,17 +57,17 @@ def memory_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_BYTES / 1e6
 
 
-@pytest.mark.parametrize("seconds", [8, pytest.param(2.4 * 3600, marks=pytest.mark.long)])
-def test_row_42_a_live_day_at_ten_times_the_speed(tmp_path: Path, seconds: float) -> None:
+@pytest.mark.parametrize("n_looks", [9, pytest.param(9_000, marks=pytest.mark.long)])
+def test_row_42_a_live_day_at_ten_times_the_speed(tmp_path: Path, n_looks: int) -> None:
     """1 kHz of lines, 50 pictures a second into a folder that is emptied behind, a replug now and then."""
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
-    camera, picture, looks = PictureFolder(tmp_path / "pictures", keep=200), tag_jpeg(), []
+    camera, picture = PictureFolder(tmp_path / "pictures", keep=200), tag_jpeg()
+    looks: list[tuple[float, int, int, int]] = []
     with Driver(tmp_path / "wheels", 1000.0) as driver:
         driver.plug_in()
         with recording(robot, tmp_path / "logs") as made:
             made.wait_for_messages("/wheels", 100)
-            end_s = time.monotonic() + seconds
-            while time.monotonic() < end_s:
+            while len(looks) < n_looks:
                 for _ in range(50):
                     camera.show(picture)
                     time.sleep(0.018)
