@@ -60,7 +60,9 @@ class Rivalry:
             if self.is_same_place(other, best) and not self._has_group_of_its_own(other, best):
                 continue
             worth = its + self.of_group(other, groups)
-            if _has_two_of_its_own(other, best):  # what fits both may be of either group
+            # What fits both may be of either group, unless the rest is outnumbered: then those did not stay.
+            n_own = int((other.members & ~best.members).sum())
+            if n_own > 1 and best.n < GROUP_MARGIN * n_own:
                 own = without(other, np.flatnonzero(other.members & best.members))
                 worth = max(worth, self.evidence(own) + self.of_group(own, groups))
             if is_alike or worth > best_worth - MARGIN_NATS:
@@ -92,11 +94,6 @@ class Rivalry:
         by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
         covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
         return covariance
-
-
-def _has_two_of_its_own(other: Explanation, best: Explanation) -> bool:
-    """Whether two tags at least are not of the best."""
-    return bool((other.members & ~best.members).sum() > 1)
 
 
 def _as_group(explanation: Explanation, tags: BoolArray, n: int) -> float:
