@@ -119,9 +119,14 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
 
 
 def place_beside(drives: Drives, view: View, chain: int, keyframe: int, side: float) -> Place:
-    """The place ahead of a keyframe, to its left (+1) or right (-1)."""
+    """The place ahead of a keyframe, to its left (+1) or right (-1).
+
+    Nobody views it where the keyframe's chain has no readings: how its robot would read it, nothing tells.
+    """
     pose = int(drives.graph.first_pose[chain]) + keyframe
     sensor = drives.sensors[pose]
+    if drives.example[pose] < 0:
+        return Place(chain, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
     angle = side * view.typical_rad
     position_m = se2.apply(sensor, view.typical_m * np.array([np.cos(angle), np.sin(angle)]))
     step = -(-len(drives.sensors) // _MOST_VIEWERS)

@@ -10,7 +10,7 @@ from offline.advice import advise, candidates_of, judged, known_of
 from offline.advice_gain import Known
 from offline.advice_passes import gain_of_pass, most_length_m
 from offline.advice_seen import expected_sigmas_m, seen_shares
-from offline.advice_tags import Place, gain_of_place
+from offline.advice_tags import Place, gain_of_place, place_beside
 from offline.chain import Chain
 from offline.factors import State
 from offline.graph import Graph, build_graph
@@ -76,6 +76,18 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
     )
     del exact[NEW]
     np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
+
+
+def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
+    """Its mount and scale would be another robot's."""
+    found = candidates_of(scene.graph, scene.solution.state)
+    place = found.places[0]
+    pose = int(scene.graph.first_pose[place.chain]) + place.keyframe
+    assert pose in place_beside(found.drives, found.view, place.chain, place.keyframe, 1.0).viewers
+    lengths = [len(each.stamps_ns) for each in scene.graph.chains]
+    is_silent = np.repeat(np.arange(len(lengths)), lengths) == place.chain
+    drives = found.drives._replace(example=np.where(is_silent, -1, found.drives.example))
+    assert not len(place_beside(drives, found.view, place.chain, place.keyframe, 1.0).viewers)
 
 
 def _seen(sensors: FloatArray, place: Place) -> FloatArray:
