@@ -20,6 +20,7 @@ from calib.lens_parameters import parameters_of, pixels_by_parameters, with_para
 
 _ROUNDS: Final = 60
 _ARRIVED: Final = 1e-10  # of the cost, relative
+_LEAST_DAMPING: Final = 1e-12
 _MOST_DAMPING: Final = 1e10
 _LEAST_COSINE: Final = 0.05  # of a ray against the board's direction
 _LEAST_CORNERS: Final = 4  # that fix a pose
@@ -132,7 +133,7 @@ def adjusted(
         cost = np.inf if tried_model is None else system.cost(tried_model, tried_poses)
         if tried_model is not None and cost < blocks.cost:
             gain = blocks.cost - cost
-            model, poses, damping = tried_model, tried_poses, max(0.1 * damping, 1e-12)
+            model, poses, damping = tried_model, tried_poses, max(0.1 * damping, _LEAST_DAMPING)
             blocks = system.linearised(model, poses)
             if gain < _ARRIVED * blocks.cost:
                 break
@@ -168,8 +169,7 @@ class _Blocks:
     def step(self, damping: float, hold_intrinsics: bool) -> tuple[FloatArray, FloatArray]:
         """To be subtracted: (n,) of the intrinsics, (V, 6) of the poses."""
         n = self.normal.shape[-1] - 6
-        diagonal = np.einsum("vii->vi", self.normal)
-        D = self.normal[:, n:, n:] + (damping * diagonal[:, n:, None] + 1e-12) * np.eye(6)
+        D = self._of_poses(damping)
         gain = np.linalg.solve(D, np.concatenate([self.normal[:, n:, :n], self.gradient[:, n:, None]], axis=-1))
         if hold_intrinsics:
             return np.zeros(n), gain[..., n]
@@ -180,10 +180,16 @@ class _Blocks:
         step_b = inverse(A) @ right
         return step_b, gain[..., n] - gain[..., :n] @ step_b
 
+    def _of_poses(self, damping: float) -> FloatArray:
+        """(V, 6, 6), with so much more on the diagonal: of a view few corners may count, too few for a pose."""
+        of_poses = self.normal[:, -6:, -6:]
+        diagonal = np.einsum("vii->vi", of_poses)
+        return np.asarray(of_poses + (damping * diagonal[..., None] + _LEAST_DAMPING) * np.eye(6))
+
     def intrinsics_alone(self) -> tuple[FloatArray, FloatArray]:
         """(n, n) information of the intrinsics where poses are unknown, and (V, n, n) each view's share."""
         n = self.normal.shape[-1] - 6
-        D = self.normal[:, n:, n:] + 1e-12 * np.eye(6)
+        D = self._of_poses(_LEAST_DAMPING)
         by_view = self.normal[:, :n, :n] - self.normal[:, :n, n:] @ np.linalg.solve(D, self.normal[:, n:, :n])
         return np.asarray(by_view.sum(axis=0)), np.asarray(by_view)
 

@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from calib.board import DEFAULT_BOARD
 from calib.board_finder import BoardFinder
-from calib.bundle import Observations, board_pose
+from calib.bundle import Observations, Poses, adjusted, board_pose
 from calib.camera_model import CameraModel
 from calib.lens_fit import first_guess, fitted_lens
 from calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
@@ -170,3 +170,17 @@ def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera
     ratio = np.sqrt(np.mean(drawn, axis=0)) / predicted
     assert np.nanmin(ratio) > 0.7
     assert np.nanmax(ratio) < 1.3
+
+
+@every_camera
+@pytest.mark.parametrize("n_corners", [1, 2])
+def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: CameraModel, n_corners: int) -> None:
+    """Robust weights may leave a spoilt view as few: its pose is then no matter, and the others tell the camera."""
+    seen, views = made_corners(camera, seed=2, count=6)
+    T_camera_board = np.array([view.T_camera_board for view in views])
+    poses = Poses(T_camera_board[:, :3, :3], T_camera_board[:, :3, 3])
+    counts = (seen.view > 0) | (np.cumsum(seen.view == 0) <= n_corners)
+    fit, others = (
+        adjusted(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2)) for each in (counts, seen.view > 0)
+    )
+    np.testing.assert_allclose(fit.information, others.information, rtol=1e-3, atol=1e-6 * others.information.max())
