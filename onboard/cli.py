@@ -58,7 +58,7 @@ def record(
 
     with ConsoleLines(sys.stdout) as console:
         recorder = LiveRecorder(files, output, stop, tell_event, console.say)
-        keeper = Housekeeper(recorder, path, Notifier())
+        keeper = Housekeeper(recorder, path, Notifier(), console.say)
         keeper.start()
         try:
             recorder.run()

@@ -111,16 +111,16 @@ class Rates:
         return max(0.0, (last.written_bytes - first.written_bytes) * _NS_PER_S / elapsed_ns)
 
 
-def write_status(status: Status, path: Path) -> bool:
-    """Puts the file in place as a whole; False where the disk will not have it."""
+def write_status(status: Status, path: Path) -> str | None:
+    """Puts the file in place as a whole; returns why the disk will not have it, None where it has."""
     try:
         with written_whole(path) as temporary:
             temporary.unlink(missing_ok=True)  # of a recorder of the same pid that was killed
             with temporary.open("x", encoding="utf-8") as file:  # never through a link
                 file.write(status.model_dump_json(indent=1))
-    except OSError:
-        return False
-    return True
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 def read_status(place: Path) -> Status:
@@ -131,7 +131,8 @@ def read_status(place: Path) -> Status:
     """
     files = [place]
     if place.is_dir():
-        files = sorted(place.glob(f"*{STATUS_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns)
+        there = [path for path in place.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # no link that leads nowhere
+        files = sorted(there, key=lambda path: path.stat().st_mtime_ns)
     if not files or not files[-1].is_file():
         raise OnboardError(f"{place}: no recorder has left a status here; give the --output or --status of `record`")
     try:

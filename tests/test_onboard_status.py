@@ -2,8 +2,10 @@
 
 import json
 import os
+import threading
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from typer.testing import CliRunner
@@ -42,6 +44,7 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     camera, path = PictureFolder(tmp_path / "pictures"), tmp_path / "logs" / "gb1.status.json"
     seen: list[Status] = []
+    said: list[str] = []
 
     def shows(lines: int) -> bool:
         camera.show(tag_jpeg())
@@ -53,7 +56,7 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
     with Driver(tmp_path / "wheels") as driver:
         driver.plug_in()
         with recording(robot, tmp_path / "logs") as made:
-            keeper = Housekeeper(made.recorder, path, Notifier(), period_s=0.1)
+            keeper = Housekeeper(made.recorder, path, Notifier(), said.append, period_s=0.1)
             keeper.start()
             until(lambda: shows(100), "a status")
             driver.unplug()
@@ -99,7 +102,7 @@ def made_status(**changes: object) -> Status:
 def test_the_command_says_it_in_plain_lines(
     tmp_path: Path, changes: dict[str, object], code: int, words: list[str]
 ) -> None:
-    assert write_status(made_status(**changes), tmp_path / "gb1.status.json")
+    assert write_status(made_status(**changes), tmp_path / "gb1.status.json") is None
     said = CliRunner().invoke(app, ["status", "--once", str(tmp_path)])
     assert said.exit_code == code
     assert [word for word in words if word not in said.output] == []
@@ -118,10 +121,81 @@ def test_a_status_is_never_written_through_a_link(tmp_path: Path) -> None:
     victim.write_text("precious")
     path.symlink_to(victim)
     (tmp_path / f".{path.name}.{os.getpid()}.partial").symlink_to(victim)
-    assert write_status(made_status(), path)
+    assert write_status(made_status(), path) is None
     assert victim.read_text() == "precious"
     assert read_status(path).robot_id == "gb1"
 
 
 def test_a_disk_that_will_not_have_the_status_does_not_stop_the_recorder(tmp_path: Path) -> None:
-    assert not write_status(made_status(), tmp_path / "absent" / "gb1.status.json")
+    assert write_status(made_status(), tmp_path / "absent" / "gb1.status.json") == "No such file or directory"
+
+
+class FakeRecorder:
+    """As much of a recorder as decides what systemd is told."""
+
+    def __init__(self) -> None:
+        self.begun = threading.Event()
+        self.begun.set()
+        self.is_stopping = False
+        self.stalled_s = 0.0
+        self.log = self
+
+
+class FakeNotifier:
+    """Notes what systemd is told."""
+
+    watchdog_s: float | None = 0.02  # so that looks come every 5 ms
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def ready(self) -> None:
+        self.said.append("ready")
+
+    def alive(self, _text: str) -> None:
+        self.said.append("alive")
+
+    def troubled(self, _text: str) -> None:
+        self.said.append("troubled")
+
+    def stopping(self) -> None:
+        self.said.append("stopping")
+
+
+def test_only_a_log_that_stands_still_keeps_the_watchdog_from_its_food(tmp_path: Path) -> None:
+    recorder, notifier, notices = FakeRecorder(), FakeNotifier(), list[str]()
+    keeper = Housekeeper(cast(Any, recorder), tmp_path / "x.json", cast(Any, notifier), notices.append)
+    keeper.start()  # each look fails: this recorder has no core
+    until(lambda: notifier.said.count("alive") >= 3, "food")
+    recorder.stalled_s = 100.0
+    until(lambda: "troubled" in notifier.said, "trouble")
+    assert len(notices) == 1
+    assert "status: cannot be told (AttributeError" in notices[0]
+    recorder.is_stopping = True
+    until(lambda: "stopping" in notifier.said, "the end")
+    recorder.stalled_s = 0.0
+    n_looks = len(notifier.said)
+    time.sleep(0.05)  # some looks more
+    keeper.end()
+    assert notifier.said[n_looks:] == []
+    assert notifier.said[-1] == "stopping"
+
+
+def test_a_status_that_cannot_be_written_is_told_of_once(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
+    said: list[str] = []
+    output = tmp_path / "logs\udcff"  # no UTF-8
+    with recording(robot, output) as made:
+        keeper = Housekeeper(made.recorder, tmp_path / "absent" / "x.json", Notifier(), said.append, period_s=0.01)
+        for _ in range(3):
+            status = keeper._write("recording")
+    assert said == [f"status: {tmp_path / 'absent' / 'x.json'} cannot be written (No such file or directory)"]
+    assert status is not None
+    assert "logs\\xff" in status.folder
+    assert write_status(status, tmp_path / "x.json") is None
+
+
+def test_a_status_that_is_a_link_to_nothing_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.status.json").symlink_to("gone")
+    with pytest.raises(OnboardError, match="no recorder has left a status"):
+        read_status(tmp_path)
