@@ -11,14 +11,31 @@ from calib.errors import CalibError
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; renames it over `path` if the block ends well, else removes it."""
+def written_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; renames it over `path` if the block ends well, else removes it.
+
+    Args:
+        path: of the file.
+        durable: wait for the disk, so that a power cut leaves the old file or the new one. A disk that hangs
+            holds this up.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
+        temporary.unlink(missing_ok=True)  # of a process of the same number that was killed, as in containers
         yield temporary
+        if durable:
+            _sync(temporary)  # else, after a power cut, the final name may hold nothing
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
 @contextmanager
@@ -45,6 +62,7 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
                 raise CalibError(
                     f"{folder}: is where a disk is mounted, and is filled by renaming; name a folder in it"
                 )
+            _put_back(folder, partial, replaced)  # of a process of the same number that was killed, as in containers
             partial.mkdir(parents=True)
         yield partial
         with _told(folder):
@@ -52,13 +70,18 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
                 folder.rename(replaced)
             partial.rename(folder)
     finally:
-        if replaced.exists() and not folder.exists():
-            replaced.rename(folder)
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(replaced, ignore_errors=True)
+        _put_back(folder, partial, replaced)
         for parent in made:
             if parent.is_dir() and not any(parent.iterdir()):
                 parent.rmdir()
+
+
+def _put_back(folder: Path, partial: Path, replaced: Path) -> None:
+    """Leaves neither of the two folders beside `folder`, nor the one missing that was to be replaced."""
+    if replaced.exists() and not folder.exists():
+        replaced.rename(folder)
+    shutil.rmtree(partial, ignore_errors=True)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 @contextmanager

@@ -114,10 +114,8 @@ class Rates:
 def write_status(status: Status, path: Path) -> str | None:
     """Puts the file in place as a whole; returns why the disk will not have it, None where it has."""
     try:
-        with written_whole(path) as temporary:
-            temporary.unlink(missing_ok=True)  # of a recorder of the same pid that was killed
-            with temporary.open("x", encoding="utf-8") as file:  # never through a link
-                file.write(status.model_dump_json(indent=1))
+        with written_whole(path, durable=False) as temporary, temporary.open("x", encoding="utf-8") as file:
+            file.write(status.model_dump_json(indent=1))  # "x": never through a link
     except OSError as error:
         return error.strerror or str(error)
     return None

@@ -1,5 +1,6 @@
 """Files and folders that are there whole or not at all."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -120,3 +121,33 @@ def test_a_mount_point_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         folder_written_whole(tmp_path),
     ):
         pytest.fail("the block must not run")
+
+
+def test_what_a_killed_process_of_the_same_number_left_is_in_nobodys_way(tmp_path: Path) -> None:
+    file, folder = tmp_path / "file", tmp_path / "folder"
+    file.with_name(f".file.{os.getpid()}.partial").write_text("half")
+    with written_whole(file) as partial, partial.open("x") as opened:
+        opened.write("whole")
+    for word in ("partial", "replaced"):  # killed while the folder had no name
+        (tmp_path / f".folder.{os.getpid()}.{word}").mkdir()
+        (tmp_path / f".folder.{os.getpid()}.{word}" / word).touch()
+    with pytest.raises(ZeroDivisionError), folder_written_whole(folder, replace=True) as partial:
+        spoilt(partial / "new")
+    assert all_below(tmp_path) == [file, folder, folder / "replaced"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, sizes, fsync = tmp_path / "file", list[int](), os.fsync
+
+    def synced(file: int) -> None:
+        assert not path.exists()
+        sizes.append(os.fstat(file).st_size)
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    with written_whole(path) as partial:
+        partial.write_text("whole")
+    assert sizes == [5]
+    with written_whole(path, durable=False) as partial:
+        partial.write_text("of now")
+    assert sizes == [5]
