@@ -42,7 +42,7 @@ def camera_from_kalibr(content: Mapping[str, Any], source: str) -> CameraModel:
     Raises:
         CalibError: several cameras, or one that we do not have.
     """
-    names = [name for name in content if name.startswith("cam") and isinstance(content[name], Mapping)]
+    names = [name for name in content if str(name).startswith("cam") and isinstance(content[name], Mapping)]
     if len(names) != 1:
         raise CalibError(f"{source}: has {len(names)} cameras ({', '.join(names)}); leave the one that is meant")
     camera = validated(_KalibrCamera, content[names[0]], f"{source}: {names[0]}")

@@ -131,9 +131,9 @@ class TagBatch(_Section):
 class Devices(_Section):
     """What the recorder opens."""
 
-    encoder_port: str | None = None
+    encoder_port: Annotated[str, Field(min_length=1)] | None = None
     encoder_baud: Annotated[int, Field(gt=0)] = 115200
-    camera: str | None = None
+    camera: Annotated[str, Field(min_length=1)] | None = None
     camera_fps: Positive = 15.0
     camera_exposure_s: Positive | None = None
     camera_gain: NotNegative | None = None

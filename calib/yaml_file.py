@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
@@ -16,13 +17,30 @@ from calib.files import written_whole
 Model = TypeVar("Model", bound=BaseModel)
 
 _LONGEST_VALUE = 60  # characters of a bad value worth repeating
+_MOST_ALIASES: Final = 16  # of a text: each may stand for as much as all before it, so that few words fill any memory
 # Characters: a second's work. Logs carry such texts, and anybody may have made a log.
 LONGEST_TEXT: Final = 1 << 17
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 
+_SHORT = reprlib.Repr()  # never all of it: an alias named again and again may stand for gigabytes
+_SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = _LONGEST_VALUE + 1
+_SHORT.maxdict = _SHORT.maxlist = _SHORT.maxset = 12
+_SHORT.maxlevel = 3
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.2's core scalars: 1e-3 is a number, `no` a word, 010 ten. A key given twice is an error."""
+
+    n_aliases = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            self.n_aliases += 1
+            if self.n_aliases > _MOST_ALIASES:
+                mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]  # PyYAML's stubs have no types for it
+                raise yaml.MarkedYAMLError(problem=f"more than {_MOST_ALIASES} aliases", problem_mark=mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -87,6 +105,9 @@ def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[s
         raise CalibError(f"{source}: {place}not valid YAML ({error.problem}); correct that line") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise CalibError(f"{source}: not valid YAML ({error})") from error
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:  # of PyYAML's own constructors
+        reason = " ".join(str(error).split())[:_LONGEST_VALUE]
+        raise CalibError(f"{source}: not valid YAML ({reason}); write plain `field: value` lines") from error
     if not isinstance(data, dict):
         raise CalibError(f"{source}: holds {_shown(data)} where fields were expected; write `field: value` lines")
     return cast(dict[str, Any], data)
@@ -159,5 +180,5 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
+    text = _SHORT.repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

@@ -289,6 +289,7 @@ def test_reads_what_kalibr_writes(tmp_path: Path, theirs: str, ours: str, coeffi
         ("0.0004]", "0.0004, 1.0]", ["distortion_coeffs", "5 numbers"]),
         ("resolution: [752, 480]", "", ["resolution", "missing"]),
         ("cam0:", "cam1: {camera_model: pinhole}\ncam0:", ["2 cameras", "cam0"]),
+        ("cam0:", "1: {}\ncam1: {camera_model: pinhole}\ncam0:", ["2 cameras", "cam0"]),
     ],
 )
 def test_a_kalibr_file_that_is_no_camera_of_ours_gives_one_clear_line(

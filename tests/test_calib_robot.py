@@ -2,6 +2,7 @@
 
 import math
 import re
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from calib.robot import (
     read_robot_yaml,
     write_robot_yaml,
 )
+from calib.yaml_file import parse_mapping, validated
 
 DOCUMENTATION = Path(__file__).parents[1] / "docs" / "robot_yaml.md"
 SECTIONS: dict[str, type[BaseModel]] = {
@@ -152,6 +154,8 @@ def test_a_tag_without_a_size_names_what_to_add() -> None:
         (SMALLEST + "mount: {z_m: 450}", ["mount.z_m", "450", "10"]),
         (SMALLEST + "mount: {x_m: }", ["mount.x_m", "None", "number"]),
         (SMALLEST + "camera: ''", ["camera", "''", "1 character"]),
+        (SMALLEST + "devices: {camera: ''}", ["devices.camera", "''", "1 character"]),
+        (SMALLEST + "devices: {encoder_port: ''}", ["devices.encoder_port", "''", "1 character"]),
         (SMALLEST + "readout_s: -0.01", ["readout_s", "-0.01", "greater than or equal to 0"]),
         (SMALLEST + "time_offset_s: .inf", ["time_offset_s", "inf", "finite"]),
         (SMALLEST + "tags: {family: tag36h11}", ["tags", "list"]),
@@ -184,6 +188,13 @@ def test_a_tag_without_a_size_names_what_to_add() -> None:
         (SMALLEST + "robot_id: b", ["line 3", "robot_id", "twice"]),
         (SMALLEST + "whels: 4", ["whels", "4", "did you mean wheels?"]),
         ("robot_id: [", ["line 1", "not valid YAML"]),
+        ("? [1, 2]\n: 3", ["not valid YAML", "unhashable"]),
+        ("robot_id: " + "1" * 5000, ["not valid YAML", "digits"]),
+        ("robot_id: !!int abc", ["not valid YAML", "abc"]),
+        ("robot_id: !!float abc", ["not valid YAML", "abc"]),
+        ("robot_id: !!bool maybe", ["not valid YAML", "maybe"]),
+        ("robot_id: !!timestamp abc", ["not valid YAML", "plain"]),
+        ("a: &a [x]\nb: [" + "*a," * 17 + "]", ["line 2", "more than 16 aliases"]),
         ("", ["None", "field: value"]),
     ],
 )
@@ -195,6 +206,18 @@ def test_a_bad_value_gives_one_clear_line(text: str, words: list[str]) -> None:
     for word in ["somewhere/robot.yaml: ", *words]:
         assert word in message
     assert "more after that" not in message  # one mistake, one error
+
+
+def test_of_a_bad_value_only_what_is_shown_is_written_out() -> None:
+    """Four levels of aliases make a quarter of a million words out of a thousand."""
+    lists = "".join(f"a{level}: &a{level} [{f'*a{level - 1},' * 4}]\n" for level in range(1, 5))
+    data = parse_mapping(f"a0: &a0 [{'x,' * 1000}]\n{lists}".replace("a4: &a4", "robot_id:"), "robot.yaml")
+    tracemalloc.start()
+    with pytest.raises(CalibError, match=r"robot_id is .*\.\.\. but must be"):
+        validated(Robot, {"robot_id": data["robot_id"]}, "robot.yaml")
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 300_000
 
 
 def test_a_missing_file_gives_one_clear_line(tmp_path: Path) -> None:
