@@ -2,11 +2,12 @@
 
 import signal
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from types import FrameType
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, ClassVar, Final, NoReturn
 
 import typer
 
@@ -23,9 +24,12 @@ _EXIT_SIGNALLED: Final = 128  # plus the signal's number, as shells have it
 class _Interrupted(BaseException):
     """Raised by a signal, so that whatever is half done is cleaned up; Typer would swallow a KeyboardInterrupt."""
 
+    newest: ClassVar["weakref.ref[_Interrupted] | None"] = None  # gives it while it is on its way
+
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
+        _Interrupted.newest = weakref.ref(self)
 
 
 def new_app(help_text: str) -> typer.Typer:
@@ -82,6 +86,10 @@ def _unwound_by_signals() -> Iterator[None]:
         signal.signal(each, _unwind)
     try:
         yield
+    except _Interrupted:
+        for each in taken:  # what is left is one line
+            signal.signal(each, signal.SIG_IGN)
+        raise
     finally:
         for each in taken:
             if signal.getsignal(each) is _unwind:  # not where a command set its own
@@ -89,6 +97,6 @@ def _unwound_by_signals() -> Iterator[None]:
 
 
 def _unwind(number: int, _frame: FrameType | None) -> None:
-    for each in _ENDING_SIGNALS:  # a second one must not stop the cleaning up
-        signal.signal(each, signal.SIG_IGN)
-    raise _Interrupted(number)
+    """A second signal must not stop the cleaning up; but the first is gone if it was swallowed, as in a `__del__`."""
+    if _Interrupted.newest is None or _Interrupted.newest() is None:
+        raise _Interrupted(number)

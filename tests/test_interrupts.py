@@ -98,6 +98,35 @@ def test_an_interrupted_map_leaves_what_was_there(
     assert not existing or (output / "map.json").read_text() == "earlier"
 
 
+# The first signal comes in a `__del__`, which swallows what it raises; the third while the second is cleaned up after.
+SWALLOWED = """
+import os, signal
+from calib.command_line import new_app, run
+app = new_app("x")
+class Swallowing:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+@app.command("a")
+def a():
+    Swallowing()
+    print("goes on", flush=True)
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        print("deaf", flush=True)
+    finally:
+        os.kill(os.getpid(), signal.SIGINT)
+        print("cleaned up", flush=True)
+run(app)
+"""
+
+
+def test_a_signal_that_was_swallowed_leaves_nobody_deaf() -> None:
+    with program("-c", SWALLOWED, "a") as process:
+        said, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 130, said
+    assert said.endswith("goes on\ncleaned up\ninterrupted\n")
+
+
 def test_signal_handlers_are_as_before_when_a_program_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     app = new_app("Does nothing.")
     app.command("rest")(lambda: None)
