@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from calib.robot import Robot
 from onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
 from onboard.clock import RunClock, wall_clock_synchronised
 from onboard.detection_process import ChildDetector, DetectionResult
@@ -26,6 +25,7 @@ _LOOK_NS: Final = 5 * _NS_PER_S
 _LOWEST_RATE_SHARE: Final = 0.5
 _BYTES_A_PIXEL: Final = 0.22  # of a JPEG, on the safe side, where there is no picture to tell
 _LEAST_HOURS: Final = 1.0
+_BYTES_A_MB: Final = 1_000_000
 _CHANGING_NAME: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 _LINKS: Final = Path("/dev/serial/by-id")
 _OLDEST_WALL_CLOCK_NS: Final = 1_735_689_600 * _NS_PER_S  # 2025
@@ -66,16 +66,16 @@ def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[Chec
     """
     clock, found = RunClock(), _Found()
     if files.robot.devices.encoder_port is not None:
-        yield _check_wheels(files.robot, clock, found)
+        yield _check_wheels(files, clock, found)
     if files.camera_settings is not None:
         yield from _check_camera(files, clock, picture, found)
     yield _check_clock(clock)
-    yield _check_disk(output, _load_of(files, found))
+    yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
 
-def _check_wheels(robot: Robot, clock: RunClock, seen: _Found) -> CheckResult:
-    devices = robot.devices
-    port = EncoderPort(devices.encoder_port or "", devices.encoder_baud)
+def _check_wheels(files: RobotFiles, clock: RunClock, seen: _Found) -> CheckResult:
+    devices = files.robot.devices
+    port = EncoderPort(str(files.path.parent / (devices.encoder_port or "")), devices.encoder_baud)
     parser, n_bytes = EncoderParser(), 0
     try:
         port.open()
@@ -168,7 +168,13 @@ def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _
     try:
         end_ns, arrived_ns, newest = clock.now_ns() + patience_ns, list[int](), None
         while clock.now_ns() < end_ns:
-            for frame in camera.read(0.1):
+            try:
+                frames = camera.read(0.1)
+            except CameraEndedError:  # a video may be short
+                if newest is None:
+                    raise
+                break
+            for frame in frames:
                 if newest is None:
                     end_ns = frame.receive_ns + _LISTEN_NS
                 newest = frame
@@ -211,12 +217,13 @@ def _load_of(files: RobotFiles, seen: _Found) -> Load:
     return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes)
 
 
-def _check_disk(output: Path, load: Load) -> CheckResult:
+def _check_disk(output: Path, load: Load, keep_free_mb: int) -> CheckResult:
     folder = output.absolute()
     while not folder.exists():
         folder = folder.parent
     free_bytes = shutil.disk_usage(folder).free
-    hours = hours_until_full(free_bytes, load.bytes_per_s) or math.inf
+    hours = hours_until_full(max(0, free_bytes - keep_free_mb * _BYTES_A_MB), load.bytes_per_s)
+    hours = math.inf if hours is None else hours
     kept = f"{load.kept_pictures_hz:.3g} pictures/s of {load.picture_bytes / 1e3:.0f} kB" if load.kept_hz else "none"
     found = f"{output}: {free_bytes / 1e9:.1f} GB free, enough for about {hours:.0f} h with pictures kept: {kept}"
     if hours < _LEAST_HOURS:

@@ -171,7 +171,7 @@ class LiveRecorder:
         files, devices = self.files, self.files.robot.devices
         threads: list[DeviceThread] = []
         if devices.encoder_port is not None:
-            port = EncoderPort(devices.encoder_port, devices.encoder_baud)
+            port = EncoderPort(str(files.path.parent / devices.encoder_port), devices.encoder_baud)
             threads.append(WheelThread(port, self.core, self._put, self._stop, self._on_notice))
         if files.camera_settings is not None:
             camera = CameraThread(

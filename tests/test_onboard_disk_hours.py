@@ -1,12 +1,13 @@
 """How long a disk lasts: what `check` foresees is what `status` will measure; and what a camera's rate is."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from onboard import check
-from onboard.camera import Camera, CameraSettings, Frame
+from onboard.camera import Camera, CameraEndedError, CameraSettings, Frame
 from onboard.clock import RunClock
 from onboard.disk_hours import Load, hours_until_full
 from onboard.messages import StampSource
@@ -54,6 +55,29 @@ def test_check_foresees_what_status_measures(tmp_path: Path, pictures_hz: int, p
 def test_nobody_knows_how_long_a_disk_lasts_that_nothing_is_written_to() -> None:
     assert hours_until_full(10**9, None) is None
     assert hours_until_full(10**9, 0.0) is None
+
+
+@pytest.mark.parametrize(("free_mb", "passed"), [(0, False), (500, False), (520, True)])
+def test_a_full_disk_does_not_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_mb: int, passed: bool) -> None:
+    """3.1 kB/s for an hour are 11 MB, beside the 500 MB that stay free."""
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free_mb * 1_000_000))
+    result = check._check_disk(tmp_path, Load(100.0, 0.0, 0.0, 0), 500)
+    assert result.passed == passed
+    assert "inf" not in result.text
+
+
+def test_a_camera_that_ends_while_check_looks_has_been_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Short(Scripted):
+        def read(self, timeout_s: float) -> list[Frame]:
+            if not self._frames:
+                raise CameraEndedError("over")
+            return super().read(timeout_s)
+
+    monkeypatch.setattr(check, "camera_for", lambda _settings, clock, since_ns: Short(clock, since_ns, 0, 20))
+    assert check._look(CameraSettings("drive.avi", 160, 120, 15.0), RunClock()).rate_hz == pytest.approx(10.0)
+    monkeypatch.setattr(check, "camera_for", lambda _settings, clock, since_ns: Short(clock, since_ns, 0, 0))
+    with pytest.raises(CameraEndedError, match="over"):
+        check._look(CameraSettings("drive.avi", 160, 120, 15.0), RunClock())
 
 
 def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_path: Path) -> None:

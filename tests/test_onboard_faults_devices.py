@@ -15,10 +15,12 @@ import cv2
 import pytest
 
 from fixtures.devices import PictureFolder
-from onboard import device_threads
+from onboard import check, device_threads
+from onboard.clock import RunClock
 from onboard.encoder_port import EncoderPort
 from onboard.messages import EventKind
 from onboard.picture_folder import FolderCamera
+from onboard.robot_files import RobotFiles
 from tests.fake_capture import FakeCapture, v4l2_camera_of
 from tests.live_recording import Driver, check_gapless, recording, robot_yaml, show_until, tag_jpeg, until
 from tests.made_cores import events_of, frames_of, wheels_of
@@ -55,6 +57,17 @@ def wheels_only(tmp_path: Path) -> Path:
 @pytest.fixture
 def both(tmp_path: Path) -> Path:
     return robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+
+
+def test_a_relative_port_starts_at_robot_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: wheels}"))
+    with Driver(tmp_path / "wheels") as driver, recording(files.path, tmp_path / "logs") as made:
+        driver.plug_in()
+        made.wait_for_messages("/wheels", 2)
+    monkeypatch.setattr(check, "_LISTEN_NS", 10_000_000)
+    assert str(tmp_path / "wheels") in check._check_wheels(files, RunClock(), check._Found()).text
 
 
 def test_row_20_a_port_that_is_absent_at_the_start(tmp_path: Path, wheels_only: Path) -> None:
