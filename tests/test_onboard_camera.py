@@ -71,6 +71,17 @@ def test_a_picture_that_stays_half_is_handed_on_to_be_counted(tmp_path: Path) ->
     assert camera.read(0.0) == []
 
 
+def test_an_entry_that_cannot_be_read_holds_up_none_after_it(tmp_path: Path) -> None:
+    camera, _ = folder_camera(tmp_path)
+    now_ns = time.time_ns()
+    (tmp_path / f"{now_ns - 1}.jpg").mkdir()
+    (tmp_path / f"{now_ns}.jpg").write_bytes(JPEG)
+    assert [frame.picture for frame in camera.read(5.0)] == [JPEG]
+    assert [frame.picture for frame in camera.read(5.0)] == [b""]  # for the decoder to refuse, and so counted
+    (tmp_path / f"{now_ns + 1}.jpg").write_bytes(JPEG)
+    assert [frame.picture for frame in camera.read(5.0)] == [JPEG]
+
+
 def test_old_pictures_are_left_alone_and_future_ones_get_their_arrival(tmp_path: Path) -> None:
     camera, clock = folder_camera(tmp_path, since_ns=RunClock().now_ns())
     (tmp_path / "0.png").write_bytes(PNG)
