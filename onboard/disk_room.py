@@ -4,7 +4,7 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -14,6 +14,7 @@ from onboard.log_segments import CAMERA_SUFFIX
 from onboard.storage import Storage
 
 BALLAST_BYTES: Final = 16 << 20  # half a second of everything, and the indices of a segment
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)
 _LEAST_BYTES: Final = 4 << 20  # beside the ballast, for a file to be begun
 
 
@@ -53,8 +54,10 @@ class DiskRoom:
             OSError: there is no room for it and a file beside it.
         """
         self._storage.make_folder(self._folder)
-        if self._storage.exists(self._ballast):
+        if self._storage.size_bytes(self._ballast) >= BALLAST_BYTES:
             return
+        if self._storage.exists(self._ballast):  # a kill or a full disk left it too small
+            self._storage.remove(self._ballast)
         if self.free_bytes() < BALLAST_BYTES + _LEAST_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
         self._storage.reserve(self._ballast, BALLAST_BYTES)
@@ -110,26 +113,36 @@ def _oldest_first(folder: Path) -> list[Path]:
 def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None]:
     """Holds a robot for one recorder: by its robot.yaml, and by its id in the folder where its runs go.
 
-    The kernel lets go when the process ends, however it ends.
+    The kernel lets go when the process ends, however it ends. On a full disk robot.yaml holds alone: recording begins
+    when there is room.
 
     Raises:
         OnboardError: another recorder has it, or the folder cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = os.open(robot_file, os.O_RDONLY | os.O_CLOEXEC)
+    with ExitStack() as held:
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-            lock = os.open(folder / f".{robot_id}.lock", flags, 0o644)
+            held.callback(os.close, _locked(robot_file, os.O_RDONLY))
             try:
-                for each in (file, lock):
-                    fcntl.flock(each, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                yield
-            finally:
-                os.close(lock)
-        finally:
-            os.close(file)
-    except BlockingIOError:
-        raise OnboardError(
-            f"{robot_file}: robot {robot_id} is being recorded already; stop that recorder first"
-        ) from None
+                folder.mkdir(parents=True, exist_ok=True)
+                held.callback(os.close, _locked(folder / f".{robot_id}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW))
+            except OSError as error:
+                if error.errno not in NO_ROOM:
+                    raise
+        except BlockingIOError:
+            raise OnboardError(
+                f"{robot_file}: robot {robot_id} is being recorded already; stop that recorder first"
+            ) from None
+        except OSError as error:
+            where = error.filename or folder
+            raise OnboardError(f"{where}: cannot record here: {error.strerror}; choose another --output") from error
+        yield
+
+
+def _locked(path: Path, flags: int) -> int:
+    file = os.open(path, flags | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(file)
+        raise
+    return file

@@ -111,10 +111,16 @@ class LogFile:
         self._storage.sync_folder(self.path.parent)
 
     def abandon(self) -> None:
-        """Gives the file up as it stands, still called `.active`; what is not safe on the disk is cut off."""
+        """Gives the file up as it stands, still called `.active`; what is not safe on the disk is cut off.
+
+        A file of which nothing is safe is removed.
+        """
         with suppress(OSError):
             self._sink.file.truncate(self._synced_bytes)
         self._sink.close()
+        if not self._synced_bytes:
+            with suppress(OSError):
+                self._storage.remove(self.active_path)
 
     def discard(self) -> None:
         """Removes a file that shall not come to be."""

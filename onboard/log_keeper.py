@@ -4,7 +4,6 @@ What is older than a second is on the disk while the disk works. While it does n
 first, and whatever is lost in the end is counted and told of in the log.
 """
 
-import errno
 import threading
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import Final, NamedTuple
 
 from google.protobuf.message import Message
 
-from onboard.disk_room import DiskRoom
+from onboard.disk_room import NO_ROOM, DiskRoom
 from onboard.log_file import Record
 from onboard.log_segments import PICTURE_TOPIC, LogSegments, SegmentLimits, files_of_run
 from onboard.log_writer import LogNote, checked_record, head_records
@@ -27,7 +26,6 @@ _RECORD_BYTES: Final = 200  # what a waiting record takes beside its data
 _RETRY_S: Final = 2.0
 _LOOK_AT_ROOM_S: Final = 10.0
 _LAST_TRIES: Final = 3
-_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class LogStatus(NamedTuple):
@@ -144,15 +142,19 @@ class LogKeeper:
             self.step(now_s)
             try:
                 self._segments.finish()
-            except OSError as error:
+            except Exception as error:
                 self._fail(error, (), now_s)
             if not self._waiting:
                 break
+        self.give_up()
+        self._room.drop_ballast()
+
+    def give_up(self) -> None:
+        """Counts what waits as lost, and tells of it."""
         with self._lock:
             self._lost.update(record.topic for record in self._waiting)
-            self._waiting.clear()
+            self._waiting, self._waiting_bytes = deque(), 0
         self._tell_losses()
-        self._room.drop_ballast()
 
     def _put_on_disk(self, batch: deque[Record], now_s: float) -> None:
         try:
@@ -160,15 +162,28 @@ class LogKeeper:
                 if self._problem is not None and not batch:
                     return
                 self._open(batch[0].log_time_ns if batch else self._last_ns, now_s)
+            begun_before = self._segments.has_full
             while batch:
-                self._segments.append(batch[0])
-                batch.popleft()
+                self._append_first(batch)
             self._segments.commit()
             self._segments.sync()
-        except OSError as error:
+            if begun_before:  # one at a time, and not where a new segment has taken its time already
+                self._segments.finish_a_full_one()
+        except Exception as error:  # also a fault of ours or of a library's: a new file may do
             self._fail(error, batch, now_s)
         else:
             self._synced_s = now_s
+
+    def _append_first(self, batch: deque[Record]) -> None:
+        try:
+            self._segments.append(batch[0])
+        except OSError:
+            raise
+        except Exception:  # no file will take it; it must not keep the others out for ever
+            with self._lock:
+                self._lost[batch.popleft().topic] += 1
+            raise
+        batch.popleft()
 
     def _open(self, start_ns: int, now_s: float) -> None:
         self._room.take_ballast()
@@ -178,11 +193,14 @@ class LogKeeper:
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_INFO, text, {}))
             self._problem = None
 
-    def _fail(self, error: OSError, batch: Iterable[Record], now_s: float) -> None:
+    def _fail(self, error: Exception, batch: Iterable[Record], now_s: float) -> None:
         """Keeps in memory what is not on the disk, and leaves files that readers can use."""
-        names = self._segments.names
-        if error.errno in _NO_ROOM:
-            self._room.remove_old_pictures()
+        number, file, what = None, None, repr(error)
+        if isinstance(error, OSError):
+            number, file, what = error.errno, error.filename, error.strerror or str(error)
+        text = f"{self._segments.names or file or 'log'}: {what}"
+        if number in NO_ROOM:
+            self._remove_old_pictures()
             self._room.drop_ballast()
             with suppress(OSError):  # what has been appended is still in its memory
                 self._segments.finish()
@@ -191,7 +209,6 @@ class LogKeeper:
             self._waiting.extendleft(reversed([*unsafe, *batch]))
             self._waiting_bytes = sum(map(_size, self._waiting))
             self._forget_oldest()
-        text = f"{names or error.filename or 'log'}: {error.strerror or error}"
         if self._problem is None:
             self._problem_since_s = now_s
             self._retry_at_s = now_s  # another file may do at once
@@ -206,15 +223,20 @@ class LogKeeper:
             return
         self._next_look_s = now_s + _LOOK_AT_ROOM_S
         low = self._room.is_low()
-        removed = self._room.remove_old_pictures() if low else []
-        if removed:
-            text = f"removed {len(removed)} old files of pictures for want of space, from {removed[0]} on"
-            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
+        if low and self._remove_old_pictures():
             low = self._room.is_low()
         if low != self._pictures_pause:
             self._pictures_pause = low
             text = "little space left: pictures are not kept" if low else "space again: pictures are kept"
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
+
+    def _remove_old_pictures(self) -> int:
+        """Makes room where that is allowed; tells, and returns, how many files went."""
+        removed = self._room.remove_old_pictures()
+        if removed:
+            text = f"removed {len(removed)} old files of pictures for want of space, from {removed[0]} on"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
+        return len(removed)
 
     def _tell_losses(self) -> None:
         with self._lock:

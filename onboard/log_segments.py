@@ -41,6 +41,7 @@ class LogSegments:
 
     Attributes:
         n_written: records appended to a file so far.
+        names: the files being written, for a person; replaced as a whole, so that other threads may read it.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class LogSegments:
             limits: when a new segment begins; None: there is only one.
         """
         self.n_written = 0
+        self.names = ""
         self._storage = storage
         self._files_of = files_of
         self._head = head
@@ -67,6 +69,8 @@ class LogSegments:
         self._start_ns = 0
         self._files: dict[Path, LogFile] = {}
         self._by_topic: dict[str, LogFile] = {}
+        self._full: list[LogFile] = []  # of earlier segments: complete, but not finished yet
+        self._new_in: set[Path] = set()  # folders whose newest names are not on the disk yet
 
     @property
     def is_open(self) -> bool:
@@ -74,12 +78,12 @@ class LogSegments:
         return bool(self._files)
 
     @property
-    def names(self) -> str:
-        """The open files, for a person."""
-        return ", ".join(path.name for path in self._files)
+    def has_full(self) -> bool:
+        """Whether files of earlier segments are to be finished."""
+        return bool(self._full)
 
     def open(self, start_ns: int) -> None:
-        """Begins the next segment: creates its files, writes their heads and waits until they are on the disk."""
+        """Begins the next segment: creates its files and writes their heads; `sync` sees to it that they stay."""
         self._start_ns = start_ns
         try:
             for path, topics in self._files_of(self._next):
@@ -89,57 +93,80 @@ class LogSegments:
                 for record in self._head:
                     file.append(record._replace(log_time_ns=start_ns))
                 file.unsafe.clear()  # every file has them anyway
-            self.commit()
-            self.sync()
-            for folder in {path.parent for path in self._files}:
-                self._storage.sync_folder(folder)
+                file.commit()
+                self._new_in.add(path.parent)
         except OSError as error:
-            self.discard()
+            self._close(LogFile.discard, self._files.values())
+            self._replace_files({})
             if isinstance(error, FileExistsError):  # what failed before may have been left there
                 self._next += 1
             raise
+        self._replace_files(self._files)
         self._next += 1
 
     def append(self, record: Record) -> None:
         """Takes a record; begins a new segment before it where that is due."""
         if self._limits is not None and self._is_full(record.log_time_ns, self._limits):
-            self.finish()
+            # Finishing takes a disk's time, which the readings that come meanwhile do not have.
+            self._full += self._files.values()
+            self._replace_files({})
             self.open(record.log_time_ns)
         self._by_topic[record.topic].append(record)
         self.n_written += 1
 
     def commit(self) -> None:
         """Writes all that was appended, in whole chunks."""
-        for file in self._files.values():
+        for file in self._unfinished():
             file.commit()
 
     def sync(self) -> None:
-        """Returns once all that is committed is on the disk."""
-        for file in self._files.values():
+        """Returns once all that is committed is on the disk, and the names of the files too."""
+        while self._new_in:
+            self._storage.sync_folder(next(iter(self._new_in)))
+            self._new_in.pop()
+        for file in self._unfinished():
             file.sync()
 
+    def finish_a_full_one(self) -> None:
+        """Finishes one file of an earlier segment. Call it again if it raises."""
+        self._full[0].finish()
+        del self._full[0]
+
     def finish(self) -> None:
-        """Finishes the files and gives them their names. Call it again if it raises."""
-        for path in list(self._files):
-            self._files[path].finish()
-            del self._files[path]
-        self._by_topic = {}
+        """Finishes all files and gives them their names. Call it again if it raises."""
+        self._full += self._files.values()
+        self._replace_files({})
+        while self._full:
+            self.finish_a_full_one()
 
     def abandon(self) -> list[Record]:
         """Leaves the files as they stand, called `.active`; returns the records that are not safe in them."""
-        unsafe = list(heapq.merge(*(file.unsafe for file in self._files.values()), key=attrgetter("log_time_ns")))
-        self._close(LogFile.abandon)
+        unsafe = list(heapq.merge(*(file.unsafe for file in self._unfinished()), key=attrgetter("log_time_ns")))
+        self._close_all(LogFile.abandon)
         return unsafe
 
     def discard(self) -> None:
-        """Removes the open files."""
-        self._close(LogFile.discard)
+        """Removes the files that are not finished."""
+        self._close_all(LogFile.discard)
 
-    def _close(self, close: Callable[[LogFile], None]) -> None:
-        for file in self._files.values():
+    def _close_all(self, close: Callable[[LogFile], None]) -> None:
+        self._close(close, self._unfinished())
+        self._full, self._new_in = [], set()
+        self._replace_files({})
+
+    def _close(self, close: Callable[[LogFile], None], files: Iterable[LogFile]) -> None:
+        for file in files:
             with suppress(OSError):
                 close(file)
-        self._files, self._by_topic = {}, {}
+
+    def _unfinished(self) -> list[LogFile]:
+        return [*self._full, *self._files.values()]
+
+    def _replace_files(self, files: dict[Path, LogFile]) -> None:
+        self._files = files
+        self.names = ", ".join(path.name for path in files)
+        if not files:
+            self._by_topic = {}
 
     def _is_full(self, log_time_ns: int, limits: SegmentLimits) -> bool:
         return log_time_ns - self._start_ns >= limits.duration_ns or any(

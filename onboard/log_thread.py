@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from google.protobuf.message import Message
@@ -11,7 +12,9 @@ from onboard.log_keeper import LogKeeper, LogStatus
 from onboard.log_writer import LogNote
 from onboard.messages import EventKind, Severity
 
-_PERIOD_S: Final = 0.5  # with the time that the disk takes, what is older than a second is safe
+# From one step's start to the next one's. With what readings and detections wait for before (0.35 s), and with the
+# steps of a disk that takes 0.1 s for a sync, what is older than a second is safe.
+_PERIOD_S: Final = 0.25
 _END_LIMIT_S: Final = 2.0  # with what devices and detection may take, a recording ends within 5 s
 
 
@@ -24,7 +27,9 @@ class LogThread:
         self._period_s = period_s
         self._stop = threading.Event()
         self._stepped_s = time.monotonic()
-        self._given_up: list[LogNote] = []
+        self._given_up: deque[LogNote] = deque()
+        self._fault = ""
+        self._finished = False
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
@@ -40,7 +45,7 @@ class LogThread:
 
     @property
     def stalled_s(self) -> float:
-        """How long the disk has not come back: a healthy one does so twice a second. For a watchdog."""
+        """How long the disk has not come back: a healthy one does so four times a second. For a watchdog."""
         return time.monotonic() - self._stepped_s
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
@@ -48,9 +53,8 @@ class LogThread:
         return self._keeper.write(topic, message, log_time_ns, publish_time_ns)
 
     def take_notes(self) -> Sequence[LogNote]:
-        """As `LogKeeper.take_notes`; and once a thread that did not end when it was told to."""
-        given_up, self._given_up = self._given_up, []
-        return [*self._keeper.take_notes(), *given_up]
+        """As `LogKeeper.take_notes`; and of a thread that failed, or did not end when it was told to."""
+        return [*self._keeper.take_notes(), *(self._given_up.popleft() for _ in range(len(self._given_up)))]
 
     def close(self) -> None:
         """Finishes the files, or gives up on a disk that does not answer. A second call does nothing."""
@@ -61,11 +65,26 @@ class LogThread:
         if self._thread.is_alive():
             text = f"the disk did not answer for {_END_LIMIT_S:g} s: the files stay unfinished"
             self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"log left unfinished": 1}))
+        elif not self._finished:
+            self._keeper.give_up()
 
     def _work(self) -> None:
         while True:
-            self._keeper.step(time.monotonic())
+            begun_s = time.monotonic()
+            self._told(self._keeper.step, begun_s)
             self._stepped_s = time.monotonic()
-            if self._stop.wait(self._period_s):
+            if self._stop.wait(begun_s + self._period_s - self._stepped_s):
                 break
-        self._keeper.finish(time.monotonic())
+        self._finished = self._told(self._keeper.finish, time.monotonic())
+
+    def _told(self, act: Callable[[float], None], now_s: float) -> bool:
+        """Whether it went well; a fault of ours or of a library's is told of and must not end the log's thread."""
+        try:
+            act(now_s)
+        except Exception as error:
+            if repr(error) != self._fault:
+                self._fault = repr(error)
+                text = f"the log's thread failed and goes on: {error!r}"
+                self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"faults of the log": 1}))
+            return False
+        return True

@@ -84,7 +84,12 @@ class LogWriter:
         files = single_file(store, path) if path.suffix == ".mcap" else files_of_run(store, path, keep_pictures)
         self._segments = LogSegments(store, files, head_records(path, head, start_ns), limits)
         with self._told_errors():
-            self._segments.open(start_ns)
+            try:
+                self._segments.open(start_ns)
+                self._segments.sync()
+            except OSError:
+                self._segments.discard()
+                raise
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
         """Appends one message.
@@ -145,6 +150,8 @@ class LogWriter:
         self._flushed_ns = self._last_ns
         self._segments.commit()
         self._segments.sync()
+        while self._segments.has_full:
+            self._segments.finish_a_full_one()
 
     @contextmanager
     def _told_errors(self) -> Iterator[None]:

@@ -37,6 +37,9 @@ class Storage(Protocol):
     def exists(self, path: Path) -> bool:
         """Whether the name is taken, a dangling link included."""
 
+    def size_bytes(self, path: Path) -> int:
+        """Of a file; 0: there is none."""
+
     def create(self, path: Path) -> StoredFile:
         """A new file; never one that is there, never through a link."""
 
@@ -73,6 +76,10 @@ class Disk:
     def exists(self, path: Path) -> bool:
         """As in Storage."""
         return os.path.lexists(path)
+
+    def size_bytes(self, path: Path) -> int:
+        """As in Storage."""
+        return path.lstat().st_size if self.exists(path) else 0
 
     def create(self, path: Path) -> "StoredFile":
         """As in Storage."""
