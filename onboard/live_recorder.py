@@ -127,7 +127,12 @@ class LiveRecorder:
             wheels = files.robot.devices.encoder_port is not None
             with one_recorder(files.path, self.output, files.robot.robot_id):
                 self.core = RecorderCore(
-                    self.output, run, on_event=self._on_event, expect_wheels=wheels, open_log=self._open_log
+                    self.output,
+                    run,
+                    on_event=self._on_event,
+                    expect_wheels=wheels,
+                    expect_camera=files.camera_settings is not None,
+                    open_log=self._open_log,
                 )
                 self.begun.set()
                 try:

@@ -4,7 +4,7 @@ It reads no clock and no device, so that a live recording and a simulated one ru
 calls give the same log to the byte.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -33,7 +33,7 @@ from onboard.picture_checks import PictureChecks
 from onboard.picture_schedule import PictureSchedule
 from onboard.tag_detector import Detection, TagDetector
 from onboard.tallies import Tallies
-from onboard.waiting_detections import WAIT_FOR_WHEELS_NS, WaitingDetections
+from onboard.waiting_detections import ReadyDetections, WaitingDetections
 from onboard.watches import Watches
 from onboard.wheel_intake import StampedReading, WheelIntake
 
@@ -75,6 +75,7 @@ class RecorderCore:
         detector: TagDetector | None = None,
         on_event: Callable[[Event], None] | None = None,
         expect_wheels: bool = True,
+        expect_camera: bool = False,
         durable: bool = True,
         open_log: LogOpener | None = None,
     ) -> None:
@@ -85,7 +86,8 @@ class RecorderCore:
             run: what is recorded.
             detector: for `on_frame`; one that gives its detections ready does without.
             on_event: told of each event as it is written.
-            expect_wheels: whether their silence is worth an event.
+            expect_wheels: whether their silence is worth an event, and a picture worth waiting for them.
+            expect_camera: whether one that never comes is a loss.
             durable: see LogWriter.
             open_log: opens another log than a LogWriter's: one that waits for no disk.
 
@@ -98,9 +100,9 @@ class RecorderCore:
         self._options = run.robot.recorder
         self._detector = detector
         self._intake = WheelIntake()
-        self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None)
+        self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None, expect_camera=expect_camera)
         self._tallies = Tallies()
-        self._waiting = WaitingDetections()
+        self._waiting = WaitingDetections(wheels=expect_wheels)
         self._checks = PictureChecks(run.camera)
         self._next_anchor_ns = 0
         head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
@@ -116,6 +118,7 @@ class RecorderCore:
         self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
         self._keep_pictures = keep_pictures
         self._schedule = PictureSchedule(self._options.picture_rate_hz, run.robot.devices.camera_fps)
+        self._port_is_lost = False
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
 
@@ -130,10 +133,12 @@ class RecorderCore:
     def on_port_connected(self, name: str, host_ns: int) -> None:
         """The port is open, for the first time or again."""
         self._intake.parser.restart()
+        self._port_is_lost = False
         self.event(EventKind.PORT_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
 
     def on_port_lost(self, reason: str, host_ns: int) -> None:
         """The port is gone."""
+        self._port_is_lost = True
         self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
 
     def _write_reading(self, each: StampedReading) -> None:
@@ -171,7 +176,7 @@ class RecorderCore:
 
     def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
         """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
-        self._watches.camera.gone()
+        self._watches.camera.gone(at_its_end=at_its_end)
         severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
         self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
 
@@ -256,7 +261,10 @@ class RecorderCore:
         self._tallies.add(kind, count, reason)
 
     def _write_waiting(self, now_ns: int) -> None:
-        for message, receive_ns in self._waiting.take_ready(now_ns, more_to_come=self._intake.warming_up):
+        self._write_detections(self._waiting.take_ready(now_ns))
+
+    def _write_detections(self, ready: Iterable[ReadyDetections]) -> None:
+        for message, receive_ns in ready:
             self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
 
     # --- time
@@ -303,11 +311,20 @@ class RecorderCore:
         self._closed = True
         for each in self._intake.release_all():
             self._write_reading(each)
-        self._write_waiting(now_ns + WAIT_FOR_WHEELS_NS)
+        self._write_detections(self._waiting.take_all())
         self._tell_tallies(now_ns)
-        if self._watches.wheels.is_silent and not self.counts["/wheels"]:
-            self.losses["recording without a single wheel reading"] += 1
+        self._count_missing_devices()
         self._log.tell_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._log.close()
+
+    def _count_missing_devices(self) -> None:
+        """A device that does not come back leaves nothing that could be counted: neither lines nor pictures."""
+        if self._watches.wheels.is_silent and not self.counts["/wheels"]:
+            self.losses["recording without a single wheel reading"] += 1
+        elif self._watches.wheels.is_silent or self._port_is_lost:
+            self.losses["wheel port gone or silent at the end"] += 1
+        if self._watches.camera.is_missing:
+            never = not self.counts["/tags/detections"] and not self.losses["pictures"]
+            self.losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1

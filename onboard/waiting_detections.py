@@ -1,12 +1,13 @@
 """Detections wait for the wheel reading after their picture, so that they can name the one before it."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 from onboard.messages import TagDetections
+from onboard.wheel_intake import WARM_UP_NS
 
-WAIT_FOR_WHEELS_NS: Final = 500_000_000
+_WAIT_FOR_WHEELS_NS: Final = WARM_UP_NS  # readings that are held back come within that time too
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
 
 
@@ -20,7 +21,9 @@ class ReadyDetections(NamedTuple):
 class WaitingDetections:
     """Detections in their order, and the wheel readings that were written last."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, wheels: bool) -> None:
+        """`wheels`: whether there are any to wait for."""
+        self._wait_ns = _WAIT_FOR_WHEELS_NS if wheels else 0
         self._waiting: deque[ReadyDetections] = deque()
         self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
 
@@ -37,19 +40,20 @@ class WaitingDetections:
         """Takes the detections of one picture."""
         self._waiting.append(ReadyDetections(message, receive_ns))
 
-    def take_ready(self, now_ns: int, *, more_to_come: bool) -> Iterator[ReadyDetections]:
-        """Gives those whose wheel readings are there, the sequence filled in, or that have waited long enough.
+    def take_ready(self, now_ns: int) -> Iterator[ReadyDetections]:
+        """Gives those whose wheel readings are there, the sequence filled in, or that have waited long enough."""
+        return self._taken(lambda receive_ns: now_ns - receive_ns >= self._wait_ns)
 
-        Args:
-            now_ns: now.
-            more_to_come: wheel readings are held back elsewhere, so that waiting is worth it however long.
-        """
+    def take_all(self) -> Iterator[ReadyDetections]:
+        """Gives all, at the end."""
+        return self._taken(lambda _: True)
+
+    def _taken(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:
         newest_ns = self.newest_wheels_ns
         while self._waiting:
             message, receive_ns = self._waiting[0]
             wheels_are_past = newest_ns is not None and newest_ns > message.stamp_ns
-            too_late = now_ns - receive_ns >= WAIT_FOR_WHEELS_NS and not more_to_come
-            if not (wheels_are_past or too_late):
+            if not (wheels_are_past or is_late(receive_ns)):
                 return
             self._name_wheels(message)
             yield self._waiting.popleft()

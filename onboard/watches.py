@@ -20,15 +20,21 @@ class SilenceWatch:
         """Waits from `since_ns` on; None: not before `heard`."""
         self._limit_ns = limit_ns
         self._since_ns = since_ns
+        self._is_gone = False
         self.is_silent = False
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether what is expected does not come: the device is gone, or silent for too long."""
+        return self._is_gone or self.is_silent
 
     def heard(self, now_ns: int) -> None:
         """The device spoke, or is there again."""
-        self._since_ns, self.is_silent = now_ns, False
+        self._since_ns, self.is_silent, self._is_gone = now_ns, False, False
 
-    def gone(self) -> None:
-        """Nothing is expected for now."""
-        self._since_ns, self.is_silent = None, False
+    def gone(self, *, at_its_end: bool = False) -> None:
+        """No word is expected for now; `at_its_end`: nor missed."""
+        self._since_ns, self.is_silent, self._is_gone = None, False, not at_its_end
 
     def fell_silent(self, now_ns: int) -> bool:
         """Whether this is the moment to tell of it."""
@@ -67,18 +73,20 @@ class Watches:
 
     Attributes:
         wheels: told of each reading.
-        camera: told of each picture; nothing is expected before the first.
+        camera: told of each picture; it is not silent before the first.
     """
 
-    def __init__(self, run_epoch_ns: int, wheels_since_ns: int | None) -> None:
+    def __init__(self, run_epoch_ns: int, wheels_since_ns: int | None, *, expect_camera: bool) -> None:
         """Begins to watch.
 
         Args:
             run_epoch_ns: realtime minus monotonic, as frozen for the run's clock.
             wheels_since_ns: from when on wheel readings are expected; None: not before the first.
+            expect_camera: whether one that never comes is missed.
         """
         self.wheels = SilenceWatch(_WHEEL_SILENCE_NS, wheels_since_ns)
         self.camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
+        self.camera.gone(at_its_end=not expect_camera)
         self._wall_clock = ClockWatch()
         self._run_epoch_ns = run_epoch_ns
 

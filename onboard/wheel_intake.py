@@ -5,8 +5,9 @@ from typing import Final, NamedTuple
 from onboard.clock import DeviceClockFilter
 from onboard.encoder_protocol import EncoderParser, WheelReading, WheelUnwrapper
 
-# The first readings of a boot wait this long for the clock mapping: they may have lain in a buffer before.
-_WARM_UP_NS: Final = 500_000_000
+# The first readings of a boot wait this long for the clock mapping: they may have lain in a buffer before. Longer than
+# the bursts of 300 ms in which lines may come, and short enough for the log to keep its promise.
+WARM_UP_NS: Final = 350_000_000
 
 
 class StampedReading(NamedTuple):
@@ -51,14 +52,9 @@ class WheelIntake:
                 ready.append(self._stamped(reading, host_ns))
         return ready + self.release_due(host_ns)
 
-    @property
-    def warming_up(self) -> bool:
-        """Whether readings wait for the clock mapping."""
-        return bool(self._held)
-
     def release_due(self, now_ns: int) -> list[StampedReading]:
         """The readings that have waited long enough for the clock mapping."""
-        if self._held and now_ns - self._held[0][1] >= _WARM_UP_NS:
+        if self._held and now_ns - self._held[0][1] >= WARM_UP_NS:
             return self._release()
         return []
 

@@ -62,7 +62,6 @@ def test_readings_that_lay_in_a_buffer_at_the_start_get_their_true_stamps() -> N
     lines = [format_line(WheelLine(1, index, index * 10_000, 0, 0, 0)) for index in range(300)]
     ready = intake.feed(b"".join(lines[:100]), HOST_NS + 1000 * MS)
     assert ready == []
-    assert intake.warming_up
     for index in range(100, 300):
         ready += intake.feed(lines[index], HOST_NS + index * 10 * MS + MS)
     assert [each.reading.sequence for each in ready] == list(range(300))

@@ -90,16 +90,21 @@ def test_detections_name_the_last_wheel_reading_measured_before_them(tmp_path: P
             core.on_detections([], (64, 48), START_NS + index * 10 * MS - 4 * MS, now_ns, 5, index)
     core.close(START_NS + 4000 * MS)
     frames = [each.message for each in read_log(tmp_path / "run1", ["/tags/detections"])]
-    named = {each.frame_sequence: each.wheel_sequence for each in frames if isinstance(each, TagDetections)}
-    assert named == {index: index - 1 for index in range(5, 400, 10)}
+    named = {
+        each.frame_sequence: each.wheel_sequence if each.has_wheel_sequence else None
+        for each in frames
+        if isinstance(each, TagDetections)
+    }
+    # The first two came before any reading, and waited no longer than what is to be safe after a second may.
+    assert named == {index: index - 1 for index in range(5, 400, 10)} | {5: None, 15: None}
 
 
-def test_without_wheels_detections_wait_half_a_second_and_name_none(tmp_path: Path) -> None:
+def test_while_wheels_are_silent_detections_wait_for_them_and_name_none(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     core.on_detections([TAG], (64, 48), START_NS, START_NS + MS, 5, 0)
-    core.tick(START_NS + 400 * MS)
+    core.tick(START_NS + 350 * MS)
     assert core.counts["/tags/detections"] == 0
-    core.tick(START_NS + 502 * MS)
+    core.tick(START_NS + 351 * MS)
     assert core.counts["/tags/detections"] == 1
     core.close(START_NS + 600 * MS)
     (found,) = read_log(tmp_path / "run1", ["/tags/detections"])
@@ -223,3 +228,63 @@ def test_a_recording_to_which_the_wheels_never_spoke_has_lost_something(tmp_path
     core.tick(START_NS + 4 * S)
     core.close(START_NS + 4 * S)
     assert core.losses == {"recording without a single wheel reading": 1}
+
+
+def end_of(core: RecorderCore, from_ns: int) -> dict[str, int]:
+    """Goes on for a minute without news, and closes."""
+    for index in range(600):
+        core.tick(from_ns + index * 100 * MS)
+    core.close(from_ns + 60 * S)
+    return dict(core.losses)
+
+
+def test_a_port_that_does_not_come_back_is_a_loss_and_one_that_does_is_none(tmp_path: Path) -> None:
+    for name, comes_back in (("gone", False), ("back", True)):
+        core = make_core(tmp_path / name)
+        now_ns = drive(core)
+        core.on_port_lost("unplugged", now_ns)
+        if comes_back:
+            core.on_port_connected("port", now_ns)
+            core.on_serial_bytes(wheel_bytes(200), now_ns + MS)
+            core.close(now_ns + 2 * MS)
+            assert not core.losses
+        else:
+            assert end_of(core, now_ns) == {
+                "wheel port gone or silent at the end": 1,
+                "camera gone or silent at the end": 1,
+            }
+            (told,) = [each.text for each in events(tmp_path / name / "run1") if each.kind == "recording_stopped"]
+            assert "1 wheel port gone or silent at the end" in told
+
+
+def test_a_port_lost_just_before_the_end_is_a_loss(tmp_path: Path) -> None:
+    core = make_core(tmp_path)
+    now_ns = drive(core)
+    core.on_port_lost("unplugged", now_ns)
+    core.close(now_ns + MS)
+    assert core.losses == {"wheel port gone or silent at the end": 1}
+
+
+def test_a_camera_that_never_comes_or_does_not_come_back_is_a_loss(tmp_path: Path) -> None:
+    run = Run(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
+    for name, said in (
+        ("never", {"recording without a single picture": 1}),
+        ("lost", {"camera gone or silent at the end": 1}),
+        ("over", {}),
+        ("silent", {"camera gone or silent at the end": 1}),
+    ):
+        core = RecorderCore(tmp_path / name, run, durable=False, expect_wheels=False, expect_camera=True)
+        if name != "never":
+            core.on_camera_connected("camera", [], START_NS)
+            core.on_detections([], (64, 48), START_NS, START_NS + MS, StampSource.STAMP_SOURCE_CAMERA, 0)
+        if name in ("lost", "over"):
+            core.on_camera_lost("unplugged, or a film's end", START_NS + 2 * MS, at_its_end=name == "over")
+        assert end_of(core, START_NS + 3 * MS) == said
+
+
+def test_without_a_port_in_robot_yaml_detections_wait_for_nothing(tmp_path: Path) -> None:
+    run = Run(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
+    core = RecorderCore(tmp_path, run, durable=False, expect_wheels=False)
+    core.on_detections([TAG], (64, 48), START_NS, START_NS + MS, StampSource.STAMP_SOURCE_CAMERA, 0)
+    assert core.counts["/tags/detections"] == 1
+    core.close(START_NS + S)
