@@ -3,12 +3,13 @@
 Around a corner the light is modelled as
 
     (1 + g . (x - c)) (a + b erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2))),
-    l_k(x) = n_k . (x - c) - kappa_k / 2 (t_k . (x - c))^2
+    l_k(x) = n_k . (x - c) - kappa_k / 2 ((t_k . (x - c))^2 + s_k^2)
 
 two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
-shutter was open. Their bends kappa_k are given: a lens bends lines, and a bend left out moves corners. Whatever makes
-black grow or shrink (too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and
-the corner not at all. Light that grows along an edge (g: the lens's falloff, a lamp) would move both halves alike.
+shutter was open. Their bends kappa_k are given: a lens bends lines, and a bend left out moves corners; so does blur,
+which draws a bent edge inwards by the bend's mean over it. Whatever makes black grow or shrink (too much light, a print
+that bleeds) moves the two halves of an edge in opposite directions, and the corner not at all. Light that grows along
+an edge (g: the lens's falloff, a lamp) would move both halves alike.
 
 What the light's noise moves a corner by falls with the root of the edges' length, so they are followed to the middle
 of the squares, where those of the next corner begin: no pixel tells of two corners.
@@ -180,11 +181,12 @@ class _Patches:
             across, along = cos * off[..., 0] + sin * off[..., 1], -sin * off[..., 0] + cos * off[..., 1]
             bend = self._around.bend[of, k, None]
             blur = np.exp(p[:, 6 + k])[:, None]
-            q = (across - 0.5 * bend * along**2) / (np.sqrt(2.0) * blur)
+            q = (across - 0.5 * bend * (along**2 + blur**2)) / (np.sqrt(2.0) * blur)
             edges.append(erf(q))
             slopes.append((2.0 / np.sqrt(np.pi)) * np.exp(-(q**2)))
             scale = 1.0 / (np.sqrt(2.0) * blur)
-            by_centre.append((scale * (-cos - bend * along * sin), scale * (-sin + bend * along * cos), -q))
+            by_blur = -q - scale * bend * blur**2
+            by_centre.append((scale * (-cos - bend * along * sin), scale * (-sin + bend * along * cos), by_blur))
             by_turn.append(scale * (along + bend * along * across))
         a, b = p[:, 4, None], p[:, 5, None]
         jacobian = np.empty((*off.shape[:2], _N))

@@ -6,6 +6,7 @@ part of the picture. So a first camera tells the bends and which corners must be
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import log, sqrt
 from typing import Final
 
 import numpy as np
@@ -95,15 +96,19 @@ def seen_again(views: Sequence[View], finder: BoardFinder, model: CameraModel, p
 
 
 def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
-    """The camera as the first look at the corners has it, of the kind that fits best.
+    """The camera as the first look at the corners has it, of the simplest kind that fits as well as the best.
+
+    A kind with more freedom always fits a little better, and may bend beyond the corners as no lens does: where corners
+    are looked for next.
 
     Raises:
         CalibError: none fits.
     """
     size_px = views[0].picture.shape[1], views[0].picture.shape[0]
     seen = observed(views, finder)
-    best, least, why = None, np.inf, ""
-    for kind in kinds:
+    found: list[tuple[LensFit, float]] = []
+    why = ""
+    for kind in sorted(kinds, key=lambda kind: COEFFICIENTS[kind]):
         try:
             lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, kind, name))
         except CalibError as error:
@@ -111,12 +116,13 @@ def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequ
             continue
         poses = every_pose(lens, seen, len(views))
         residual = lens.fit.model.project(poses.points(seen.view, seen.points_m)[0]) - seen.pixels
-        typical = float(np.median(np.nan_to_num((residual**2).sum(axis=1), nan=np.inf)))
-        if typical < least:
-            best, least = lens, typical
-    if best is None:
+        found.append((lens, float(np.median(np.nan_to_num((residual**2).sum(axis=1), nan=np.inf)))))
+    if not found:
         raise CalibError(why)
-    return best
+    # The median of N squared distances, which noise makes exponential, has a standard error of 1 / (ln 2 sqrt(N)).
+    alike = 1.0 + 2.0 / (log(2.0) * sqrt(len(seen.view)))
+    least = min(typical for _, typical in found)
+    return next(lens for lens, typical in found if typical <= alike * least)
 
 
 def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:

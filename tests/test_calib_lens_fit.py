@@ -6,8 +6,11 @@ from scipy.stats import chi2
 
 from calib.board import DEFAULT_BOARD
 from calib.board_finder import BoardFinder
+from calib.board_finder import View as FoundView
 from calib.bundle import Observations, Poses, adjusted, board_pose
 from calib.camera_model import CameraModel
+from calib.corner_fit import Corners
+from calib.intrinsics import KINDS, first_fit
 from calib.lens_fit import first_guess, fitted_lens
 from calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
 from calib.projection_uncertainty import (
@@ -184,3 +187,20 @@ def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: C
         adjusted(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2)) for each in (counts, seen.view > 0)
     )
     np.testing.assert_allclose(fit.information, others.information, rtol=1e-3, atol=1e-6 * others.information.max())
+
+
+def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
+    """A kind with more freedom fits a little better each time, and bends where there are no corners."""
+    size_px = (WIDE.height_px, WIDE.width_px)
+    for seed in range(3):
+        seen, views = made_corners(WIDE, seed=seed, count=8)
+        found = [_view_of(seen, index, size_px) for index in range(len(views))]
+        assert first_fit(found, FINDER, "camera", KINDS).fit.model.distortion_model != "rational_polynomial"
+
+
+def _view_of(seen: Observations, index: int, size_px: tuple[int, int]) -> FoundView:
+    own = seen.view == index
+    ids = np.array([np.argmin(np.linalg.norm(FINDER.corners_m - point, axis=1)) for point in seen.points_m[own]])
+    ones = np.ones(int(own.sum()))
+    corners = Corners(ids, seen.pixels[own], seen.covariance[own], blur_px=ones, contrast=100.0 * ones)
+    return FoundView(f"{index}", np.zeros(size_px, np.uint8), corners)
