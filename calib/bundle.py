@@ -105,7 +105,10 @@ class Fit:
 
 
 def inverse(information: FloatArray) -> FloatArray:
-    """The inverse of an information matrix whose unknowns differ by powers of ten; infinite where it tells nothing."""
+    """The inverse of an information matrix whose unknowns differ by powers of ten.
+
+    Where it tells nothing, the inverse is 1e15 times what it is where it tells most, both scaled to a diagonal of one.
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
     bounded = 1.0 / np.maximum(values, 1e-15 * values.max())

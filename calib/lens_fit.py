@@ -75,7 +75,7 @@ def fitted_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit
         start: a camera near enough, as `first_guess` gives one.
 
     Raises:
-        CalibError: no three views have a pose.
+        CalibError: no view has a pose.
     """
     poses, views = poses_of(start, seen, n_views)
     counts = np.bincount(seen.view, minlength=n_views)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.yaml_file import parse_mapping, read_text, validated, write_model
+from calib.yaml_file import parse_mapping, read_text, validated
 
 # Wider than anything that drives, and within what sums of squares can hold.
 Sigma = Annotated[float, Field(ge=1e-9, le=1e3)]
@@ -40,8 +40,3 @@ def read_noise_yaml(path: Path) -> NoiseParameters:
         CalibError: one line that names file, field, value, limit and way out.
     """
     return validated(NoiseParameters, parse_mapping(read_text(path), str(path)), str(path))
-
-
-def write_noise_yaml(noise: NoiseParameters, path: Path) -> None:
-    """Writes all parameters, so that `read_noise_yaml` gives them back."""
-    write_model(noise, path)
