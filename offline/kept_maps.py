@@ -85,7 +85,7 @@ def local_map_of(kept: KeptChain) -> LocalMap:
 def measured_chain(
     run: Run,
     stamps_ns: IntArray,
-    motions: tuple[FloatArray, ...],
+    motions: tuple[FloatArray, FloatArray, FloatArray],
     tags: tuple[TagKey, ...],
     keyframe: IntArray,
     tag: IntArray,
@@ -94,6 +94,8 @@ def measured_chain(
     by_camera: FloatArray,
     polar: BoolArray,
     in_camera: BoolArray,
+    *,
+    distance_m: FloatArray | None = None,
 ) -> Chain:
     """A chain of motions and readings whose noise is settled, named as its run.
 
@@ -109,10 +111,11 @@ def measured_chain(
         by_camera: its derivative by the camera's parameters.
         polar: its form.
         in_camera: about what.
+        distance_m: (K-1,) driven; None: as far as each motion leads ahead or back.
     """
-    motion, spread, jacobian = motions[:3]
-    distance_m = motions[3] if len(motions) > 3 else np.abs(motion[:, 0])
-    odometry = ChainOdometry(motion, spread, _settled(spread), jacobian, distance_m)
+    motion, spread, jacobian = motions
+    driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
+    odometry = ChainOdometry(motion, spread, _settled(spread), jacobian, driven_m)
     n = len(value)
     readings = Readings(
         keyframe,
@@ -172,7 +175,7 @@ def _chain(kept: KeptChain) -> Chain:
     chain = measured_chain(
         run,
         kept.stamps_ns,
-        (kept.motion, kept.motion_covariance, kept.motion_by_wheels, kept.distance_m),
+        (kept.motion, kept.motion_covariance, kept.motion_by_wheels),
         tags,
         kept.reading_keyframe,
         kept.reading_tag,
@@ -181,6 +184,7 @@ def _chain(kept: KeptChain) -> Chain:
         kept.reading_by_camera,
         kept.reading_polar,
         kept.reading_in_camera,
+        distance_m=kept.distance_m,
     )
     return replace(chain, name=kept.name, warnings=kept.warnings)
 
