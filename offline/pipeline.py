@@ -1,6 +1,5 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +16,6 @@ from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.goodness import fitted_windows
 from offline.graph import TAG_SCALE
 from offline.kept_maps import (
-    check_can_be_extended,
-    check_sizes_in_map,
     kept_of,
     local_map_of,
     tags_of,
@@ -45,6 +42,7 @@ from offline.result import (
 )
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
+from offline.runs_refused import check_distinct, check_new
 from offline.self_calibration import about_the_files, free_what_is_told
 from offline.self_calibration_option import Calibrate
 from offline.solver import Solution
@@ -124,11 +122,11 @@ def build_map(
         GroundsbotError: one line that says why there can be no map.
     """
     stages, tape = stages or Stages(), tape or TapeOptions()
-    _check_distinct(runs)
+    check_distinct(runs)
     check_tag_sizes(runs)
     noise_fit = None
     if extending is not None:
-        _check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
+        check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
     workings = workings or Workings()
     workings.runs += runs
@@ -298,54 +296,6 @@ def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, so
     if found or len(members.members) == 1:
         return found
     return fitted_windows(solution.problem).judge(solution.state).warnings(f"component {component}")
-
-
-def _check_distinct(runs: Sequence[Run]) -> None:
-    """Refuses a drive that is given twice, and runs and stretches that would have one name."""
-    if not runs:
-        raise OfflineError("no log given; name at least one log file or run folder")
-    seen: dict[str, Run] = {}
-    for run in runs:
-        if run.name in seen:
-            other = seen[run.name]
-            if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
-                raise OfflineError(
-                    f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
-                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them apart"
-                )
-            raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
-                "leave one out, or a drive would count as two"
-            )
-        seen[run.name] = run
-    for run in runs:
-        stretch = re.fullmatch(r"(.+)_stretch\d+", run.name)
-        if stretch and stretch[1] in seen:
-            raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a stretch of {stretch[1]}, which "
-                f"{seen[stretch[1]].log} is; map them apart"
-            )
-
-
-def _check_new(
-    runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
-) -> None:
-    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
-    check_can_be_extended(extending)
-    if corners:
-        raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
-    if calibrate.is_on:
-        raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
-    if noise is not None:
-        raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
-    names = {name for each in extending.kept for name in (each.run, each.name)}
-    for run in runs:
-        if run.name in names:
-            raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out, or a drive "
-                "would count as two"
-            )
-        check_sizes_in_map(run, extending)
 
 
 def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:

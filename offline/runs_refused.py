@@ -1,0 +1,59 @@
+"""Runs that cannot go into one map, or not into a kept one, refused before anything is computed."""
+
+import re
+from collections.abc import Sequence
+
+from calib.noise import NoiseParameters
+from offline.errors import OfflineError
+from offline.kept_maps import check_can_be_extended, check_sizes_in_map
+from offline.result import MapResult
+from offline.run import Run
+from offline.self_calibration_option import Calibrate
+
+
+def check_distinct(runs: Sequence[Run]) -> None:
+    """Refuses a drive that is given twice, and runs and stretches that would have one name."""
+    if not runs:
+        raise OfflineError("no log given; name at least one log file or run folder")
+    seen: dict[str, Run] = {}
+    for run in runs:
+        if run.name in seen:
+            other = seen[run.name]
+            if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
+                raise OfflineError(
+                    f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
+                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them apart"
+                )
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
+                "leave one out, or a drive would count as two"
+            )
+        seen[run.name] = run
+    for run in runs:
+        stretch = re.fullmatch(r"(.+)_stretch\d+", run.name)
+        if stretch and stretch[1] in seen:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a stretch of {stretch[1]}, which "
+                f"{seen[stretch[1]].log} is; map them apart"
+            )
+
+
+def check_new(
+    runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
+) -> None:
+    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
+    check_can_be_extended(extending)
+    if corners:
+        raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+    if calibrate.is_on:
+        raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
+    if noise is not None:
+        raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
+    names = {name for each in extending.kept for name in (each.run, each.name)}
+    for run in runs:
+        if run.name in names:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out, or a drive "
+                "would count as two"
+            )
+        check_sizes_in_map(run, extending)
