@@ -49,7 +49,7 @@ class Pass(NamedTuple):
 
 def ways_m(graph: Graph) -> list[FloatArray]:
     """Of each chain, (K,) how far it had driven at its keyframes."""
-    return [np.append(0.0, np.cumsum(chain.odometry.distance_m)) for chain in graph.chains]
+    return [chain.along_m for chain in graph.chains]
 
 
 def sightings_of(graph: Graph, ways: list[FloatArray]) -> list[Sighting]:

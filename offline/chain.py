@@ -49,6 +49,11 @@ class Chain:
         mount = self.run.robot.mount
         return np.array([mount.x_m, mount.y_m, mount.yaw_rad])
 
+    @property
+    def along_m(self) -> FloatArray:
+        """(K,) the way driven until each keyframe."""
+        return np.append(0.0, np.cumsum(self.odometry.distance_m))
+
     def prefix(self, n_keyframes: int) -> "Chain":
         """The same chain as far as its first keyframes, with the tags read until then."""
         return self.part(0, n_keyframes)

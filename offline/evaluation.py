@@ -171,7 +171,7 @@ def _notes(component: Component, truth: Truth) -> list[str]:
     late = sum(_n_not_covered(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
     if late:
         notes.append(f"{late} keyframes lie outside the truth's time, left out of trajectory_rmse_m")
-    unknown_tags = [_tag_label(tag) for tag in component.tags if not _knows(truth, tag)]
+    unknown_tags = [tag.full_label for tag in component.tags if not _knows(truth, tag)]
     if unknown_tags:
         notes.append(f"not in the truth, or there more than once, left out: tags {', '.join(unknown_tags)}")
     return notes
@@ -179,10 +179,6 @@ def _notes(component: Component, truth: Truth) -> list[str]:
 
 def _n_not_covered(run: RunResult, true_run: TrueRun) -> int:
     return int((~true_run.at(run.stamps_ns)[1]).sum())
-
-
-def _tag_label(tag: TagResult) -> str:
-    return f"{tag.family}:{tag.tag_id}{tag.instance}"
 
 
 def _name(tag: TagResult) -> tuple[str, int, str]:

@@ -41,7 +41,7 @@ def _names(component: Component) -> Iterator[str]:
         yield f"# run {run.name}: vertices {first} to {first + run.n_keyframes - 1}"
         first += run.n_keyframes
     for i, tag in enumerate(component.tags, start=first):
-        yield f"# tag {tag.family} {tag.tag_id}{tag.instance}: vertex {i}"
+        yield f"# tag {tag.family} {tag.label}: vertex {i}"
 
 
 def _edges(edges: GraphEdges, first_tag: int) -> Iterator[str]:

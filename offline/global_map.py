@@ -153,7 +153,7 @@ def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, 
         covariance=covariance,
         stamps_ns=chain.stamps_ns,
         T_map_base=poses,
-        distance_m=float(chain.odometry.distance_m.sum()),
+        distance_m=float(chain.along_m[-1]),
         T_base_camera=None if mount is None else _components(mount),
     )
 

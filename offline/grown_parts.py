@@ -114,7 +114,7 @@ def _poses(chain: Chain, first: int, end: int, known: Grown | None, wheels: Floa
 
 def _coarse_ends(chain: Chain) -> list[int]:
     """Numbers of keyframes, some metres apart; the last is all of them."""
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))
+    along_m = chain.along_m
     step_m = max(_PIECE_M, along_m[-1] / _MOST_PIECES)
     marks = np.searchsorted(along_m, np.arange(step_m, along_m[-1], step_m)) + 1
     ends: list[int] = np.unique([*marks[(marks > 1) & (marks < len(along_m))], len(along_m)]).tolist()

@@ -169,7 +169,7 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
 def _pieces(chain: Chain) -> list[int]:
     """Numbers of keyframes at which to stop and solve; the last is all of them."""
     ends, last_m = [], 0.0
-    for keyframe, along_m in enumerate(np.cumsum(chain.odometry.distance_m).tolist(), start=1):
+    for keyframe, along_m in enumerate(chain.along_m[1:].tolist(), start=1):
         if along_m - last_m >= max(_PIECE_M, _PIECE_SHARE * along_m):
             ends.append(keyframe)
             last_m = along_m

@@ -226,7 +226,7 @@ def _runs(held: HeldRun) -> tuple[LocatedRun, ...]:
                 T_map_base=state.poses[own],
                 covariance=covariance[own],
                 tags=tuple(sorted(held.held[i])),
-                distance_m=float(chain.odometry.distance_m.sum()),
+                distance_m=float(chain.along_m[-1]),
             )
         )
     return tuple(runs)

@@ -161,7 +161,6 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
     """A ball, its one-sigma ellipse on the floor plan, and its number; at z = 0 where the map knows no height."""
     x, y = tag.position_m.tolist()
     z_m = 0.0 if tag.pose is None else tag.pose.height_m
-    name = f"{tag.family}:{tag.tag_id}{tag.instance}"
     ball = SpherePrimitive(
         pose=Pose(position=Vector3(x=x, y=y, z=z_m), orientation=_orientation(tag)),
         size=Vector3(x=_TAG_DIAMETER_M, y=_TAG_DIAMETER_M, z=_TAG_DIAMETER_M),
@@ -172,7 +171,7 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         billboard=True,
         font_size=_TEXT_M,
         color=_TAG_COLOR,
-        text=f"{tag.tag_id}{tag.instance}",
+        text=tag.label,
     )
     sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag.covariance)).tolist()
     said = {
@@ -184,7 +183,7 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         "n_observations": str(tag.n_observations),
         "runs": " ".join(tag.runs),
     }
-    entity = _entity(name, frame, stamp_ns, said)
+    entity = _entity(tag.full_label, frame, stamp_ns, said)
     if tag.pose is not None:
         entity.metadata.append(KeyValuePair(key="height_m", value=f"{tag.pose.height_m:.4f}"))
     entity.spheres.append(ball)

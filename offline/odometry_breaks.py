@@ -165,7 +165,7 @@ def _wild_in_a_row(local_map: LocalMap) -> bool:
     chain, readings = local_map.chain, local_map.graph.problem.readings
     squares = (readings.residual(local_map.solution.state) ** 2).sum(axis=1)
     squares /= max(1.0, local_map.goodness.reading_factor) ** 2
-    part = (np.append(0.0, np.cumsum(chain.odometry.distance_m))[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
+    part = (chain.along_m[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
     _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
     n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
     by_chance = np.asarray(binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM))

@@ -208,10 +208,7 @@ def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Da
     if not component.tags:
         return
     families = {tag.family for tag in component.tags}
-    texts = [
-        f"{tag.tag_id}{tag.instance}" if len(families) == 1 else f"{tag.family}:{tag.tag_id}{tag.instance}"
-        for tag in component.tags
-    ]
+    texts = [tag.label if len(families) == 1 else tag.full_label for tag in component.tags]
     px_per_pt = axes.figure.dpi / 72.0
     places_px = axes.transData.transform(np.array([tag.position_m[:2] for tag in component.tags]))
     trails = np.concatenate([run.T_map_base[:, :2] for run in component.runs])

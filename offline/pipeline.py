@@ -317,7 +317,7 @@ def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequ
 def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
     warnings = []
     for chain in chains:
-        if float(chain.odometry.distance_m.sum()) < 0.05:
+        if chain.along_m[-1] < 0.05:
             warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
         if not chain.tags and len(chains) == 1:
             warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")

@@ -78,6 +78,16 @@ class TagResult:
     runs: tuple[str, ...]  # names of the runs that saw it
     pose: TagPose | None = None  # None where it is known on the floor only
 
+    @property
+    def label(self) -> str:
+        """Its number as people say it, with the instance."""
+        return f"{self.tag_id}{self.instance}"
+
+    @property
+    def full_label(self) -> str:
+        """The same with its family, for maps of several."""
+        return f"{self.family}:{self.label}"
+
 
 @dataclass(frozen=True)
 class RivalResult:

@@ -106,7 +106,7 @@ def _shared(parts: Sequence[FittedPart]) -> tuple[FloatArray, bool]:
 
 def _cells(chain: Chain) -> IntArray:
     """(M,) of each reading: a number for each tag in each part of the way, from 0 without gaps."""
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))[chain.readings.keyframe]
+    along_m = chain.along_m[chain.readings.keyframe]
     part = (along_m / _SHARED_OVER_M).astype(np.int64)
     _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
     return np.asarray(cell, dtype=np.int64)

@@ -93,7 +93,7 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters) -> Chain:
 
 def _cuts(chain: Chain) -> list[tuple[int, int]]:
     """First keyframe and end of each stretch; they are equally long."""
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))
+    along_m = chain.along_m
     n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _STRETCHES))
     ends = np.searchsorted(along_m, along_m[-1] * np.arange(1, n) / n, side="right").tolist()
     return list(zip([0, *ends], [*ends, len(along_m)], strict=True))

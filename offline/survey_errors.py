@@ -28,7 +28,7 @@ class JudgedEntry:
 
     def line(self) -> str:
         """For a person; of entries that do not fit."""
-        name = f"{self.tag.family} {self.tag.tag_id}{self.tag.instance}"
+        name = f"{self.tag.family} {self.tag.label}"
         off = f"{float(np.linalg.norm(self.shift_m)):.3f} m ({self.sigmas:.0f} sigmas)"
         if self.verdict == "swapped":
             return f"entry {name} looks swapped with {self.swapped_with}: it fits there, and is off by {off} here"

@@ -121,7 +121,7 @@ def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:
     readings = chain.readings
     order = np.lexsort((readings.keyframe, readings.tag))
     tag, keyframe = readings.tag[order], readings.keyframe[order]
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))[keyframe]
+    along_m = chain.along_m[keyframe]
     stamps_ns = chain.stamps_ns[keyframe]
     begins = np.ones(len(order), dtype=np.bool_)
     begins[1:] = cut[order][1:] | (np.diff(tag) != 0) | (np.diff(along_m) > GAP_M) | (np.diff(stamps_ns) > _GAP_S * 1e9)

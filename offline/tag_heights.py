@@ -99,7 +99,7 @@ def _what_is_missing(tag: TagResult, z_m: float | None, options: ExportOptions) 
     what, column, instead = ("height", "z_m", "--tag-height-m") if z_m is None else ("direction", "yaw_rad", "")
     instead = instead or "--face-viewers (off by tens of degrees)"
     return (
-        f"--format {options.form}: the map does not hold the {what} of tag {tag.tag_id}{tag.instance} ({tag.family}); "
+        f"--format {options.form}: the map does not hold the {what} of tag {tag.label} ({tag.family}); "
         f"fill in {column} in a copy of tags.csv for --tag-poses, or give {instead}"
     )
 

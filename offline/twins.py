@@ -47,7 +47,7 @@ def _followed(chain: Chain, own: IntArray) -> list[int]:
     """Numbers of the tags that readings `own` of one id are of, in order of time; the wheels tell where they hang."""
     readings = chain.readings
     poses = se2.compose(chained(chain.odometry.motion, np.zeros(3)), chain.T_base_camera)
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))
+    along_m = chain.along_m
     keyframe = readings.keyframe[own]
     range_m, bearing = readings.value[own].T
     in_camera = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
