@@ -10,7 +10,18 @@ import pytest
 from fixtures.calibration import nominal_robot
 from fixtures.simulate import simulate
 from fixtures.world import Noise, load_world
-from tests.benchmarks.accuracy import METHODS, Drives, Method, Tally, rough, run_study, study_worlds, with_wide_priors
+from offline.result import MapResult
+from tests.benchmarks.accuracy import (
+    METHODS,
+    Drives,
+    Method,
+    Tally,
+    held,
+    rough,
+    run_study,
+    study_worlds,
+    with_wide_priors,
+)
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.cramer_rao_world import bound_of
 
@@ -63,6 +74,29 @@ def test_what_is_promised_is_held_against_the_bound(monkeypatch: pytest.MonkeyPa
         assert len(missed) == len(expected)
         assert all(text in sentence for text, sentence in zip(expected, missed, strict=True))
     assert Tally("room", "2D", in_parts=[3]).missed() == ["room, 2D, seed 3: the map is in parts"]
+
+
+def test_wide_methods_get_drives_of_robots_that_nobody_knows_and_their_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Drives] = []
+
+    def estimate(drives: Drives) -> MapResult:
+        given.append(drives)
+        return METHODS["dead reckoning"].estimate(drives)
+
+    monkeypatch.setitem(METHODS, "wide", Method(estimate, wide=True))
+    (tally,) = run_study({"room": load_world("room")}, ["wide"], [0], tmp_path / "accuracy.jsonl")
+    (drives,) = given
+    wheels = drives.runs[0].robot.wheels
+    assert wheels.track_m_sigma == pytest.approx(0.03 * wheels.track_m)
+    wide = bound_of(with_wide_priors(load_world("room")), 0, exact_calibration=False)
+    assert tally.bounds[0].tags_m == wide.tags_m
+    sure = held(drives.runs[0]).robot
+    assert sure.wheels.track_m_sigma == pytest.approx(1e-4 * wheels.track_m_sigma)
+    assert sure.mount.yaw_rad_sigma < 1e-5
+    assert sure.time_offset_s_sigma < 1e-5
+    assert sure.wheels.track_m == wheels.track_m
 
 
 def _figures_at(start_m: float, tags_m: float) -> Figures:
