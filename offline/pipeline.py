@@ -1,19 +1,14 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.noise import NoiseParameters
-from offline.advice import advise
 from offline.chain import Chain, chains_of
-from offline.checks import COMPARED, check_warnings, checks_of, metre_of
-from offline.corner_graph import has_corners
-from offline.corner_map import refine
+from offline.checks import COMPARED, check_warnings
+from offline.components import Found, solved_component
 from offline.effort import Effort
 from offline.errors import OfflineError
-from offline.global_map import calibration_of, component_of, solve_global_map
-from offline.goodness import fitted_windows
 from offline.graph import TAG_SCALE
 from offline.kept_maps import (
     kept_of,
@@ -23,35 +18,27 @@ from offline.kept_maps import (
 )
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured import Measurements, TapeOptions, parse_measurements
-from offline.measured_map import judged, measurement_warnings, unused
-from offline.merge import Group, Merge, merge
+from offline.measured_map import measurement_warnings, unused
+from offline.merge import Merge, merge
 from offline.merge_report import alignment_results, merge_warnings
 from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
 from offline.result import (
     MAX_SIGMAS,
-    AdviceResult,
     CalibrationChoice,
     CalibrationResult,
     CheckResult,
-    Component,
     MapResult,
-    MeasurementResult,
-    MetreResult,
-    SuspectTag,
 )
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
 from offline.runs_refused import check_distinct, check_new
 from offline.self_calibration import about_the_files, free_what_is_told
 from offline.self_calibration_option import Calibrate
-from offline.solver import Solution
 from offline.stages import Stages
-from offline.suspects import RunsAlone, joined, split_together, with_outliers_apart
-from offline.suspects_report import suspect_tags
+from offline.suspects import RunsAlone, with_outliers_apart
 from offline.twins import told_apart
-from offline.weak_parts import weak_parts
-from offline.workings import Solved, Workings
+from offline.workings import Workings
 
 
 def read_runs(
@@ -147,11 +134,10 @@ def build_map(
         merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
     workings.maps += maps
-    found = _Found()
+    found = Found()
     for members in merged.groups:
-        workings.solved.append(
-            found.add(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
-        )
+        solved = solved_component(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
+        workings.solved.append(found.take(maps, solved, measurements, stages))
     found.measured += unused(measurements, found.measured)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     return MapResult(
@@ -211,65 +197,8 @@ def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) 
         return [alone.split(each) for each in maps], broken
 
 
-@dataclass
-class _Found:
-    """What the components gave, one after the other."""
-
-    components: list[Component] = field(default_factory=list)
-    suspects: list[SuspectTag] = field(default_factory=list)
-    calibration: list[CalibrationResult] = field(default_factory=list)
-    measured: list[MeasurementResult] = field(default_factory=list)
-    checks: list[CheckResult] = field(default_factory=list)
-    metres: list[MetreResult] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    advice: list[AdviceResult] = field(default_factory=list)
-
-    def add(
-        self,
-        maps: Sequence[LocalMap],
-        members: Group,
-        measurements: Measurements,
-        stages: Stages,
-        *,
-        keep_suspects: bool,
-        corners: bool,
-    ) -> Solved:
-        """Solves one more component, tags that do not belong apart unless they are kept, and takes what it says."""
-        index = len(self.components)
-        graph, solution = solve_global_map(maps, members, stages, measurements)
-        with stages.stage("tags that do not belong"):
-            searched = split_together(graph, solution, [maps[m] for m in members.members])
-            suspects = suspect_tags(searched)
-        self.suspects += suspects
-        graph, solution = searched.graph, searched.solution
-        if keep_suspects and suspects:
-            graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
-        refined = None
-        if corners and has_corners(graph):
-            with stages.stage("refining on tag corners"):
-                refined, refused = refine(graph, solution)
-            self.warnings += [f"component {index}: {sentence}" for sentence in refused]
-        with stages.stage("covariances"):
-            self.components.append(component_of(graph, solution, refined))
-            last = refined.solution if refined else solution
-            self.calibration += calibration_of(refined.parameters if refined else graph.parameters, last, index)
-            self.measured += judged(graph, last, measurements, index)
-            self.checks += checks_of(graph, solution, index)
-            self.metres.append(metre_of(graph, index))
-        if refined is None:  # else the map's sigmas are not those that advice is foretold from
-            with stages.stage("advice"):
-                self.advice += advise(graph, solution, index)
-        if not solution.converged:
-            self.warnings.append(
-                f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
-            )
-        with stages.stage("checking that it fits"):
-            self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
-        return Solved(members, graph, solution, last.state.poses)
-
-
 def _warnings(
-    runs: Sequence[Run], maps: Sequence[LocalMap], broken: Sequence[str], merged: Merge, found: _Found
+    runs: Sequence[Run], maps: Sequence[LocalMap], broken: Sequence[str], merged: Merge, found: Found
 ) -> tuple[str, ...]:
     """All that a person must be told, in the order in which it came up, each sentence once."""
     chains = [each.chain for each in maps]
@@ -288,14 +217,6 @@ def _measurements(
         names = [*dict.fromkeys(each.run for each in extending.kept), *names]
         tags |= {tag for each in extending.kept for tag in tags_of(each)}
     return parse_measurements(tape, names, sorted(tags))
-
-
-def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, solution: Solution) -> list[str]:
-    """Runs that do not fit together in themselves, and a component that does not though its runs do."""
-    found = [w for m in members.members for w in maps[m].goodness.warnings(maps[m].chain.name)]
-    if found or len(members.members) == 1:
-        return found
-    return fitted_windows(solution.problem).judge(solution.state).warnings(f"component {component}")
 
 
 def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
