@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -15,6 +16,7 @@ def test_a_process_that_sleeps_is_over_the_limit_and_one_that_ends_is_not() -> N
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
+        n_threads = threading.active_count()
         with pytest.raises(AssertionError, match="waiting for a processor"):
             ended_within(process, 1.0)
-        process.kill()
+        assert threading.active_count() == n_threads
