@@ -31,15 +31,14 @@ from onboard.messages import (
 from onboard.picture import encode_jpeg
 from onboard.picture_checks import PictureChecks
 from onboard.picture_schedule import PictureSchedule
+from onboard.recording_losses import RecordingLosses
 from onboard.tag_detector import Detection, TagDetector
-from onboard.tallies import Tallies
 from onboard.waiting_detections import ReadyDetections, WaitingDetections
 from onboard.watches import Watches
 from onboard.wheel_intake import StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S
-_WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
 
 
 class Run(NamedTuple):
@@ -101,7 +100,6 @@ class RecorderCore:
         self._detector = detector
         self._intake = WheelIntake()
         self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None, expect_camera=expect_camera)
-        self._tallies = Tallies()
         self._waiting = WaitingDetections(wheels=expect_wheels)
         self._checks = PictureChecks(run.camera)
         self._next_anchor_ns = 0
@@ -115,6 +113,7 @@ class RecorderCore:
         else:
             writer = open_log(self.folder, head, run.start_ns, keep_pictures)
         self._log = CountedLog(writer, on_event)
+        self._missing = RecordingLosses(self._log)
         self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
         self._keep_pictures = keep_pictures
         self._schedule = PictureSchedule(self._options.picture_rate_hz, run.robot.devices.camera_fps)
@@ -142,27 +141,10 @@ class RecorderCore:
         self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
 
     def _write_reading(self, each: StampedReading) -> None:
-        self._note_gaps(each)
+        self._missing.note_reading(each, self._waiting.newest_wheels_ns)
         self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)
         self._watches.wheels.heard(each.host_ns)
-
-    def _note_gaps(self, each: StampedReading) -> None:
-        reading = each.reading
-        if reading.lost:
-            self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
-            self.losses["wheel lines"] += reading.lost
-        before_ns = self._waiting.newest_wheels_ns
-        if before_ns is None:
-            return
-        gap_ns = each.stamp_ns - before_ns
-        if reading.new_epoch:
-            self.losses["wheel controller resets"] += 1
-            text = f"boot {reading.boot_id} after {gap_ns / _NS_PER_S:.3f} s: the motion in between is unknown"
-            self.event(EventKind.WHEEL_RESET, Severity.SEVERITY_WARNING, text, each.host_ns, 1)
-        elif gap_ns > _WHEEL_GAP_NS:
-            text = f"no wheel reading for {gap_ns / _NS_PER_S:.3f} s"
-            self.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
 
     # --- camera
 
@@ -233,8 +215,7 @@ class RecorderCore:
         if odd_size is not None:
             self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, odd_size, receive_ns)
         if self._checks.lost_its_stamps(source):
-            text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
-            self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
+            self._missing.note_stamp()
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
         try:
             message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
@@ -257,8 +238,7 @@ class RecorderCore:
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
         """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
         self._watches.camera.heard(host_ns)
-        self.losses["pictures"] += count
-        self._tallies.add(kind, count, reason)
+        self._missing.note_pictures(kind, count, reason)
 
     def _write_waiting(self, now_ns: int) -> None:
         self._write_detections(self._waiting.take_ready(now_ns))
@@ -293,12 +273,7 @@ class RecorderCore:
             synchronised=synchronised,
         )
         self._log.write("/clock", anchor, now_ns, now_ns)
-        self._tell_tallies(now_ns)
-
-    def _tell_tallies(self, now_ns: int) -> None:
-        self._tallies.add_left_out(self._intake)
-        for each in self._tallies.take():
-            self.event(each.kind, Severity.SEVERITY_WARNING, f"{each.times} {each.text}", now_ns, each.times)
+        self._missing.tell(self._intake, now_ns)
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Writes one event."""
@@ -312,19 +287,9 @@ class RecorderCore:
         for each in self._intake.release_all():
             self._write_reading(each)
         self._write_detections(self._waiting.take_all())
-        self._tell_tallies(now_ns)
-        self._count_missing_devices()
+        self._missing.tell(self._intake, now_ns)
+        self._missing.count_missing(self._watches, port_is_lost=self._port_is_lost)
         self._log.tell_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._log.close()
-
-    def _count_missing_devices(self) -> None:
-        """A device that does not come back leaves nothing that could be counted: neither lines nor pictures."""
-        if self._watches.wheels.is_silent and not self.counts["/wheels"]:
-            self.losses["recording without a single wheel reading"] += 1
-        elif self._watches.wheels.is_silent or self._port_is_lost:
-            self.losses["wheel port gone or silent at the end"] += 1
-        if self._watches.camera.is_missing:
-            never = not self.counts["/tags/detections"] and not self.losses["pictures"]
-            self.losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1

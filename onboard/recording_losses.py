@@ -1,0 +1,66 @@
+"""What a recording has lost, as events in its log and as counts at its end."""
+
+from typing import Final
+
+from onboard.counted_log import CountedLog
+from onboard.messages import EventKind, Severity
+from onboard.tallies import Tallies
+from onboard.watches import Watches
+from onboard.wheel_intake import StampedReading, WheelIntake
+
+_NS_PER_S: Final = 1_000_000_000
+_WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
+
+
+class RecordingLosses:
+    """Tells of what comes singly at once, and of what comes in numbers when `tell` is called."""
+
+    def __init__(self, log: CountedLog) -> None:
+        """Tells `log`, and counts there."""
+        self._log = log
+        self._tallies = Tallies()
+
+    def note_reading(self, each: StampedReading, before_ns: int | None) -> None:
+        """What is missing before a wheel reading; `before_ns`: stamp of the one before, None where there is none."""
+        reading = each.reading
+        if reading.lost:
+            self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
+            self._log.losses["wheel lines"] += reading.lost
+        if before_ns is None:
+            return
+        gap_ns = each.stamp_ns - before_ns
+        if reading.new_epoch:
+            self._log.losses["wheel controller resets"] += 1
+            text = f"boot {reading.boot_id} after {gap_ns / _NS_PER_S:.3f} s: the motion in between is unknown"
+            self._log.event(EventKind.WHEEL_RESET, Severity.SEVERITY_WARNING, text, each.host_ns, 1)
+        elif gap_ns > _WHEEL_GAP_NS:
+            text = f"no wheel reading for {gap_ns / _NS_PER_S:.3f} s"
+            self._log.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
+
+    def note_pictures(self, kind: EventKind, count: int, reason: str) -> None:
+        """Pictures whose tags the log will not have."""
+        self._log.losses["pictures"] += count
+        self._tallies.add(kind, count, reason)
+
+    def note_stamp(self) -> None:
+        """A picture that only its arrival can date."""
+        text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
+        self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
+
+    def tell(self, intake: WheelIntake, now_ns: int) -> None:
+        """Tells of what was counted since the last time, the lines that the intake left out included."""
+        self._tallies.add_left_out(intake)
+        for each in self._tallies.take():
+            text = f"{each.times} {each.text}"
+            self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times)
+
+    def count_missing(self, watches: Watches, *, port_is_lost: bool) -> None:
+        """At the end: a device that does not come back leaves nothing to be counted, neither lines nor pictures."""
+        losses, counts = self._log.losses, self._log.counts
+        if watches.wheels.is_silent and not counts["/wheels"]:
+            losses["recording without a single wheel reading"] += 1
+        elif watches.wheels.is_silent or port_is_lost:
+            losses["wheel port gone or silent at the end"] += 1
+        if watches.camera.is_missing:
+            never = not counts["/tags/detections"] and not losses["pictures"]
+            losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1
