@@ -5,6 +5,8 @@ to the right, and faces the robot there; it is read from where the robots' camer
 tags of the map.
 """
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -105,17 +107,19 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
     }
     start_m = np.arange(0.0, view.far_m, _LEAST_SPACING_M)
     at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.ways[0][:-1], start_m)}
-    first, others = (
-        [
-            place
-            for chain, keyframe in sorted(where)
-            for side in (1.0, -1.0)
-            if len((place := place_beside(drives, view, chain, keyframe, side)).viewers) > 1
-        ]
-        for where in (at_start, beside - at_start)
-    )
+    first = list(islice(_seen_twice(drives, view, at_start), most // 3))
+    others = list(_seen_twice(drives, view, beside - at_start))
     again = [place for place in others if place.n_sightings > 1]
-    return first[: most // 3] + _spread(again or others, drives.state.tags, most - min(len(first), most // 3))
+    return first + _spread(again or others, drives.state.tags, most - len(first))
+
+
+def _seen_twice(drives: Drives, view: View, where: set[tuple[int, int]]) -> Iterator[Place]:
+    """Of places beside some chains and keyframes those that more than one pose views."""
+    for chain, keyframe in sorted(where):
+        for side in (1.0, -1.0):
+            place = place_beside(drives, view, chain, keyframe, side)
+            if len(place.viewers) > 1:
+                yield place
 
 
 def place_beside(drives: Drives, view: View, chain: int, keyframe: int, side: float) -> Place:

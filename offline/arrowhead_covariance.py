@@ -6,7 +6,7 @@ from its node to the top: so a tag in the border costs one triangular solve ther
 
 import heapq
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
@@ -102,16 +102,22 @@ def square_root(tree: Tree, rows: Rows, top: FloatArray, wanted: IntArray) -> Sq
 
 
 def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.csc_array:
-    """Rows (n, q) of some of the columns (q,), one part below the other."""
-    empty = np.zeros(0, dtype=np.int64)
-    rows, columns, values, n = [empty], [empty], [np.zeros(0)], 0
+    """Rows (n, q) of some of the columns (q,), one part below the other; written where they stay, for they are many."""
+    n_in_column = np.zeros(n_columns + 1, dtype=np.int64)
     for who, Z in parts:
-        rows.append(np.repeat(np.arange(n, n + len(Z)), len(who)))
-        columns.append(np.tile(who, len(Z)))
-        values.append(Z.reshape(-1))
+        n_in_column[who + 1] += len(Z)
+    start: IntArray = np.cumsum(n_in_column)
+    n_rows = sum(len(Z) for _, Z in parts)
+    n_values = int(start[-1])
+    index: type[Any] = np.int32 if max(n_rows, n_values) <= np.iinfo(np.int32).max else np.int64
+    values, rows = np.empty(n_values), np.empty(n_values, dtype=index)
+    n, at = 0, start[:-1].copy()
+    for who, Z in parts:
+        own = at[who][:, None] + np.arange(len(Z))
+        values[own], rows[own] = Z.T, np.arange(n, n + len(Z))
+        at[who] += len(Z)
         n += len(Z)
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return sparse.csc_array(entries, shape=(n, n_columns))
+    return sparse.csc_array((values, rows, start.astype(index)), shape=(n_rows, n_columns))
 
 
 class _Sent(NamedTuple):

@@ -25,7 +25,7 @@ from offline.solver import Solution
 _TOLD: Final = 4.0
 _TINY: Final = 1e-9
 _N_SIGNS: Final = 8
-_FEW: Final = 2**22  # numbers: more vectors at once take more memory than a solve
+_FEW: Final = 2**20  # numbers: more vectors at once take more memory than a solve
 _SEED: Final = 7
 
 
@@ -69,7 +69,7 @@ def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
     cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
     found, whole = np.empty((4, 4, _N_SIGNS)), np.empty((4, _N_SIGNS))
     drawn = _drawn(cell)
-    at_once = 4 if 8 * _N_SIGNS * len(cell) <= _FEW else 1  # parts
+    at_once = 4 if 4 * _N_SIGNS * solution.problem.columns.n <= _FEW else 1  # parts
     for part in range(0, 4, at_once):
         rows = np.stack([next(drawn) for _ in range(at_once)], axis=2).reshape(2 * len(cell), -1)
         kept, length = read.left_over(rows)

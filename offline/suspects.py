@@ -20,6 +20,7 @@ from offline.merge import Merge
 from offline.run import TagKey
 from offline.solver import Solution, solve
 from offline.suspects_evidence import Evidence, contradicted, gathered, noise_scales, to_other_tags
+from offline.suspects_passings import few_of_each_tag
 from offline.suspects_places import Places, settled
 from offline.suspects_search import FALSE_ALARM, bound, excess, search
 from offline.suspects_sightings import (
@@ -221,7 +222,7 @@ def _sightings(graph: Graph, state: State, scales: FloatArray) -> Sightings:
     """Cut also where a tag moved in sight."""
     whole = sightings_of(graph.chains)
     cut = contradicted(graph, state, whole, scales)
-    return sightings_of(graph.chains, cut) if cut.any() else whole
+    return few_of_each_tag(graph, sightings_of(graph.chains, cut) if cut.any() else whole)
 
 
 def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:

@@ -216,14 +216,15 @@ def _weighed(problem: Problem, state: State, sightings: Sightings) -> Problem:
 
 
 def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Sightings) -> FloatArray:
-    """(M,) robust weights of readings about the place that their sighting alone gives the tag, poses held."""
-    n, of = len(sightings), sightings.of_reading
+    """(M,) robust weights of readings about the place that their passing alone gives the tag, poses held."""
+    of = sightings.passing
+    n_readings = np.bincount(of)
     order = np.argsort(of, kind="stable")
-    begins = np.cumsum(sightings.n_readings) - sightings.n_readings
+    begins = np.cumsum(n_readings) - n_readings
     squares = np.einsum("mki,mkj->mij", by_tag, by_tag).reshape(-1, 4)
     rows = np.concatenate([squares, np.einsum("mki,mk->mi", by_tag, residual)], axis=1)[order]
     weights = np.ones(len(residual))
-    for _ in range(_WEIGHINGS if n else 0):
+    for _ in range(_WEIGHINGS if len(of) else 0):
         sums = np.add.reduceat(weights[order, None] * rows, begins)
         off = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
         left = residual + np.einsum("mki,mi->mk", by_tag, off[of])

@@ -30,6 +30,7 @@ class Sightings:
     Attributes:
         ids: N ids that were read, sorted, no instances told apart.
         of_reading: (M,) the sighting of each reading, in the order of the chains' readings one after the other.
+        passing: (M,) the same, before passings were taken together (`suspects_passings`).
         id: (S,) index into `ids`; chain: (S,) index of the chain.
         first_ns, last_ns: (S,) when it began and ended.
         n_readings: (S,)
@@ -38,6 +39,7 @@ class Sightings:
 
     ids: tuple[TagKey, ...]
     of_reading: IntArray
+    passing: IntArray
     id: IntArray
     chain: IntArray
     first_ns: IntArray
@@ -113,7 +115,8 @@ def sightings_of(chains: Sequence[Chain], begins: BoolArray | None = None) -> Si
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     own, chain_of, tag, first_ns, last_ns, count = table[order].T
-    return Sightings(ids, rank[np.concatenate(of_reading)], own, chain_of, first_ns, last_ns, count, tag)
+    sighting_of = rank[np.concatenate(of_reading)]
+    return Sightings(ids, sighting_of, sighting_of, own, chain_of, first_ns, last_ns, count, tag)
 
 
 def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:

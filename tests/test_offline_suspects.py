@@ -207,7 +207,7 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
     zeros = np.zeros(len(place), dtype=np.int64)
     n_readings = np.r_[np.full(2 * n, 7), 1, 1]
     keys = tuple(TagKey(FAMILY, i) for i in range(n + 2))
-    sightings = Sightings(keys, zeros, place, zeros, zeros, zeros, n_readings, zeros)
+    sightings = Sightings(keys, zeros, zeros, place, zeros, zeros, zeros, n_readings, zeros)
     found = chances(sightings, place, Views(n_readings, np.r_[np.full(2 * n, 10), 30, 2]))
     assert (found[: 2 * n] == 1.0).all()
     assert found[-2] < 1e-6
