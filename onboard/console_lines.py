@@ -19,9 +19,10 @@ class ConsoleLines:
     def __init__(self, stream: TextIO | None) -> None:
         """Writes to what stands behind `stream`; None: there is nothing, and nobody is told.
 
-        Not through the stream: its lock, held by a thread that blocks, ends the interpreter in a crash.
+        Not through the stream: its lock, held by a thread that blocks, ends the interpreter in a crash. And to a number
+        of its own: the stream's may be another file's by the time that a listener who hung reads on.
         """
-        self._file = None if stream is None else stream.fileno()
+        self._file = None if stream is None else os.dup(stream.fileno())
         self._encoding = "utf-8" if stream is None else stream.encoding
         self._lines: queue.Queue[str | None] = queue.Queue(_WAITING_LIMIT)
         self._n_dropped = 0
@@ -53,6 +54,8 @@ class ConsoleLines:
             if self._lines.empty():
                 self._tell_dropped()
         self._tell_dropped()
+        if self._file is not None:
+            os.close(self._file)
 
     def _tell_dropped(self) -> None:
         n_dropped, self._n_dropped = self._n_dropped, 0

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -110,7 +111,7 @@ class ChildDetector:
         self._thread.join(_END_LIMIT_S)
         with self._lock:
             self._closing.set()  # from here on nobody starts another
-            self._process.kill()
+            _kill(self._process)
         self._thread.join()
         self._stop_child()
 
@@ -129,7 +130,7 @@ class ChildDetector:
 
         def end_child() -> None:
             overdue.set()
-            process.kill()
+            _kill(process)
 
         # A child that has stopped takes no picture either: `send` would wait for it for ever.
         limit = threading.Timer(self._job_limit_s, end_child)
@@ -203,9 +204,18 @@ class ChildDetector:
         return greeting
 
     def _stop_child(self) -> None:
+        """Ends the child and lets go of its pipes, now and not when they are collected; a second call does nothing."""
         self._connection.close()
-        self._process.kill()
-        self._process.join()
+        _kill(self._process)
+        with suppress(ValueError):
+            self._process.join()
+            self._process.close()
+
+
+def _kill(process: BaseProcess) -> None:
+    """Ends a child; nothing where another thread has just let go of it."""
+    with suppress(ValueError, AttributeError):
+        process.kill()
 
 
 @contextmanager

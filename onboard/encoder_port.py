@@ -58,7 +58,10 @@ class EncoderPort:
         try:
             port.close()
         except (OSError, termios.error):
-            return  # it is gone already
+            # The port is gone already, and its number free, though the kernel complains. pyserial would close that
+            # number again when it is collected, whoever has it by then.
+            port.fd = None
+            port.is_open = False
 
 
 def _reason(error: Exception) -> str:

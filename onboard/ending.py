@@ -24,8 +24,9 @@ def told_to_end() -> threading.Event:
             signal.signal(each, lambda *_: None)
 
     def pass_on() -> None:
-        os.read(read_fd, 1)
-        stop.set()
+        while os.read(read_fd, 1):
+            stop.set()
+        os.close(read_fd)  # whoever takes the handlers back closes the other end
 
     threading.Thread(target=pass_on, name="signals", daemon=True).start()
     return stop

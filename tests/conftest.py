@@ -1,13 +1,21 @@
 """What holds for every test."""
 
+import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
 from tests.programs import Outcome, Run
+
+if TYPE_CHECKING:
+    from fixtures.devices import PtyPort
 
 # A busy machine must not fail a property test.
 settings.register_profile("groundsbot", deadline=None)
@@ -57,6 +65,40 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         return Outcome(int(caught.value.code or 0), captured.out, captured.err.replace(f"{COMPILING}\n", ""))
 
     return call
+
+
+@pytest.fixture
+def plug_in() -> Iterator[Callable[..., "PtyPort"]]:
+    """`PtyPort(LINK, ...)`, unplugged after the test."""
+    from fixtures.devices import PtyPort
+
+    with ExitStack() as ports:
+
+        def call(link: Path, *, patient: bool = False) -> PtyPort:
+            port = PtyPort(link, patient=patient)
+            ports.callback(port.unplug)
+            return port
+
+        yield call
+
+
+@pytest.fixture
+def signals_back() -> Iterator[None]:
+    """Whatever `told_to_end` takes over is given back after the test, and its thread ends."""
+    from onboard.ending import ENDING_SIGNALS
+
+    handlers = {each: signal.getsignal(each) for each in ENDING_SIGNALS}
+    before = signal.set_wakeup_fd(-1)
+    threads = set(threading.enumerate())
+    yield
+    for each, handler in handlers.items():
+        signal.signal(each, handler)
+    write_fd = signal.set_wakeup_fd(before)
+    if write_fd != -1:
+        os.close(write_fd)
+    for thread in set(threading.enumerate()) - threads:
+        if thread.name == "signals":
+            thread.join()
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import numpy as np
 from calib.camera_file import write_camera_yaml
 from calib.camera_model import CameraModel
 from fixtures.devices import PictureFolder, PtyPort, wheel_line
+from onboard.detection_process import ChildDetector
 from onboard.live_recorder import LiveRecorder
 from onboard.messages import Event
 from onboard.robot_files import RobotFiles
@@ -56,6 +57,14 @@ def until(true: Callable[[], bool], what: str) -> None:
     while not true():
         assert time.monotonic() < end_s, f"never came: {what}"
         time.sleep(0.005)
+
+
+def has_ended(child: ChildDetector) -> bool:
+    """Whether its process has: it can only be let go of then."""
+    try:
+        return not child._process.is_alive()
+    except ValueError:
+        return True
 
 
 class Recording:
@@ -190,3 +199,5 @@ class Driver:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
+        if self.port is not None:
+            self.port.unplug()

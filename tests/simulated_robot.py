@@ -93,6 +93,10 @@ class SimulatedRobot:
         self._port.unplug()
         self._port = PtyPort(self._link, patient=True)
 
+    def unplug(self) -> None:
+        """For good."""
+        self._port.unplug()
+
     def drive(self) -> None:
         """Drives once, in real time."""
         begin_ns, begin_s = time.time_ns(), time.monotonic()

@@ -24,6 +24,7 @@ from onboard.messages import StampSource
 from onboard.picture_folder import FolderCamera
 from onboard.v4l2_camera import V4l2Camera
 from tests.fake_capture import FakeCapture
+from tests.live_recording import has_ended
 from tests.tag_pictures import draw_tag
 
 MS = 1_000_000
@@ -194,7 +195,7 @@ def test_detection_in_its_own_process_survives_bad_pictures_and_its_own_death() 
         check_found(child.detect(PNG))
     finally:
         child.close()
-    assert not child._process.is_alive()
+    assert has_ended(child)
 
 
 def check_found(result: DetectionResult) -> None:

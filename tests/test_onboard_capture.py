@@ -358,6 +358,7 @@ def test_without_any_picture_it_fails(tmp_path: Path) -> None:
         (ROBOT, ["--size", "0x720"], "--size is '0x720' but"),
     ],
 )
+@pytest.mark.usefixtures("signals_back")
 def test_what_cannot_begin_is_one_line_and_nothing_written(
     tmp_path: Path,
     robot: str | None,
@@ -371,11 +372,8 @@ def test_what_cannot_begin_is_one_line_and_nothing_written(
         path.write_text(robot)
     words = ["capture", "--robot", str(path), "--output", str(tmp_path / "pictures"), *options]
     monkeypatch.setattr(sys, "argv", ["groundsbot-onboard", *words])
-    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with pytest.raises(SystemExit) as ended:
         cli.main()
-    for each, handler in handlers.items():
-        signal.signal(each, handler)
     told = capsys.readouterr()
     assert ended.value.code == 1
     assert told.err.startswith("error: ")

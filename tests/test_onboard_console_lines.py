@@ -39,7 +39,9 @@ def say_all(console: ConsoleLines, lines: list[str]) -> None:
 def read_until(file: int, end: str) -> list[str]:
     data = b""
     while not data.endswith(f"{end}\n".encode()):
-        data += os.read(file, 1 << 16)
+        got = os.read(file, 1 << 16)
+        assert got, "all ends are closed"
+        data += got
     return data.decode().splitlines()
 
 
@@ -76,3 +78,18 @@ def test_a_listener_who_is_gone_and_one_who_never_was(tmp_path: Path) -> None:
     with (tmp_path / "said").open("w", encoding="ascii") as stream, ConsoleLines(stream) as console:
         console.say("\u00fc")
     assert (tmp_path / "said").read_text() == "\\xfc\n"
+
+
+def test_a_listener_who_reads_on_after_the_end_finds_nothing_in_other_files(tmp_path: Path) -> None:
+    lines = [f"{index:0100d}" for index in range(200)]
+    with small_pipe() as (file, stream):
+        console = ConsoleLines(stream)
+        say_all(console, lines)
+        console.close(limit_s=0.0)
+        number = stream.fileno()
+        stream.close()
+        with (tmp_path / "other").open("w+") as other:
+            assert other.fileno() == number
+            assert read_until(file, lines[-1]) == lines
+            console.close(LIMIT_S)
+            assert other.read() == ""

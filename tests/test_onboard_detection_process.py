@@ -1,5 +1,6 @@
 """A detection's process that starts late, answers wrongly, takes nothing, or is started as the recording ends."""
 
+import gc
 import os
 import signal
 import threading
@@ -18,7 +19,7 @@ import pytest
 from onboard import detection_process
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
 from onboard.tag_detector import TagDetector
-from tests.live_recording import tag_jpeg, until
+from tests.live_recording import has_ended, tag_jpeg, until
 
 LIMIT_S = 60.0  # only what hangs comes near
 BLANK = cv2.imencode(".jpg", np.full((120, 160), 200, np.uint8))[1].tobytes()
@@ -73,7 +74,7 @@ def test_a_child_that_starts_too_late_is_ended_and_its_greeting_taken_for_no_ans
         told = child.detect(tag_jpeg()).error
         assert told is not None
         assert "did not start within" in told
-        assert not child._process.is_alive()
+        assert has_ended(child)
         monkeypatch.setattr(detection_process, "_START_LIMIT_S", LIMIT_S)
         (tmp_path / "wait").unlink()
         assert child.detect(tag_jpeg()).error is not None  # this one finds no child, and starts one
@@ -147,4 +148,21 @@ def test_closing_while_a_child_is_being_started(monkeypatch: pytest.MonkeyPatch)
     may_start.set()
     closing.join(LIMIT_S)
     assert closed == [None]
-    until(lambda: not child._process.is_alive(), "the end of the child")
+    until(lambda: has_ended(child), "the end of the child")
+
+
+def test_what_a_child_had_open_is_closed_when_it_is_ended() -> None:
+    with child_detector(DetectorSettings()) as first:  # whatever multiprocessing keeps for good is there now
+        first.detect(BLANK)
+    gc.collect()
+    gc.disable()
+    try:
+        before = sorted(Path("/proc/self/fd").iterdir())
+        child = ChildDetector(DetectorSettings())
+        os.kill(child._process.pid or 0, signal.SIGKILL)
+        assert child.detect(BLANK).error is not None  # another one was started
+        child.close()
+        child.close()
+        assert sorted(Path("/proc/self/fd").iterdir()) == before
+    finally:
+        gc.enable()

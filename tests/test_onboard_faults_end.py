@@ -87,7 +87,9 @@ def recorder(
         yield process
     finally:
         process.kill()
-        process.communicate()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def wait_for(process: "subprocess.Popen[str]", *words: str) -> None:
@@ -156,6 +158,9 @@ def full_load(folder: Path) -> Iterator[None]:
         yield
     finally:
         over.set()
+        port.unplug()
+        for each in threads:
+            each.join()
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -145,8 +146,8 @@ def test_row_43_killed_around_the_rename(tmp_path: Path) -> None:
     assert not losses  # whole to its end mark, whatever its name
 
 
-def test_row_19_a_second_recorder_leaves_with_one_line(tmp_path: Path) -> None:
-    PtyPort(tmp_path / "wheels")
+def test_row_19_a_second_recorder_leaves_with_one_line(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
+    plug_in(tmp_path / "wheels")
     robot = tmp_path / "robot.yaml"
     robot.write_text(ROBOT_YAML + "devices: {encoder_port: wheels}\n")
     command = [sys.executable, "-m", "onboard.cli", "record", "--robot", str(robot), "--output", str(tmp_path / "logs")]

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -81,11 +81,13 @@ def feed_pictures(folder: Path, seconds: float) -> list[tuple[int, int]]:
     return exposed
 
 
-def test_a_live_recording_has_every_line_and_picture_on_one_clock(tmp_path: Path) -> None:
+def test_a_live_recording_has_every_line_and_picture_on_one_clock(
+    tmp_path: Path, plug_in: Callable[..., PtyPort]
+) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     (pictures / "1000.png").write_bytes(b"an old one, left alone")
-    port = PtyPort(tmp_path / "wheels")
+    port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     exposed: list[tuple[int, int]] = []
     with program("record", "--robot", robot, "--output", tmp_path / "logs", before=PATIENT) as process:
@@ -128,10 +130,12 @@ def check_named(frames: list[TagDetections], wheels: list[WheelEncoders]) -> Non
         assert not before or frame.wheel_sequence == wheels[before - 1].sequence
 
 
-def test_what_the_devices_hold_when_recording_ends_belongs_to_it(tmp_path: Path) -> None:
+def test_what_the_devices_hold_when_recording_ends_belongs_to_it(
+    tmp_path: Path, plug_in: Callable[..., PtyPort]
+) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    port = PtyPort(tmp_path / "wheels")
+    port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     picture = cv2.imencode(".png", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
     with program("record", "--robot", robot, "--output", tmp_path / "logs", before=PATIENT) as process:
@@ -148,19 +152,19 @@ def test_what_the_devices_hold_when_recording_ends_belongs_to_it(tmp_path: Path)
     assert len(list(read_log(log, ["/tags/detections"]))) == 20
 
 
-def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path) -> None:
+def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
     link = tmp_path / "wheels"
     robot = robot_yaml(tmp_path, f"{{encoder_port: {link}}}")
     with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
         wait_for(process.stdout, "waiting for the wheels")  # absent at the start
-        port = PtyPort(link)
+        port = plug_in(link)
         wait_for(process.stdout, "port_connected")
         for index in range(20):
             send(port, index)
         time.sleep(0.2)
         port.unplug()
         wait_for(process.stdout, "port_lost")
-        port = PtyPort(link)
+        port = plug_in(link)
         wait_for(process.stdout, "port_connected")
         for index in range(30, 50):  # ten were sent while nobody listened
             send(port, index)
@@ -178,11 +182,11 @@ def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path) -> None:
     assert sequences == [*range(20), *range(30, 50)]
 
 
-def test_check_tells_of_each_device(tmp_path: Path) -> None:
+def test_check_tells_of_each_device(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     cv2.imwrite(str(pictures / f"{time.time_ns()}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
-    port = PtyPort(tmp_path / "wheels")
+    port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     with program("check", "--robot", robot) as process:
         feeder = threading.Thread(target=feed_wheels, args=(port, 5.0))

@@ -105,7 +105,9 @@ class Reader:
     def leave(self) -> None:
         if self._recording is not None:
             self._recording.kill()
-            self._recording.wait()
+            self._recording.communicate()
+        if self.robot is not None:
+            self.robot.unplug()
 
 
 def test_the_page_leads_from_a_bare_robot_to_a_first_map(tmp_path: Path) -> None:
