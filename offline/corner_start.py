@@ -23,6 +23,7 @@ _JUDGING_LOOKS: Final = 8
 # have no planar pose at all.
 _ASIDE_RAD: Final = (-0.6, 0.6)
 _STEPS: Final = 5
+_SAME_RAD: Final = 0.01  # fits that end nearer than this are one
 _DAMPING: Final = 1e-6
 _PLACE_AND_TURN: Final = slice(3, 9)  # of a look's columns
 
@@ -52,6 +53,27 @@ def tags_hung(problem: CornerProblem, state: SpatialState) -> SpatialState:
     places_m, heights_m, all_turns = state.tags.copy(), state.heights_m.copy(), state.turns.copy()
     places_m[hung], heights_m[hung], all_turns[hung] = tried.tags[first], tried.heights_m[first], tried.turns[first]
     return replace(state, tags=places_m, heights_m=heights_m, turns=all_turns)
+
+
+def hung_otherwise(problem: CornerProblem, state: SpatialState, tag: int) -> list[SpatialState]:
+    """The state with one tag in each other way that single looks and its looks from all around allow.
+
+    The robots' poses are held: a solve from there tells what each is worth.
+    """
+    own = CornerFactors(problem.corners.looks.where(problem.corners.looks.tag == tag), problem.corners.cameras)
+    tags, (places, turns) = _candidates(own, state)
+    tried, losses = _fitted(
+        _judges(own, tags), SpatialState(state.poses, places[:, :2], state.calibration, places[:, 2], turns)
+    )
+    found: list[SpatialState] = []
+    known = [state.turns[tag]]
+    for i in np.argsort(losses, kind="stable")[: int(np.isfinite(losses).sum())].tolist():
+        if all(Rotation.from_matrix(turn.T @ tried.turns[i]).magnitude() > _SAME_RAD for turn in known):
+            known.append(tried.turns[i])
+            places_m, heights_m, all_turns = state.tags.copy(), state.heights_m.copy(), state.turns.copy()
+            places_m[tag], heights_m[tag], all_turns[tag] = tried.tags[i], tried.heights_m[i], tried.turns[i]
+            found.append(replace(state, tags=places_m, heights_m=heights_m, turns=all_turns))
+    return found
 
 
 def _candidates(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:

@@ -192,11 +192,12 @@ def _component_lines(component: Component, *, several: bool) -> list[str]:
 
 def _alignment_line(alignment: AlignmentResult) -> str:
     x_m, y_m, theta_rad = alignment.T_from_to
+    weak = "; weak: one tag alone says so" if alignment.is_weak else ""
     return (
         f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
         f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
         f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
-        + ("" if alignment.is_sure else "; not sure, so not used")
+        + (weak if alignment.is_sure else "; not sure, so not used")
     )
 
 

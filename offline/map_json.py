@@ -117,6 +117,8 @@ def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
         "inlier_rmse_m": _plain(alignment.inlier_rmse_m),
         "outliers": _tag_names_json(alignment.outliers),
         "is_sure": alignment.is_sure,
+        "is_weak": alignment.is_weak,
+        "covariance": None if alignment.covariance is None else _plain(alignment.covariance),
         "rivals": [
             {"transform": _plain(rival.T_from_to), "n_inliers": len(rival.tags), "tags": _tag_names_json(rival.tags)}
             for rival in alignment.rivals
@@ -193,6 +195,8 @@ def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
         rivals=tuple(
             RivalResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
         ),
+        is_weak=entry.get("is_weak", False),
+        covariance=None if entry.get("covariance") is None else array_from(entry["covariance"]),
     )
 
 

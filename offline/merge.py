@@ -155,7 +155,7 @@ def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[Co
 
 
 def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
-    """Components of the maps under a tree of links, largest first (most tags, then most keyframes)."""
+    """Components of the maps under a tree of links, largest first."""
     neighbours: dict[int, list[Link]] = {i: [] for i in range(len(maps))}
     for link in tree:
         neighbours[link.a].append(link)
@@ -175,9 +175,10 @@ def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
                     members.append(there)
         members.sort()
         groups.append(Group(tuple(members), se2.between(placed[members[0]], np.array([placed[m] for m in members]))))
+    return sorted(groups, key=lambda group: size_rank(maps, group))
 
-    def size(candidate: Group) -> tuple[int, int, int]:
-        tags = {tag for m in candidate.members for tag in maps[m].graph.tags}
-        return -len(tags), -sum(len(maps[m].T_start_base) for m in candidate.members), candidate.members[0]
 
-    return sorted(groups, key=size)
+def size_rank(maps: Sequence[LocalMap], group: Group) -> tuple[int, int, int]:
+    """Sorts groups, largest first: most tags, then most keyframes."""
+    tags = {tag for m in group.members for tag in maps[m].graph.tags}
+    return -len(tags), -sum(len(maps[m].T_start_base) for m in group.members), group.members[0]

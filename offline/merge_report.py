@@ -5,10 +5,12 @@ from math import degrees
 
 from calib.arrays import FloatArray
 from offline.alignment import Alignment
+from offline.corner_graph import has_corners
 from offline.local_map import LocalMap
 from offline.merge import Group, Merge, PairAlignment
 from offline.result import AlignmentResult, RivalResult
 from offline.run import TagKey
+from offline.tag_joins import TagJoin
 
 _MOST_NAMED = 8
 
@@ -18,13 +20,19 @@ def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[Alignmen
     return tuple(_result(maps, pair, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
 
 
-def merge_warnings(maps: Sequence[LocalMap], merged: Merge, named: Collection[tuple[str, int]] = ()) -> list[str]:
+def merge_warnings(
+    maps: Sequence[LocalMap],
+    merged: Merge,
+    named: Collection[tuple[str, int]] = (),
+    not_joined: Sequence[TagJoin] | None = None,
+) -> list[str]:
     """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart.
 
     Args:
         maps: that were merged.
         merged: the result.
         named: family and id of tags of which nothing more is to be said.
+        not_joined: over single tags, with their reasons; None: that was not tried.
     """
     component = {m: i for i, group in enumerate(merged.groups) for m in group.members}
     warnings = []
@@ -38,15 +46,25 @@ def merge_warnings(maps: Sequence[LocalMap], merged: Merge, named: Collection[tu
             warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
     warnings += _contradictions(maps, merged)
     for i, group in enumerate(merged.groups[1:], start=1):
-        warnings.append(f"component {i}: {reason_apart(maps, merged, group)}")
+        warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
     return warnings
 
 
-def reason_apart(maps: Sequence[LocalMap], merged: Merge, group: Group) -> str:
+def reason_apart(
+    maps: Sequence[LocalMap], merged: Merge, group: Group, not_joined: Sequence[TagJoin] | None = None
+) -> str:
     """Why a component is one of its own, told of the pair that is nearest to joining it, and what would help."""
     crossing = [pair for pair in merged.pairs if (pair.a in group.members) != (pair.b in group.members)]
     if crossing:
-        return _why_not_joined(maps, max(crossing, key=_nearness), {maps[m].chain.name for m in group.members})
+        names = {maps[m].chain.name for m in group.members}
+        nearest = max(crossing, key=_nearness)
+        why = _why_not_joined(maps, nearest, names)
+        if len(nearest.shared) > 1:
+            return why
+        if not_joined is None and all(has_corners(maps[m].graph) for m in (nearest.a, nearest.b)):
+            return f"{why}, and --model corners may do with the one"
+        tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
+        return tried[0] if tried else why
     name = maps[group.members[0]].chain.name
     if not any(maps[m].graph.tags for m in group.members):
         return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"

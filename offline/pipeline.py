@@ -1,6 +1,7 @@
 """Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from calib.noise import NoiseParameters
@@ -37,6 +38,8 @@ from offline.self_calibration import about_the_files, free_what_is_told
 from offline.self_calibration_option import Calibrate
 from offline.stages import Stages
 from offline.suspects import RunsAlone, with_outliers_apart
+from offline.tag_join_report import join_results, join_warnings
+from offline.tag_joins import TagJoin, joined_over_tags
 from offline.twins import told_apart
 from offline.workings import Workings
 
@@ -134,21 +137,31 @@ def build_map(
         merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
     workings.maps += maps
+    components = [
+        solved_component(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
+        for members in merged.groups
+    ]
+    joins: list[TagJoin] = []
+    if corners and len(components) > 1:
+        components, joins = joined_over_tags(maps, merged, components, measurements, stages)
+        merged = replace(merged, groups=tuple(each.members for each in components))
     found = Found()
-    for members in merged.groups:
-        solved = solved_component(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
-        workings.solved.append(found.take(maps, solved, measurements, stages))
+    workings.solved += [found.take(maps, each, measurements, stages) for each in components]
     found.measured += unused(measurements, found.measured)
+    joined = join_results(components, joins)
+    found.warnings += join_warnings(joins, joined)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     return MapResult(
         components=tuple(found.components),
-        alignments=alignment_results(maps, merged),
+        alignments=alignment_results(maps, merged) + joined,
         noise=noise,
         calibration=tuple(about_the_files(found.calibration, choices)),
         measurements=tuple(found.measured),
         checks=tuple(found.checks),
         metres=tuple(found.metres),
-        warnings=_warnings(runs, maps, broken, merged, found),
+        warnings=_warnings(
+            runs, maps, broken, merged, found, [each for each in joins if each.reason] if corners else None
+        ),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
         suspects=tuple(found.suspects),
         noise_fit=noise_fit,
@@ -198,7 +211,12 @@ def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) 
 
 
 def _warnings(
-    runs: Sequence[Run], maps: Sequence[LocalMap], broken: Sequence[str], merged: Merge, found: Found
+    runs: Sequence[Run],
+    maps: Sequence[LocalMap],
+    broken: Sequence[str],
+    merged: Merge,
+    found: Found,
+    not_joined: Sequence[TagJoin] | None,
 ) -> tuple[str, ...]:
     """All that a person must be told, in the order in which it came up, each sentence once."""
     chains = [each.chain for each in maps]
@@ -206,7 +224,7 @@ def _warnings(
     warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
     warnings += _calibration_warnings(found.calibration, found.checks)
     named = {(each.family, each.tag_id) for each in found.suspects}
-    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named)))
+    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
 
 
 def _measurements(
@@ -244,6 +262,6 @@ def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
             warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
         if len(chain.tags) == 1:
             warnings.append(
-                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two are needed to join it to a run"
+                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two would make sure how it lies to other runs"
             )
     return warnings

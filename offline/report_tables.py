@@ -116,12 +116,21 @@ def _alignments(document: dict[str, Any]) -> Table:
                 f"{x_m:.2f}, {y_m:.2f}",
                 f"{degrees(theta_rad):.1f}",
                 ", ".join(str(tag["tag_id"]) for tag in each["outliers"]),
-                "yes" if each["is_sure"] else f"no; {len(each['rivals'])} other ways",
+                _sureness(each),
             )
         )
     columns = ("run", "joined with", "shared tags that fit", "RMS (m)", "x, y (m)", "turned (deg)", "left out", "sure")
     note = "How each run's own map lies in another's, by the tags that both hold."
     return _table("alignments", "How the runs fit together", note, columns, rows)
+
+
+def _sureness(alignment: dict[str, Any]) -> str:
+    if not alignment["is_sure"]:
+        return f"no; {len(alignment['rivals'])} other ways"
+    if not alignment["is_weak"]:
+        return "yes"
+    x_m, y_m, theta_rad = (alignment["covariance"][i][i] ** 0.5 for i in range(3))
+    return f"weak: one tag; to {x_m:.2f} m, {y_m:.2f} m, {degrees(theta_rad):.2f} deg"
 
 
 def _holding(document: dict[str, Any]) -> Table:

@@ -141,6 +141,10 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
         doubts.append(
             f"{counted(len(unsure), 'alignment')} could not be told for sure and {_were(unsure)} left out: {names}"
         )
+    weak = [each for each in document["alignments"] if each["is_sure"] and each["is_weak"]]
+    if weak:
+        names = enumerated([f"{each['from']} with {each['to']}" for each in weak])
+        doubts.append(f"{counted(len(weak), 'join')} {'rests' if len(weak) == 1 else 'rest'} on one tag alone: {names}")
     few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_READINGS]
     if few:
         names = enumerated([str(tag["tag_id"]) for tag in few])

@@ -110,6 +110,9 @@ class AlignmentResult:
     outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
     is_sure: bool = True  # else the runs are not joined by it: chance or a rival explains the tags almost as well
     rivals: tuple[RivalResult, ...] = ()
+    is_weak: bool = False  # one tag alone joins them: if that was moved in between, nothing shows it
+    # (3, 3) of T_from_to as x, y, theta in the first run's frame; None where the transform only begins a solve.
+    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)
