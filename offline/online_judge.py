@@ -1,11 +1,12 @@
 """Which of the map's tags hold a robot online: judged again at each round, as `held_run` does, a slice at a time."""
 
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from typing import Final
 
 from scipy.stats import chi2
 
-from offline.online_root import SLICE, OnlineRoot
+from offline.online_root import SLICE, Lifted, OnlineRoot
 from offline.run import TagKey
 from offline.suspects_search import FALSE_ALARM
 
@@ -35,7 +36,7 @@ class TagJudge:
         Or lets go of one that two others contradict, which would both fit if it did not hold: in a short drive a tag
         that was moved may be believed, and those that stayed be doubted one by one.
         """
-        bound = float(chi2.isf(FALSE_ALARM / max(root.prior.n_tags, 1), 2))
+        bound = _bound(root.prior.n_tags, 1)
         settled = {tag for tag, at in self._changed.items() if n_readings < at + _LEAST_MORE}
         others = self._others(root, settled)
         squares: dict[int, float] = {}
@@ -48,7 +49,7 @@ class TagJudge:
             return
         best: list[tuple[float, int, TagKey]] = []
         for tag, of_map in others:
-            best.append((root.free_squares(tag, of_map), tag, of_map))
+            best.append((root.free_squares([(tag, of_map)]), tag, of_map))
             yield from self._spent(6 * root.prior.n**2 + CALLED)
         least, tag, of_map = min(best, default=(bound, -1, TagKey("", 0)))
         if least < bound:
@@ -57,21 +58,25 @@ class TagJudge:
             yield from self._outvoted(root, squares, bound, n_readings)
 
     def _outvoted(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
-        """Lets go of the tag without which most others fit."""
+        """Lets go of the tag without which most others fit, each and all together."""
         most, outvoted = _OUTVOTE - 1, -1
         for tag in held:
-            lifted, fitting = root.lifted(tag), set[int]()
+            lifted, fitting = root.lifted(tag), dict[int, TagKey]()
             for other, of_map in self._others(root, set()):
                 if len(lifted.by_shift) != len(root.step):  # a tag was seen meanwhile
                     lifted = root.lifted(tag)
-                if root.free_squares(other, of_map, lifted) < bound:
-                    fitting.add(other)
+                if root.free_squares([(other, of_map)], lifted) < bound:
+                    fitting.setdefault(other, of_map)
                 yield from self._spent(6 * root.prior.n**2 + CALLED)
-            if len(fitting) > most:
+            if len(fitting) > most and self._fit(root, fitting, root.lifted(tag)):
                 most, outvoted = len(fitting), tag
         if outvoted >= 0:
             self._changed = {}  # by a tag that did not stay
             self._let_go(outvoted, n_readings)
+
+    def _fit(self, root: OnlineRoot, tags: dict[int, TagKey], lifted: Lifted) -> bool:
+        squares = root.free_squares(list(tags.items()), lifted)
+        return squares < _bound(root.prior.n_tags, len(tags))
 
     def _let_go(self, tag: int, n_readings: int) -> None:
         if tag in self.held and len(self.held) >= _LEAST_HELD:
@@ -99,3 +104,9 @@ class TagJudge:
             for tag, of_map in may_be
             if tag < root.prior.n_tags and tag not in root.prior.held and tag not in settled and of_map not in taken
         ]
+
+
+@lru_cache
+def _bound(n_tags: int, n_together: int) -> float:
+    """Squared sigmas that tags reach together, where they hang as in the map, once in a hundred drives."""
+    return float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2 * n_together))

@@ -83,6 +83,11 @@ class OnlinePrior:
         return self._root[: self.n, : self.n]
 
     @property
+    def whole(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """`root`, `off` and `places_m` with the room that is left, as compiled functions read them quickest."""
+        return self._root, self._off, self._places
+
+    @property
     def off(self) -> FloatArray:
         """(n,) of what is known from the points."""
         return self._off[: self.n]
@@ -123,17 +128,17 @@ class OnlinePrior:
         self.n, self.n_tags = self.n - 2, self.n_tags - 1
         self.held.pop(self.n_tags, None)
 
-    def by_others(self, of_map: TagKey) -> tuple[FloatArray, FloatArray]:
-        """Derivative (2, n) of a tag of the map by those that hold and the calibration, and the covariance left."""
-        rows, in_map = self._known.rows([of_map]), self._in_map[: self.n]
+    def by_others(self, *of_map: TagKey) -> tuple[FloatArray, FloatArray]:
+        """Derivative (2 m, n) of tags of the map by those that hold and the calibration, and the covariance left."""
+        rows, in_map = self._known.rows(of_map), self._in_map[: self.n]
         across = np.where(in_map[:, None] >= 0, self._known.covariance[in_map[:, None], rows], 0.0)
         whitened = self.root @ across
         return whitened.T @ self.root, self._known.covariance[np.ix_(rows, rows)] - whitened.T @ whitened
 
-    def foretold_m(self, of_map: TagKey, step: FloatArray) -> FloatArray:
-        """(2,) where the map has a tag, by those that hold and a step (n,) from the points."""
-        by, _ = self.by_others(of_map)
-        return np.asarray(self._known.places_m[self._known.index[of_map]] + by @ (step - self.off))
+    def foretold_m(self, by: FloatArray, moved: FloatArray, *of_map: TagKey) -> FloatArray:
+        """(2 m,) where the map has tags, by their `by_others` and how far all else is from its points (n,)."""
+        places_m = self._known.places_m[[self._known.index[tag] for tag in of_map]]
+        return np.asarray(places_m.reshape(-1) + by @ (moved - self.off))
 
     def _grow(self, n: int) -> None:
         if n <= self.room:

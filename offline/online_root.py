@@ -7,6 +7,7 @@ smoothing and mapping", 2008). A motion costs as many operations as there are nu
 tags), a reading their square.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,10 +16,11 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.joint_fit import UNMODELLED_SIGMA_M
 from offline.linearise_kernels import Values
-from offline.online_answers import carried, foretold, move, snooped, through, weighed
+from offline.online_answers import carried, foretold, move, moved_on, snooped, through, weighed
 from offline.online_drive import Drive
-from offline.online_kernels import BY_POINTS, Border, Sights, sweep
+from offline.online_kernels import BY_POINTS, Border, Motions, Sights, sweep
 from offline.online_prior import OnlinePrior, padded
+from offline.online_turn import Known, pose_among, relaxed, turned
 from offline.run import TagKey
 from offline.solver import HUBER_THRESHOLD
 
@@ -28,6 +30,9 @@ _HELD_SIGMA: Final = 1e-6
 _MOST_MOTIONS: Final = 64  # in one slice
 # Multiplications in one slice: some 0.2 ms.
 SLICE: Final = 300_000
+# Costs that are worked out for one step: warm, most steps take one or two.
+_LEAST_COSTS: Final = 2
+_MOST_COSTS: Final = 24
 
 
 class Lifted(NamedTuple):
@@ -71,16 +76,28 @@ class OnlineRoot:
             self._pose[:, 3] = -se2.log(start) / _HELD_SIGMA
         self._at_tags = np.array([prior.first_tag])
         self._left: list[tuple[FloatArray, FloatArray]] = []
+        self._relaxed = np.zeros(n)  # of the last step: where the next one is looked for
         self._step: FloatArray | None = None
 
     # What it holds.
 
     @property
     def step(self) -> FloatArray:
-        """(3 + n,) of pose and border, from the points."""
+        """(3 + n,) of pose and border, from the points, in the drive's own frame; see `online_turn`."""
         if self._step is None:
-            self._step = self.through(np.concatenate([self._pose[:, 3], self._right[: self.prior.n]]))
+            n = self.prior.n
+            z = np.zeros(n)
+            if self.prior.held:
+                z[: len(self._relaxed)] = self._relaxed
+                most = min(max(SLICE // (6 * n**2 + 1), _LEAST_COSTS), _MOST_COSTS)
+                self._relaxed = z = relaxed(self._border, self._known, z, most)
+            self._step = self.through(np.concatenate([self._pose[:, 3], self._right[:n] + z]))
         return self._step
+
+    @property
+    def moved(self) -> FloatArray:
+        """(n,) of the border, from its points in the map."""
+        return turned(self._known, self.step[3:], self.prior.first_tag)
 
     @property
     def is_determined(self) -> bool:
@@ -97,18 +114,14 @@ class OnlineRoot:
     @property
     def calibration(self) -> FloatArray:
         """(C,) numbers."""
-        return self.calibration_at(self.step)
-
-    def calibration_at(self, step: FloatArray) -> FloatArray:
-        """(C,) after a step."""
         found, columns = self.prior.calibration.copy(), self.prior.columns
-        found[columns >= 0] += step[3 + columns[columns >= 0]]
+        found[columns >= 0] += self.step[3 + columns[columns >= 0]]
         return found
 
     @property
     def places_m(self) -> FloatArray:
         """(T, 2) of the tags."""
-        return self.prior.places_m + self.step[3 + self.prior.first_tag :].reshape(-1, 2)
+        return self.prior.places_m + self.moved[self.prior.first_tag :].reshape(-1, 2)
 
     def pose_covariance(self) -> FloatArray:
         """(3, 3) perturbed on the right."""
@@ -135,6 +148,11 @@ class OnlineRoot:
     def _border(self) -> Border:
         return Border(self._root, self._right, self.prior.columns, self._at_tags)
 
+    @property
+    def _known(self) -> Known:
+        prior = self.prior
+        return Known(*prior.whole)
+
     # Tags.
 
     def add_tag(self, place_m: FloatArray, of_map: TagKey | None) -> None:
@@ -152,17 +170,14 @@ class OnlineRoot:
     def drop_last_tag(self) -> None:
         """Forgets the tag that was added last, before anything of it is read."""
         self.prior.drop_last()
+        self._relaxed = self._relaxed[: self.prior.n]
         self._step = None
-
-    def foretold_m(self, of_map: TagKey) -> FloatArray:
-        """(2,) where the map has a tag, by those that hold."""
-        return self.prior.foretold_m(of_map, self.step[3:])
 
     def held_squares(self, tag: int) -> float:
         """Squared sigmas of a tag that holds the robot against all else, 1 cm in each coordinate allowed for."""
         prior, at = self.prior, self.prior.first_tag + 2 * tag
-        off = self.step[3:] - prior.off
-        return snooped(self._border, self._pose, prior.root.copy(), off, prior.n, at, UNMODELLED_SIGMA_M**2)
+        off = self.moved - prior.off
+        return snooped(self._border, self._pose, self._known.root, off, prior.n, at, UNMODELLED_SIGMA_M**2)
 
     def lifted(self, tag: int) -> Lifted:
         """What comes of all if one tag that holds the robot did not: its shift is one more unknown."""
@@ -172,16 +187,20 @@ class OnlineRoot:
         checked = ways[:, at : at + 2] - taken @ taken.T
         covariance = np.asarray(np.linalg.pinv(checked, rcond=1e-9, hermitian=True), dtype=np.float64)
         by_shift = np.column_stack([self.through(each.copy()) for each in taken])
-        return Lifted(at, by_shift, covariance @ ways @ (self.step[3:] - prior.off), covariance)
+        return Lifted(at, by_shift, covariance @ ways @ (self.moved - prior.off), covariance)
 
-    def free_squares(self, tag: int, of_map: TagKey, lifted: Lifted | None = None) -> float:
-        """Likewise of a tag that does not hold the robot, against where the map has one; as if another did not."""
-        at = 3 + self.prior.first_tag + 2 * tag
-        by, covariance = self.prior.by_others(of_map)
-        ways = np.concatenate([np.zeros((2, 3)), -by], axis=1)
-        ways[:, at : at + 2] += np.eye(2)
-        spread = self.variance_of(ways) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
-        off_m = self.places_m[tag] - self.foretold_m(of_map)
+    def free_squares(self, free: Sequence[tuple[int, TagKey]], lifted: Lifted | None = None) -> float:
+        """Likewise of tags that do not hold the robot, against where the map has them; as if another did not."""
+        prior = self.prior
+        tags, of_map = [tag for tag, _ in free], [each for _, each in free]
+        by, covariance = prior.by_others(*of_map)
+        ways = np.concatenate([np.zeros((len(by), 3)), -by], axis=1)
+        at = 3 + prior.first_tag + (2 * np.array(tags)[:, None] + np.arange(2)).reshape(-1)
+        ways[np.arange(len(by)), at] += 1.0
+        spread = self.variance_of(ways) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(len(by))
+        moved = self.moved
+        off_m = (prior.places_m.reshape(-1) + moved[prior.first_tag :])[at - 3 - prior.first_tag]
+        off_m -= prior.foretold_m(by, moved, *of_map)
         if lifted is not None:
             by_shift = ways @ lifted.by_shift + by[:, lifted.at : lifted.at + 2]
             off_m = off_m + by_shift @ lifted.shift_m
@@ -202,13 +221,22 @@ class OnlineRoot:
         end = min(end, self.keyframe + _MOST_MOTIONS)
         until = min(until, int(np.searchsorted(keyframes, end, side="right")))
         sights = drive.sights(self.n_readings, until, self.keyframe)
-        self._take(drive, end, sights, np.full(until - self.n_readings, BY_POINTS))
+        points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
+        self._take(drive, points, sights, np.full(until - self.n_readings, BY_POINTS))
 
     def take_last(self, drive: Drive) -> None:
         """Takes what came last, one motion or one reading, all else being taken; weighed by what it leaves over."""
         end, until = len(drive.poses) - 1, len(drive.keyframe)
+        points = self.point[None]
+        if end > self.keyframe:
+            points = np.stack([self.point, self._led_to(drive.motions(self.keyframe, end))])
         sights = drive.sights(self.n_readings, until, self.keyframe)
-        self._take(drive, end, sights, np.array([self._weight(sights)] if until > self.n_readings else []))
+        self._take(drive, points, sights, np.array([self._weight(sights)] if until > self.n_readings else []))
+
+    def _led_to(self, motion: Motions) -> FloatArray:
+        """(3,) the point of the next pose: among its points as the estimate lies among its own."""
+        pose = moved_on(self.pose, motion, 0, self.calibration)
+        return pose_among(self.prior.places_m, self.places_m, pose)
 
     def surprise(self, sights: Sights, unmodelled_m: float) -> float:
         """Squared sigmas of the first reading from what is foretold, its tag being off by as much besides."""
@@ -229,9 +257,8 @@ class OnlineRoot:
     def _values(self, poses: FloatArray) -> Values:
         return Values(poses, self.prior.places_m, self.prior.calibration)
 
-    def _take(self, drive: Drive, end: int, sights: Sights, weights: FloatArray) -> None:
-        n = self.prior.n
-        points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
+    def _take(self, drive: Drive, points: FloatArray, sights: Sights, weights: FloatArray) -> None:
+        n, end = self.prior.n, self.keyframe + len(points) - 1
         left = np.empty((end - self.keyframe, 3, 7 + n))
         motions, values = drive.motions(self.keyframe, end), self._values(points)
         sweep(self._border, self._pose, n, motions, sights, weights, values, HUBER_THRESHOLD, left)

@@ -19,12 +19,12 @@ from offline.graph import Parameter
 from offline.joint_fit import TAG_GATE, UNMODELLED_SIGMA_M
 from offline.known_map import KnownMap
 from offline.online_answers import move, moved_on, substituted
-from offline.online_bend import bent_step, carried_along
 from offline.online_drive import Drive, TagReading
 from offline.online_judge import CALLED, TagJudge
 from offline.online_kernels import Sights
 from offline.online_prior import Numbers, OnlinePrior
 from offline.online_root import SLICE, OnlineRoot
+from offline.online_turn import pose_among
 from offline.run import TagKey
 
 _POSES_A_SLICE: Final = 256
@@ -61,11 +61,10 @@ class Smoother:
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
         """One by the wheels."""
-        drive, front = self.drive, self.front
-        pose, calibration = (drive.poses[-1], self._calibration) if front is None else (front.pose, front.calibration)
+        drive = self.drive
         drive.add_motion(motion, covariance, by_wheels)
         n = len(drive.poses)
-        drive.poses[-1] = moved_on(pose, drive.motions(n - 2, n - 1), 0, calibration)
+        drive.poses[-1] = moved_on(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
         self._take_last()
 
     def add_reading(self, tag: int, reading: TagReading, scale: int, instances: tuple[TagKey, ...]) -> None:
@@ -79,7 +78,11 @@ class Smoother:
         if self.front is not None:
             self.front.take_last(self.drive)
             if self.front.is_determined:
-                self.drive.poses[-1] = self.front.pose
+                self.drive.poses[-1] = self._among_places(self.front)
+
+    def _among_places(self, front: OnlineRoot) -> FloatArray:
+        """(3,) the pose among the tags where those were when poses were last substituted back."""
+        return pose_among(self.places_m, front.places_m, front.pose)
 
     def work(self) -> None:
         """Some more of the present round."""
@@ -90,19 +93,17 @@ class Smoother:
         drive, front = self.drive, self.front
         last = len(drive.keyframe) - 1
         sights = drive.sights(last, last + 1, int(drive.keyframe[last]))
+        self._places.append(_place_m(sights, drive.poses[-1], self._calibration))
         if front is not None and self.is_placed:
             for of_map in instances:
-                front.add_tag(front.foretold_m(of_map), of_map)
+                front.add_tag(_place_m(sights, front.point, front.prior.calibration), of_map)
                 if front.surprise(sights, UNMODELLED_SIGMA_M) < TAG_GATE:
                     self.held[tag] = of_map
-                    self._places.append(front.places_m[tag])
                     return
                 front.drop_last_tag()
-        calibration = self._calibration if front is None else front.calibration
-        self._places.append(_place_m(sights, drive.poses[-1], calibration))
         self._judge.maybe[tag] = instances
         if front is not None:
-            front.add_tag(self._places[tag], None)
+            front.add_tag(_place_m(sights, front.point, front.prior.calibration), None)
 
     def place(self, T_map_start: FloatArray, held: dict[int, TagKey], maybe: dict[int, tuple[TagKey, ...]]) -> None:
         """Moves everything into the map's frame, in which these tags hold it; the front is there after a round."""
@@ -158,12 +159,8 @@ class Smoother:
 
     def _substitute_back(self, root: OnlineRoot) -> Iterator[None]:
         """Has the points be where the root puts them."""
-        step = bent_step(root) if self.is_placed else root.step
-        following, border = step[:3], step[3:]
-        self._calibration, self._places[: root.prior.n_tags] = (
-            root.calibration_at(step),
-            list(carried_along(root, step)),
-        )
+        following, border = root.step[:3], root.step[3:]
+        self._calibration, self._places[: root.prior.n_tags] = root.calibration, list(root.places_m)
         move(root.point, following, self.drive.poses[root.keyframe])
         n = 0
         for first, rows, points in root.left_behind():

@@ -10,11 +10,11 @@ from calib.arrays import FloatArray
 from offline import online_root
 from offline.factors import State, stacked
 from offline.graph import Graph, build_graph, unheld
-from offline.online_bend import bent_step, carried_along
 from offline.online_drive import Table
 from offline.online_localizer import OnlineLocalizer
 from offline.online_prior import OnlinePrior
 from offline.online_root import OnlineRoot
+from offline.online_turn import Known, pose_among, turned
 from offline.run import TagKey
 from offline.solver import HUBER_THRESHOLD
 from tests.benchmarks.localize_study import Scene, filtered, made_scene
@@ -34,10 +34,14 @@ def online(scene: Scene) -> OnlineLocalizer:
 
 def _root(online: OnlineLocalizer, calibration: FloatArray) -> OnlineRoot:
     """Through the whole drive, about where the estimate ended."""
+    return _root_about(online, calibration, online._smoother.places_m)
+
+
+def _root_about(online: OnlineLocalizer, calibration: FloatArray, places_m: FloatArray) -> OnlineRoot:
     smoother = online._smoother
     prior = OnlinePrior(online._known, smoother._numbers, calibration)
     root = OnlineRoot(prior, smoother.drive.poses[0], held=False)
-    for tag, place_m in enumerate(smoother.places_m):
+    for tag, place_m in enumerate(places_m):
         root.add_tag(place_m, smoother.held.get(tag))
     while not root.is_at_end_of(smoother.drive):
         root.advance(smoother.drive)
@@ -81,15 +85,16 @@ def test_a_root_takes_the_step_of_dense_least_squares(
     monkeypatch.setattr(online_root, "_MOST_MOTIONS", most)
     calibration = online._smoother.calibration + np.where(online._smoother._numbers.columns >= 0, 1e-3, 0.0)
     root = _root(online, calibration)
-    information, gradient, graph, state = _dense(online, calibration)
+    information, gradient, graph, _ = _dense(online, calibration)
     covariance = np.linalg.inv(information)
     step = -covariance @ gradient
     last, columns = graph.problem.columns.poses[-1], graph.problem.columns
-    np.testing.assert_allclose(root.step[:3], step[last], rtol=1e-6, atol=1e-9)
+    in_straight_lines = _straight_step(root)
+    np.testing.assert_allclose(in_straight_lines[:3], step[last], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(root.pose_covariance(), covariance[np.ix_(last, last)], rtol=1e-6)
     order = [graph.tags.index(_called(online, tag)) for tag in online._index]
     tags = columns.tags[order].reshape(-1)
-    np.testing.assert_allclose(root.places_m.reshape(-1) - state.tags[order].reshape(-1), step[tags], atol=1e-9)
+    np.testing.assert_allclose(in_straight_lines[3 + root.prior.first_tag :], step[tags], atol=1e-9)
     np.testing.assert_allclose(root.tags_covariance(), covariance[np.ix_(tags, tags)], rtol=1e-5, atol=1e-12)
 
 
@@ -100,13 +105,13 @@ def test_poses_are_substituted_back_to_the_step_of_dense_least_squares(online: O
     step = -np.linalg.solve(information, gradient)
     expected = se2.compose(state.poses, se2.exp(step[graph.problem.columns.poses]))
     root = _root(online, calibration)
-    before, is_placed = smoother.drive.poses.copy(), smoother.is_placed
-    smoother.is_placed = False  # a plain step, without the bend
+    before = smoother.drive.poses.copy()
+    root._step = _straight_step(root)
     try:
         _finish(smoother._substitute_back(root))
         np.testing.assert_allclose(smoother.drive.poses, expected, atol=1e-8)
     finally:
-        smoother.is_placed, smoother.drive.poses[:] = is_placed, before
+        smoother.drive.poses[:] = before
 
 
 def test_a_prior_is_the_maps_joint_information(online: OnlineLocalizer) -> None:
@@ -121,42 +126,79 @@ def test_a_prior_is_the_maps_joint_information(online: OnlineLocalizer) -> None:
     np.testing.assert_allclose(information @ known.covariance[np.ix_(rows, rows)], np.eye(len(rows)), atol=1e-5)
 
 
-def test_places_that_turn_with_the_pose_go_along_arcs(online: OnlineLocalizer) -> None:
-    """To second order, what `bent_step` counts: phi J (dx - dp) + phi^2 (x - p) / 2."""
-    root = _root(online, online._smoother.calibration)
-    step = 1e-3 * np.random.default_rng(0).standard_normal(3 + root.prior.n)
-    cos, sin = np.cos(root.point[2]), np.sin(root.point[2])
-    along = np.array([[cos, -sin], [sin, cos]]) @ step[:2]
-    straight = root.prior.places_m + step[3 + root.prior.first_tag :].reshape(-1, 2)
-    turned = straight - root.prior.places_m - along
-    bend = step[2] * np.column_stack([-turned[:, 1], turned[:, 0]])
-    bend += 0.5 * step[2] ** 2 * (root.prior.places_m - root.point[:2])
-    found = carried_along(root, step) - straight
-    np.testing.assert_allclose(found, bend, atol=5e-8)
-    assert np.abs(bend).max() > 1e-6
+@pytest.mark.parametrize("turn_rad", [0.03, -0.3])
+def test_a_drive_turned_in_its_map_has_the_same_answer(online: OnlineLocalizer, turn_rad: float) -> None:
+    """About points turned by as much as a map's bend: the first step already ends where it did."""
+    smoother, calibration = online._smoother, online._smoother.calibration
+    straight = _root(online, calibration)
+    before = smoother.drive.poses.copy()
+    T = np.array([0.5, -0.2, turn_rad])
+    try:
+        smoother.drive.poses[:] = se2.compose(T, before)
+        root = _root_about(online, calibration, se2.apply(T, smoother.places_m))
+        steps_m = _straight_step(root)[3 + root.prior.first_tag :].reshape(-1, 2)
+    finally:
+        smoother.drive.poses[:] = before
+    sigmas = np.sqrt(np.diag(straight.pose_covariance()))
+    assert np.abs(root.pose - straight.pose).max() < 1e-3 * sigmas.max()
+    np.testing.assert_allclose(root.places_m, straight.places_m, atol=1e-4)
+    np.testing.assert_allclose(root.calibration, straight.calibration, atol=1e-5)
+    assert np.abs(root.prior.places_m + steps_m - straight.places_m).max() > 1e-2  # as a step in straight lines ends
 
 
-def test_a_bent_step_solves_with_the_bend(online: OnlineLocalizer) -> None:
-    """The gradient of the quadratic cost with the bend's term vanishes there."""
-    root = _root(online, online._smoother.calibration + np.where(online._smoother._numbers.columns >= 0, 1e-3, 0.0))
-    n, first = root.prior.n, 3 + root.prior.first_tag
-    information = np.linalg.inv(root.variance_of(np.eye(3 + n)))
-    step = root.step
-    pull = (root.prior.root.T @ (root.prior.root @ (step[3:] - root.prior.off)))[root.prior.first_tag :].reshape(-1, 2)
-    cos, sin = np.cos(root.pose[2]), np.sin(root.pose[2])
-    from_pose = root.places_m - root.pose[:2]
+def test_a_relaxed_step_is_where_the_cost_with_arcs_is_least(online: OnlineLocalizer) -> None:
+    """Against central differences of the cost, written down once more."""
+    smoother = online._smoother
+    calibration = smoother.calibration + np.where(smoother._numbers.columns >= 0, 1e-3, 0.0)
+    places_m = se2.apply(np.array([0.1, 0.1, 0.05]), smoother.places_m)
+    root = _root_about(online, calibration, places_m)  # of poses that do not fit: it has to bend
+    prior, n = root.prior, root.prior.n
+    S, d = np.tril(root._root[:n, :n]), root._right[:n]
 
-    def bent(at: FloatArray) -> float:
-        moved = at[first:].reshape(-1, 2) - np.array([[cos, -sin], [sin, cos]]) @ at[:2]
-        turned = np.column_stack([-moved[:, 1], moved[:, 0]])
-        off = at - step
-        return float(0.5 * off @ information @ off + (pull * (at[2] * turned + 0.5 * at[2] ** 2 * from_pose)).sum())
+    def cost(step: FloatArray) -> float:
+        straight, arcs = (prior.root @ (each - prior.off) for each in (step, _turned(root, step)))
+        return float(((S @ step - d) ** 2).sum() + (arcs**2).sum() - (straight**2).sum()) / 2.0
 
-    found = bent_step(root)
-    for way in np.eye(3 + n)[[0, 1, 2, first, first + 1]]:
-        slope = (bent(found + 1e-4 * way) - bent(found - 1e-4 * way)) / 2e-4
-        plain = (bent(step + 1e-4 * way) - bent(step - 1e-4 * way)) / 2e-4
-        assert abs(slope) < max(1e-6, 1e-4 * abs(plain))
+    found, unit = root.step[3:], np.linalg.inv(S)
+    slopes = [(cost(found + 1e-3 * way) - cost(found - 1e-3 * way)) / 2e-3 for way in unit.T]
+    began = _straight_step(root)[3:]
+    before = [(cost(began + 1e-3 * way) - cost(began - 1e-3 * way)) / 2e-3 for way in unit.T]
+    assert np.linalg.norm(slopes) < 1e-3
+    assert np.linalg.norm(before) > 1e-2
+    assert cost(found) < cost(began)
+
+
+@pytest.mark.parametrize("twist", [(0.3, -0.1, 0.2), (1.0, 2.0, 1.5), (0.1, 0.2, 0.0)])
+def test_tags_that_turn_together_go_along_arcs(twist: tuple[float, float, float]) -> None:
+    """A twist in straight lines is the motion of its exponential, and what a tag does besides turns with it."""
+    rng = np.random.default_rng(0)
+    places_m, first = rng.uniform(-10.0, 10.0, (5, 2)), 2
+    middle = places_m.mean(axis=0)
+    quarter = np.column_stack([-(places_m - middle)[:, 1], (places_m - middle)[:, 0]])
+    straight = twist[2] * quarter + twist[:2]
+    known = Known(np.zeros((12, 12)), np.zeros(12), np.concatenate([places_m, np.full((7, 2), np.nan)]))
+
+    def went(steps_m: FloatArray) -> FloatArray:
+        return turned(known, np.concatenate([np.zeros(first), steps_m.reshape(-1)]), first)[first:].reshape(-1, 2)
+
+    along_arcs = se2.apply(se2.exp(np.array(twist)), places_m - middle) + middle - places_m
+    np.testing.assert_allclose(went(straight), along_arcs, atol=1e-12)
+    aside = 0.1 * rng.standard_normal((5, 2))
+    aside -= aside.mean(axis=0)
+    aside -= (aside * quarter).sum() / (quarter**2).sum() * quarter
+    turned_aside = se2.apply([0.0, 0.0, twist[2]], aside)
+    np.testing.assert_allclose(went(straight + aside), along_arcs + turned_aside, atol=1e-12)
+
+
+def test_a_pose_moves_along_with_the_tags_near_it() -> None:
+    before_m = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [40.0, 0.0]])
+    T = np.array([0.3, -0.5, 0.2])
+    pose = np.array([1.0, -1.0, 3.1])
+    after_m = se2.apply(T, before_m)
+    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose)), pose, atol=1e-12)
+    after_m[3] += [0.0, 1.0]  # far away, where the map bends
+    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose)), pose, atol=0.03)
+    np.testing.assert_allclose(pose_among(np.zeros((0, 2)), np.zeros((0, 2)), pose), pose)
 
 
 def test_a_table_keeps_its_rows_when_it_grows() -> None:
@@ -179,6 +221,15 @@ def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None
         assert root.keyframe - before[0] <= 64
         assert (root.n_readings - before[1] - 1) * 4 * root.prior.n**2 <= online_root.SLICE
         assert (root.keyframe, root.n_readings) != before
+
+
+def _straight_step(root: OnlineRoot) -> FloatArray:
+    """Of Gauss-Newton: all in straight lines."""
+    return root.through(np.concatenate([root._pose[:, 3], root._right[: root.prior.n]]))
+
+
+def _turned(root: OnlineRoot, step: FloatArray) -> FloatArray:
+    return turned(root._known, step, root.prior.first_tag)
 
 
 def _called(online: OnlineLocalizer, tag: TagKey) -> TagKey:
