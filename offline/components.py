@@ -9,8 +9,8 @@ from offline.checks import checks_of, metre_of
 from offline.corner_graph import has_corners
 from offline.corner_map import Refined, refine
 from offline.global_map import calibration_of, component_of, solve_global_map
-from offline.goodness import fitted_windows
 from offline.graph import Graph
+from offline.joined_goodness import joined_goodness
 from offline.local_map import LocalMap
 from offline.measured import Measurements
 from offline.measured_map import judged
@@ -121,4 +121,4 @@ def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, so
     found = [w for m in members.members for w in maps[m].goodness.warnings(maps[m].chain.name)]
     if found or len(members.members) == 1:
         return found
-    return fitted_windows(solution.problem).judge(solution.state).warnings(f"component {component}")
+    return joined_goodness([maps[m] for m in members.members], solution).warnings(f"component {component}")

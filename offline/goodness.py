@@ -154,7 +154,7 @@ def fitted_windows(
         if left <= 0 or np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
             break
     # Drives that only a tape joins have more unknowns together than apart.
-    n_conditions = max(0, _freedom(problem) - _freedom(apart))
+    n_conditions = max(0, freedom_of(problem) - freedom_of(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     most_steps = max(1, min(left, MAX_STEPS))
     if not n_conditions:
@@ -269,7 +269,7 @@ def _scaled(problem: Problem, odometry_factor: float, reading_factor: float | Fl
     return problem.reweighed(odometry, readings)
 
 
-def _freedom(problem: Problem) -> int:
+def freedom_of(problem: Problem) -> int:
     """Measured numbers, priors included, over unknowns."""
     return problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
 
@@ -292,5 +292,5 @@ def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)
-    whole = max(0, _freedom(problem))
+    whole = max(0, freedom_of(problem))
     return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])
