@@ -255,9 +255,8 @@ def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArra
     good = np.isfinite(rays).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         return []
-    toward = rays[good].mean(axis=0)
-    turn = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), toward[np.newaxis])[0]
-    turned = turn.apply(rays[good])
+    turn = _turned_ahead(rays[good].mean(axis=0))
+    turned = rays[good] @ turn.T
     if turned[:, 2].min() < _LEAST_COSINE:
         return []
     try:
@@ -268,13 +267,19 @@ def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArra
         return []
     if not found:
         return []
-    back, poses = turn.inv(), []
+    poses = []
     for i in np.argsort([float(np.asarray(error).ravel()[0]) for error in errors], kind="stable").tolist():
         place = np.asarray(places[i], dtype=np.float64).ravel()
         if np.isfinite(place).all():
-            rotation = (back * Rotation.from_rotvec(np.asarray(turns[i]).ravel())).as_matrix()
-            poses.append((rotation, back.apply(place)))
+            poses.append((turn.T @ cv2.Rodrigues(turns[i])[0], turn.T @ place))
     return poses
+
+
+def _turned_ahead(ray: FloatArray) -> FloatArray:
+    """The least turn `[3, 3]` that takes a ray in front of the camera onto its axis."""
+    x, y, z = (ray / np.linalg.norm(ray)).tolist()
+    share = 1.0 / (1.0 + z)
+    return np.array([[1.0 - x * x * share, -x * y * share, -x], [-x * y * share, 1.0 - y * y * share, -y], [x, y, z]])
 
 
 def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:

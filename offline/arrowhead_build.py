@@ -33,8 +33,8 @@ def build_arrowhead(
     is_free = columns.calibration >= 0
     free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
     by_pose = _sorted_readings(readings)
-    in_order = np.argsort(odometry.first, kind="stable")
-    first, parameters = odometry.first[in_order], odometry.parameters[in_order]
+    motions = compiled_motions(odometry, np.argsort(odometry.first, kind="stable"))
+    first, parameters = motions.first, motions.parameters
     uses = np.zeros((len(chain_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
     for chain, used in ((chain_of[first], parameters), (chain_of[by_pose.pose], by_pose.parameters)):
         uses[chain[:, None], free_calibration[used]] = True
@@ -56,26 +56,31 @@ def build_arrowhead(
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
-    motion = odometry.motion[in_order]
-    own = Odometry(
-        first=first,
-        motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
-        information=np.empty((len(first), 3, 3)),
-        covariance=np.empty((len(first), 3, 3)),
-        jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
-        parameters=parameters,
-        slots=slot[chain_of[first][:, None], free_calibration[parameters]],
-    )
-    add_moments(own, np.ascontiguousarray(odometry.whitening[in_order]))
     return Arrowhead(
         tree=tree,
-        odometry=own,
+        odometry=motions._replace(slots=slot[chain_of[first][:, None], free_calibration[parameters]]),
         readings=by_pose._replace(slots=slot[chain_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
         prior_sigma=prior.sigma,
         free=free,
         tangent=_tangent_order(columns),
         measured=measured_blocks(measured, tree, free),
     )
+
+
+def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> Odometry:
+    """For compiled functions, in an order (M,); without slots."""
+    first, motion = odometry.first[in_order], odometry.motion[in_order]
+    motions = Odometry(
+        first=first,
+        motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
+        information=np.empty((len(first), 3, 3)),
+        covariance=np.empty((len(first), 3, 3)),
+        jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
+        parameters=odometry.parameters[in_order],
+        slots=np.full((len(first), 3), -1),
+    )
+    add_moments(motions, np.ascontiguousarray(odometry.whitening[in_order]))
+    return motions
 
 
 def reweighed(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFactors) -> Arrowhead:

@@ -111,21 +111,30 @@ def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArr
 def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> int:
     """Partial Cholesky: the first columns become rows of R, the rest loses what they explain."""
     n, size = tree.n_eliminated[node], front.shape[0]
-    for first in range(0, n, 4):
-        end = min(first + 4, n)
-        failed = _eliminate_panel(front, first, end)
-        if failed >= 0:
-            return int(tree.front[tree.front_start[node] + failed])
-        if end - first == 4:
-            _subtract_four(front, first)
-        else:
-            for k in range(first, end):
-                for r in range(end, size):
-                    _subtract_one(front, k, r)
+    failed = eliminate_columns(front, n)
+    if failed >= 0:
+        return int(tree.front[tree.front_start[node] + failed])
     start = tree.rows_start[node]
     for i in range(n):
         for j in range(size):
             rows.inner[start + i * size + j] = front[i, j]
+    return -1
+
+
+@inner
+def eliminate_columns(front: FloatArray, n: int) -> int:
+    """Partial Cholesky of a matrix's upper triangle by its first n columns; -1, or the one without a positive pivot."""
+    for first in range(0, n, 4):
+        end = min(first + 4, n)
+        failed = _eliminate_panel(front, first, end)
+        if failed >= 0:
+            return failed
+        if end - first == 4:
+            _subtract_four(front, first)
+        else:
+            for k in range(first, end):
+                for r in range(end, len(front)):
+                    _subtract_one(front, k, r)
     return -1
 
 

@@ -11,6 +11,7 @@ by the marginal covariance R + J S J^T in Woodbury's form.
 """
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
+from offline.corner_kernels import LookArrays, SpatialValues, lenses_of
 from offline.factors import Columns, Linearised, State
 from offline.tag_pose import UNIT_CORNERS
 
@@ -122,6 +124,16 @@ class CornerFactors:
 
     looks: Looks
     cameras: tuple[CameraModel, ...]
+
+    @cached_property
+    def arrays(self) -> LookArrays:
+        """The looks for compiled functions."""
+        return LookArrays(*(np.ascontiguousarray(getattr(self.looks, field.name)) for field in fields(Looks)))
+
+    @cached_property
+    def lenses(self) -> FloatArray:
+        """Of the cameras, for compiled functions."""
+        return lenses_of(self.cameras)
 
     def residual(self, state: SpatialState) -> FloatArray:
         """(M, 8), whitened; NaN where the lens has no image of a corner."""
@@ -258,6 +270,11 @@ class CornerFactors:
         about = seen.in_base - mount[:, None, :3]
         by_turn = _by_turning(seen.by_base, about) @ axes[:, None].swapaxes(-1, -2)
         return np.concatenate([-seen.by_base, by_turn], axis=-1)
+
+
+def spatial_values(state: SpatialState) -> SpatialValues:
+    """For compiled functions."""
+    return SpatialValues(state.poses, state.tags, state.calibration, state.heights_m, state.turns)
 
 
 def _by_moving(by_point: FloatArray, point: FloatArray) -> FloatArray:

@@ -10,10 +10,14 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState
+from offline.arrowhead_build import compiled_motions
+from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
+from offline.corner_kernels import N_LOOK, add_looks, add_motions
 from offline.corner_order import corner_order
 from offline.factors import CalibrationPrior, Linearised, OdometryFactors, ReadingFactors
-from offline.fronts import Fronts
+from offline.front_kernels import System
+from offline.fronts import FrontFactor, Fronts, Normal
+from offline.linearise_kernels import Odometry, Values
 from offline.measured_factors import Measured
 from offline.robust import Loss, huber, losses_and_weights
 from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
@@ -22,14 +26,7 @@ from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
 # How a picture stands and which of its looks count settle together in a few rounds; most of them in one.
 _WEIGHT_ROUNDS: Final = 3
-_N_LOOK: Final = 18
-
-
-class Normal(NamedTuple):
-    """J^T W J (M, k, k) and J^T W r (M, k) of a kind of factor."""
-
-    matrix: FloatArray
-    gradient: FloatArray
+LOOKS: Final = -2  # among `kinds`; the last are pairs
 
 
 class Weighed(NamedTuple):
@@ -77,6 +74,11 @@ class CornerProblem:
     def order(self) -> Fronts:
         """The order of elimination, settled once."""
         return corner_order(self)
+
+    @cached_property
+    def motions(self) -> Odometry:
+        """The odometry for compiled functions."""
+        return compiled_motions(self.odometry, np.arange(len(self.odometry.first)))
 
     @cached_property
     def pictures(self) -> tuple[IntArray, int]:
@@ -134,26 +136,52 @@ class CornerProblem:
                 axis=1,
             ),
             look,
-            look[self.pairs].reshape(len(self.pairs), 2 * _N_LOOK),
+            look[self.pairs].reshape(len(self.pairs), 2 * N_LOOK),
         ]
 
     def linearise(self, state: SpatialState) -> tuple[list[Normal], float]:
         """Normal equations of each kind, in the order of `kinds`, and the cost: half the sum of all losses."""
-        columns = self.columns
-        odometry_loss, reading_loss = DEFAULT_LOSSES
-        normals, total = [], 0.0
-        plain: list[tuple[Linearised, Loss | None]] = [
-            (self.odometry.linearise(state, columns), odometry_loss),
-            (self.readings.linearise(state, columns), reading_loss),
-            (self.prior.linearise(state, columns), None),
-            *((kind, None) for kind in self.measured.linearise(state, columns)),
-        ]
-        for kind, loss in plain:
-            normal, cost = _normal(kind, loss)
-            normals.append(normal)
-            total += cost
+        odometry = _normal(self.odometry.linearise(state, self.columns), DEFAULT_LOSSES.odometry)
+        plain = [odometry, *self._few(state)]
         look, pair, cost = self._looks(state)
-        return [*normals, look, pair], 0.5 * (total + cost)
+        return [*(normal for normal, _ in plain), look, pair], 0.5 * (sum(each for _, each in plain) + cost)
+
+    def system(self, state: SpatialState, *, is_whole: bool = True) -> tuple[System, float]:
+        """The same added up, compiled where all is level; and the cost. Without matrices it takes half of the time."""
+        system = self.order.empty(is_whole=is_whole)
+        if self.wobble_sigma.any():
+            normals, cost = self.linearise(state)
+            self.order.add(system, 0, normals)
+            return system, cost
+        odometry, values = self.order.kinds[0], Values(state.poses, state.tags, state.calibration)
+        total = add_motions(self.motions, DEFAULT_LOSSES.odometry, values, odometry, system)
+        few = self._few(state)
+        self.order.add(system, 1, [normal for normal, _ in few])
+        total += sum(each for _, each in few) + self._level_looks(state, system)[1]
+        return system, 0.5 * total
+
+    def factor(self, state: SpatialState) -> FrontFactor:
+        """Of H there.
+
+        Raises:
+            NotPositiveError: it has no square root.
+        """
+        return self.order.factorise(self.system(state)[0])
+
+    def _few(self, state: SpatialState) -> list[tuple[Normal, float]]:
+        """Of all kinds between odometry and looks, with the sum of their losses."""
+        return [
+            _normal(self.readings.linearise(state, self.columns), DEFAULT_LOSSES.readings),
+            _normal(self.prior.linearise(state, self.columns), None),
+            *(_normal(kind, None) for kind in self.measured.linearise(state, self.columns)),
+        ]
+
+    def _level_looks(self, state: SpatialState, system: System) -> tuple[FloatArray, float]:
+        """Adds looks at level pictures; their weights (M,) and twice their cost."""
+        corners, weight = self.corners, np.empty(len(self.corners.looks))
+        values = spatial_values(state)
+        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, self.order.kinds[LOOKS], system, weight)
+        return weight, cost if np.isfinite(cost) else np.inf
 
     def weighed(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
         """Weighs looks whose pictures may stand off level.
@@ -187,6 +215,9 @@ class CornerProblem:
 
     def outliers(self, state: SpatialState) -> float:
         """Share of looks beyond where their loss leaves the square."""
+        if not self.wobble_sigma.any():
+            weight, _ = self._level_looks(state, self.order.empty(is_whole=False))
+            return float((weight < 1.0).mean())
         linearised, wobble = self.corners.linearise(state, self.columns)
         return float((self.weighed(linearised.residual, wobble).weight < 1.0).mean())
 
@@ -225,7 +256,7 @@ class CornerProblem:
         matrix = transposed @ (weighed.weight[:, None, None] * jacobian)
         gradient = (transposed @ (weighed.weight[:, None] * weighed.residual)[..., None])[..., 0]
         if not self.wobble_sigma.any():
-            none = Normal(np.zeros((0, 2 * _N_LOOK, 2 * _N_LOOK)), np.zeros((0, 2 * _N_LOOK)))
+            none = Normal(np.zeros((0, 2 * N_LOOK, 2 * N_LOOK)), np.zeros((0, 2 * N_LOOK)))
             return Normal(matrix, gradient), none, weighed.cost
         picture, _ = self.pictures
         heavy = weighed.weight[:, None, None] * wobble
@@ -236,10 +267,10 @@ class CornerProblem:
         matrix = matrix - coupled.swapaxes(-1, -2) @ taken
         a, b = self.pairs.T
         across = -coupled[a].swapaxes(-1, -2) @ taken[b]
-        pair = np.zeros((len(a), 2 * _N_LOOK, 2 * _N_LOOK))
-        pair[:, :_N_LOOK, _N_LOOK:] = across
-        pair[:, _N_LOOK:, :_N_LOOK] = across.swapaxes(-1, -2)
-        return Normal(matrix, gradient), Normal(pair, np.zeros((len(a), 2 * _N_LOOK))), weighed.cost
+        pair = np.zeros((len(a), 2 * N_LOOK, 2 * N_LOOK))
+        pair[:, :N_LOOK, N_LOOK:] = across
+        pair[:, N_LOOK:, :N_LOOK] = across.swapaxes(-1, -2)
+        return Normal(matrix, gradient), Normal(pair, np.zeros((len(a), 2 * N_LOOK))), weighed.cost
 
     def _by_picture(self, values: FloatArray) -> FloatArray:
         """Sums (P, ...) of values (M, ...) of looks."""

@@ -1,20 +1,25 @@
 """Least squares on tag corners: Gauss-Newton steps while they work, damped where one would raise the cost."""
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from offline.corner_factors import SpatialState
-from offline.corner_problem import CornerProblem, Normal
+from offline.corner_problem import CornerProblem
 from offline.damping import Damping
+from offline.front_kernels import System
 from offline.fronts import FrontFactor, NotPositiveError
 
 _MOST_STEPS: Final = 40
 # In squared sigmas: a step that brings less is 1e-4 sigma long. It is taken, and what it leaves over is
 # smaller still by far.
 _COST_TOLERANCE: Final = 1e-8
+# A step that brings so little is taken for one of the last. H hardly changes any more: its factor is kept while each
+# step promises at most so much of the one before.
+_NEAR: Final = 1e-2
+_CLOSING: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -22,16 +27,20 @@ class CornerSolution:
     """Where the solve ended and why.
 
     Attributes:
-        factor: of H at the end; None where it has no square root.
+        factor: of H where the last steps were made, 0.1 sigma from the end at most; None where it did not converge.
         costs: one an accepted step, the first before all of them.
     """
 
     state: SpatialState
     costs: tuple[float, ...]
     reason: str
-    converged: bool
     problem: CornerProblem = field(repr=False)
     factor: FrontFactor | None = field(repr=False, default=None)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it did."""
+        return self.factor is not None
 
     @property
     def cost(self) -> float:
@@ -42,11 +51,26 @@ class CornerSolution:
         """Joint covariance (k, k) of k columns of the tangent vector; 0 where held (-1).
 
         Raises:
-            ValueError: something is not tied down.
+            ValueError: something is not tied down, or the solve did not converge.
         """
         if self.factor is None:
             raise ValueError(f"no covariance: {self.reason}")
         return self.factor.covariance(columns)
+
+
+class _Step(NamedTuple):
+    """By a factor of H; what it promises of the cost; where it leads."""
+
+    factor: FrontFactor
+    expected: float
+    state: SpatialState
+
+
+class _ClosedIn(NamedTuple):
+    """Where the last steps end, and the cost after each but the last."""
+
+    state: SpatialState
+    costs: list[float]
 
 
 def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution:
@@ -55,41 +79,63 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
     It stops, and `reason` says which of these it was: "converged", "no step lowers the cost", "stopped after N steps",
     "something is not tied down", "the cost is no number at the start".
     """
-    order, state = problem.order, start
-    normals, cost = problem.linearise(state)
-    costs, damping = [cost], Damping()
+    state, damping = start, Damping()
+    system, cost = problem.system(state)
+    costs = [cost]
 
     def ended(reason: str, factor: FrontFactor | None = None) -> CornerSolution:
-        return CornerSolution(state, tuple(costs), reason, factor is not None, problem, factor)
+        return CornerSolution(state, tuple(costs), reason, problem, factor)
 
     if not np.isfinite(cost):
         return ended("the cost is no number at the start")
-    for _ in range(_MOST_STEPS):
-        entries, gradient = order.assembled([n.matrix for n in normals]), order.summed([n.gradient for n in normals])
-        diagonal = _diagonal(problem, normals)
-        while True:
-            try:
-                factor = order.factorise(entries, damping.share * diagonal)
-            except NotPositiveError:
-                return ended("something is not tied down")
-            step = -factor.solve(gradient)
-            expected = 0.5 * float(damping.share * (diagonal * step**2).sum() - gradient @ step)
-            moved = problem.moved(state, step)
-            if expected <= _COST_TOLERANCE:
-                state = moved
-                return ended("converged", factor if damping.is_least else order.factorise(entries))
-            tried, tried_cost = problem.linearise(moved)
-            if tried_cost < cost:
-                break
-            damping.step_rejected()
-            if damping.exhausted:
-                return ended("no step lowers the cost")
-        damping.step_taken((cost - tried_cost) / expected)
-        state, normals, cost = moved, tried, tried_cost
-        costs.append(cost)
+    while len(costs) <= _MOST_STEPS:
+        try:
+            step = _step(problem, system, state, damping.share)
+        except NotPositiveError:
+            return ended("something is not tied down")
+        if step.expected <= _COST_TOLERANCE:
+            state = step.state
+            return ended("converged", step.factor if damping.is_least else problem.factor(state))
+        if step.expected <= _NEAR and damping.is_least:
+            closed_in = _closed_in(problem, step, cost)
+            if closed_in is not None:
+                state = closed_in.state
+                costs += closed_in.costs
+                return ended("converged", step.factor)
+        tried, tried_cost = problem.system(step.state)
+        if tried_cost < cost:
+            damping.step_taken((cost - tried_cost) / step.expected)
+            state, system, cost = step.state, tried, tried_cost
+            costs.append(cost)
+            continue
+        damping.step_rejected()
+        if damping.exhausted:
+            return ended("no step lowers the cost")
+        system, _ = problem.system(state)  # its entries became the factor
     return ended(f"stopped after {_MOST_STEPS} steps")
 
 
-def _diagonal(problem: CornerProblem, normals: list[Normal]) -> FloatArray:
-    """(n,) of H."""
-    return problem.order.summed([np.einsum("mii->mi", normal.matrix) for normal in normals])
+def _step(problem: CornerProblem, system: System, state: SpatialState, share: float) -> _Step:
+    """Gauss-Newton's, the diagonal raised by a share; the factor takes the system's entries."""
+    raised = share * problem.order.diagonal_of(system) if share else None
+    factor = problem.order.factorise(system, raised)
+    step = -factor.solve(system.gradient)
+    expected = -0.5 * float(system.gradient @ step)
+    if raised is not None:
+        expected += 0.5 * float((raised * step**2).sum())
+    return _Step(factor, expected, problem.moved(state, step))
+
+
+def _closed_in(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | None:
+    """The last steps, by one factor, as H hardly changes any more; None where it takes more than a few."""
+    state, costs, before = step.state, list[float](), step.expected
+    while True:
+        system, now = problem.system(state, is_whole=False)
+        by = -step.factor.solve(system.gradient)
+        expected = -0.5 * float(system.gradient @ by)
+        if not (now < cost and expected < _CLOSING * before):
+            return None
+        costs.append(now)
+        state, cost, before = problem.moved(state, by), now, expected
+        if expected <= _COST_TOLERANCE:
+            return _ClosedIn(state, costs)

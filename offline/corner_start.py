@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.bundle import planar_poses
-from offline.corner_factors import CornerFactors, Looks, SpatialState
+from offline.corner_factors import CornerFactors, Looks, SpatialState, spatial_values
+from offline.corner_kernels import add_to_tags
 from offline.corner_problem import CORNER_LOSS, CornerProblem
-from offline.robust import losses_and_weights
 from offline.tag_pose import UNIT_CORNERS
 
 _POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
@@ -92,19 +92,17 @@ def _candidates(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, 
                 places.append(turn[index] @ centre_m + place[index])
             in_map = turn[index] @ rays.mean(axis=0)
             range_m = np.linalg.norm(state.tags[looks.tag[index]] - place[index, :2])
-            for aside_rad in _ASIDE_RAD:
-                tags.append(int(looks.tag[index]))
-                turns.append(_upright(-in_map, aside_rad))
-                places.append(place[index] + in_map * range_m / np.hypot(in_map[0], in_map[1]))
+            tags += [int(looks.tag[index])] * len(_ASIDE_RAD)
+            turns += list(_upright(-in_map))
+            places += [place[index] + in_map * range_m / np.hypot(in_map[0], in_map[1])] * len(_ASIDE_RAD)
     return np.array(tags, dtype=np.int64), (np.array(places).reshape(-1, 3), np.array(turns).reshape(-1, 3, 3))
 
 
-def _upright(towards: FloatArray, aside_rad: float) -> FloatArray:
-    """R_map_tag `[3, 3]` of an upright face that looks so far aside of a direction."""
-    yaw = np.arctan2(towards[1], towards[0]) + aside_rad
-    normal = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    return np.column_stack([np.cross(up, normal), up, normal])
+def _upright(towards: FloatArray) -> FloatArray:
+    """R_map_tag `[2, 3, 3]` of upright faces that look so far aside of a direction to either side."""
+    yaw = np.arctan2(towards[1], towards[0]) + np.array(_ASIDE_RAD)
+    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
+    return np.stack([-sin, zero, cos, cos, zero, sin, zero, one, zero], axis=-1).reshape(-1, 3, 3)
 
 
 def _posed(own: IntArray, corners_px: FloatArray) -> list[int]:
@@ -133,21 +131,16 @@ def _judges(factors: CornerFactors, tags: IntArray) -> CornerFactors:
 def _fitted(judges: CornerFactors, state: SpatialState) -> tuple[SpatialState, FloatArray]:
     """Each tag of the state fitted to its looks alone, and what they lose (T,); infinite where one is not seen."""
     n = len(state.tags)
-    tag = judges.looks.tag
+    is_seen = np.bincount(judges.looks.tag, minlength=n) > 0
     losses = np.full(n, np.inf)
     best = tried = state
     with np.errstate(invalid="ignore"):
         for _ in range(_STEPS):
-            residual, jacobian = judges.by_columns(tried)
-            each, weight = losses_and_weights(CORNER_LOSS, residual)
-            total = np.bincount(tag, each, n)
-            better = total < losses
+            total, normal, gradient = np.zeros(n), np.zeros((n, 6, 6)), np.zeros((n, 6))
+            values = spatial_values(tried)
+            add_to_tags(judges.arrays, judges.lenses, CORNER_LOSS, values, total, normal, gradient)
+            better = (total < losses) & is_seen
             best, losses = _mixed(better, tried, best), np.where(better, total, losses)
-            jacobian = jacobian[..., _PLACE_AND_TURN]
-            heavy = (weight[:, None, None] * jacobian).swapaxes(-1, -2)
-            normal, gradient = np.zeros((n, 6, 6)), np.zeros((n, 6))
-            np.add.at(normal, tag, heavy @ jacobian)
-            np.add.at(gradient, tag, (heavy @ residual[..., None])[..., 0])
             good = better & np.isfinite(normal).all((-1, -2))
             diagonal = np.einsum("tii->ti", normal)
             normal = np.where(good[:, None, None], normal + _DAMPING * diagonal[:, :, None] * np.eye(6), np.eye(6))

@@ -1,4 +1,4 @@
-"""A sparse symmetric system solved by fronts: the multifrontal method, on dense blocks that LAPACK eliminates.
+"""A sparse symmetric system solved by fronts: the multifrontal method, on dense blocks (`front_kernels`).
 
 Columns are eliminated at the nodes of a tree, children before parents. A node's front holds its own columns and those
 further up that its factors, or what its children left over, couple them with. Duff and Reid, "The multifrontal solution
@@ -8,26 +8,34 @@ of indefinite sparse symmetric linear equations" (1983).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.front_kernels import (
+    Factors,
+    Kind,
+    Nodes,
+    System,
+    add_vectors,
+    assemble,
+    factorise,
+    settle,
+    substitute,
+    whiten,
+)
+
+
+class Normal(NamedTuple):
+    """J^T W J (M, k, k) and J^T W r (M, k) of a kind of factor."""
+
+    matrix: FloatArray
+    gradient: FloatArray
 
 
 class NotPositiveError(ValueError):
     """A matrix without a square root: something is not tied down."""
-
-
-@dataclass(frozen=True)
-class Front:
-    """One node: its own columns, then those further up; where these are in its parent's front."""
-
-    columns: IntArray
-    n_own: int
-    parent: int
-    in_parent: IntArray
-    offset: int  # of its matrix among all fronts' entries
 
 
 @dataclass(frozen=True)
@@ -36,120 +44,110 @@ class Fronts:
 
     Attributes:
         n: number of columns.
-        fronts: children before parents; the last one is the root.
-        entries: for each kind of factor (M, k, k) positions among all fronts' entries.
-        columns: for each kind of factor (M, k).
-        n_entries: of all fronts; the position n_entries takes what is held.
+        nodes: their fronts, children before parents; the last one is the root.
+        kinds: of factors.
     """
 
     n: int
-    fronts: tuple[Front, ...]
-    entries: tuple[IntArray, ...]
-    columns: tuple[IntArray, ...]
-    n_entries: int
+    nodes: Nodes
+    kinds: tuple[Kind, ...]
+
+    @cached_property
+    def _diagonals(self) -> tuple[IntArray, BoolArray]:
+        """(S,) positions of all fronts' diagonal entries, and which are of the front's own columns."""
+        nodes, sizes = self.nodes, np.diff(self.nodes.start)
+        of_column = np.repeat(np.arange(len(sizes)), sizes)
+        place = np.arange(len(nodes.columns)) - nodes.start[of_column]
+        return nodes.offset[of_column] + place * (sizes[of_column] + 1), place < nodes.n_own[of_column]
+
+    @property
+    def is_own(self) -> BoolArray:
+        """(S,) which columns of the fronts are eliminated there."""
+        return self._diagonals[1]
 
     @cached_property
     def diagonal(self) -> IntArray:
         """(n,) position of each column's diagonal entry in the front that eliminates it."""
+        positions, is_own = self._diagonals
         at = np.empty(self.n, dtype=np.int64)
-        for front in self.fronts:
-            at[front.columns[: front.n_own]] = front.offset + np.arange(front.n_own) * (len(front.columns) + 1)
+        at[self.nodes.columns[is_own]] = positions[is_own]
         return at
 
-    def assembled(self, normals: Sequence[FloatArray]) -> FloatArray:
-        """All fronts' entries from the normal matrices (M, k, k) of each kind of factor."""
-        total = np.zeros(self.n_entries + 1)
-        for entries, normal in zip(self.entries, normals, strict=True):
-            total += np.bincount(entries.reshape(-1), normal.reshape(-1), len(total))
-        return total[:-1]
-
-    def summed(self, vectors: Sequence[FloatArray]) -> FloatArray:
-        """(n,) from the vectors (M, k) of each kind of factor."""
-        flat = np.concatenate([columns.reshape(-1) for columns in self.columns])
-        values = np.concatenate([vector.reshape(-1) for vector in vectors])
-        held = flat < 0
-        total: FloatArray = np.bincount(np.where(held, self.n, flat), values, self.n + 1)[:-1].astype(np.float64)
+    def diagonal_of(self, system: System) -> FloatArray:
+        """(n,) of the whole matrix, of which each front has what its factors add."""
+        total: FloatArray = np.bincount(self.nodes.columns, system.entries[self._diagonals[0]], self.n).astype(
+            np.float64
+        )
         return total
 
-    def factorise(self, entries: FloatArray, raised: FloatArray | None = None) -> "FrontFactor":
-        """R with R^T R the matrix, its diagonal raised by (n,).
+    def empty(self, *, is_whole: bool = True) -> System:
+        """Zeros for factors to be added to; without room for matrices unless all is wanted."""
+        return System(self.nodes, np.zeros(self.nodes.offset[-1] if is_whole else 0), np.zeros(self.n))
+
+    def add(self, system: System, first: int, normals: Sequence[Normal]) -> None:
+        """Adds the normal equations of kinds of factors, from the first of these on; no matrices without room."""
+        for kind, normal in zip(self.kinds[first:], normals, strict=False):
+            add_vectors(kind, normal.gradient, system.gradient)
+            if len(system.entries):
+                assemble(kind, normal.matrix, system)
+
+    def factorise(self, system: System, raised: FloatArray | None = None) -> "FrontFactor":
+        """R with R^T R the matrix; R takes the place of the system's entries.
+
+        Args:
+            system: complete.
+            raised: (n,) added to the diagonal.
 
         Raises:
             NotPositiveError: it has none.
         """
-        entries = entries.copy()
         if raised is not None:
-            entries[self.diagonal] += raised
-        matrices = [entries[f.offset : f.offset + len(f.columns) ** 2].reshape(len(f.columns), -1) for f in self.fronts]
-        lowers, rows = [], []
-        for front, matrix in zip(self.fronts, matrices, strict=True):
-            k = front.n_own
-            lower, above = matrix[:k, :k], matrix[:k, k:]
-            if k:
-                lower, info = linalg.lapack.dpotrf(lower, lower=1)
-                if info:
-                    raise NotPositiveError(f"column {front.columns[max(info - 1, 0)]} has no positive pivot")
-                above = _solved(lower, above)
-            if front.parent >= 0 and len(front.in_parent):
-                parent = matrices[front.parent]
-                parent[np.ix_(front.in_parent, front.in_parent)] += matrix[k:, k:] - above.T @ above
-            lowers.append(lower)
-            rows.append(above)
-        return FrontFactor(self, tuple(lowers), tuple(rows))
+            system.entries[self.diagonal] += raised
+        failed = factorise(self.nodes, system.entries)
+        if failed >= 0:
+            raise NotPositiveError(f"column {failed} has no positive pivot")
+        return FrontFactor(self, system.entries)
 
 
 @dataclass(frozen=True)
 class FrontFactor:
-    """R with R^T R = H, by fronts: R^T of the own columns, and their rows in the columns further up."""
+    """R with R^T R = H: in each front the rows of its own columns."""
 
     order: Fronts
-    lowers: tuple[FloatArray, ...]
-    rows: tuple[FloatArray, ...]
+    entries: FloatArray
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """H^-1 vector (n,)."""
         x = vector.copy()
-        for front, lower, above in zip(self.order.fronts, self.lowers, self.rows, strict=True):
-            own, up = front.columns[: front.n_own], front.columns[front.n_own :]
-            x[own] = _solved(lower, x[own])
-            x[up] -= x[own] @ above
-        for front, lower, above in zip(self.order.fronts[::-1], self.lowers[::-1], self.rows[::-1], strict=True):
-            own, up = front.columns[: front.n_own], front.columns[front.n_own :]
-            x[own] = _solved(lower, x[own] - above @ x[up], transposed=True)
+        substitute(self.order.nodes, self.entries, x)
         return x
 
     def log_determinant(self) -> float:
         """Of H."""
-        return 2.0 * float(sum(np.log(np.diagonal(lower)).sum() for lower in self.lowers))
+        return 2.0 * float(np.log(self.entries[self.order.diagonal]).sum())
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns: their block of H^-1; 0 where held (-1).
 
         E^T H^-1 E = Z^T Z with R^T Z = E, and a column of Z is zero but on the path from its node to the root.
         """
-        free = np.flatnonzero(columns >= 0)
-        x = np.zeros((self.order.n, len(free)))
-        x[columns[free], np.arange(len(free))] = 1.0
-        inner = np.zeros((len(free), len(free)))
-        for front, lower, above in zip(self.order.fronts, self.lowers, self.rows, strict=True):
-            own, up = front.columns[: front.n_own], front.columns[front.n_own :]
-            active = np.flatnonzero(x[own].any(axis=0))
-            if not len(active):
-                continue
-            z = _solved(lower, x[np.ix_(own, active)])
-            x[np.ix_(up, active)] -= above.T @ z
-            inner[np.ix_(active, active)] += z.T @ z
+        nodes, free = self.order.nodes, np.flatnonzero(columns >= 0)
+        wanted = np.zeros(self.order.n, dtype=np.bool_)
+        wanted[columns[free]] = True
+        on_path = np.zeros(len(nodes.parent), dtype=np.bool_)
+        of_front, is_own = np.repeat(np.arange(len(nodes.parent)), np.diff(nodes.start)), self.order.is_own
+        on_path[of_front[is_own & wanted[nodes.columns]]] = True
+        for i, above in enumerate(nodes.parent.tolist()):
+            on_path[above] |= on_path[i]
+        rows = nodes.columns[is_own & on_path[of_front]]
+        row = np.full(self.order.n, -1)
+        row[rows] = np.arange(len(rows))
+        Z = np.zeros((len(rows), len(free)))
+        Z[row[columns[free]], np.arange(len(free))] = 1.0
+        whiten(nodes, self.entries, np.flatnonzero(on_path), row, Z)
         covariance = np.zeros((len(columns), len(columns)))
-        covariance[np.ix_(free, free)] = inner
+        covariance[np.ix_(free, free)] = Z.T @ Z
         return covariance
-
-
-def _solved(lower: FloatArray, right: FloatArray, *, transposed: bool = False) -> FloatArray:
-    """L^-1 or L^-T times a vector or matrix; either may be empty, which LAPACK would refuse."""
-    if not right.size:
-        return right
-    solution: FloatArray = linalg.lapack.dtrtrs(lower, right, lower=1, trans=int(transposed))[0]
-    return solution
 
 
 def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[IntArray]) -> Fronts:
@@ -163,53 +161,34 @@ def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[In
             root.
     """
     n_nodes = len(parent)
-    nodes = [_node_of_factors(columns, node_of, n_nodes) for columns in kinds]
-    coupled = np.unique(
-        np.concatenate(
-            [(node[:, None] * n + columns)[columns >= 0] for node, columns in zip(nodes, kinds, strict=True)]
-            + [node_of * n + np.arange(n)]
-        )
+    kinds = [np.ascontiguousarray(columns) for columns in kinds]
+    node = [_node_of_factors(columns, node_of, n_nodes) for columns in kinds]
+    flat = np.concatenate([columns.reshape(-1) for columns in kinds])
+    lengths = np.concatenate([np.full(len(columns), columns.shape[1]) for columns in kinds])
+    of_factor = np.concatenate(node)
+    factors = Factors(
+        _begins(of_factor, n_nodes), np.argsort(of_factor, kind="stable"), _ends(lengths), flat, np.full(len(flat), -1)
     )
-    members: list[IntArray] = np.split(coupled % n, np.searchsorted(coupled // n, np.arange(1, n_nodes)))
-    sorted_members: list[IntArray] = []
-    fronts, offset = [], 0
-    pending: list[list[IntArray]] = [[] for _ in range(n_nodes)]
-    for i in range(n_nodes):
-        own_and_up = np.unique(np.concatenate([members[i], *pending[i]])) if pending[i] else members[i]
-        is_own = node_of[own_and_up] == i
-        columns = np.concatenate([own_and_up[is_own], own_and_up[~is_own]])
-        if parent[i] >= 0:
-            pending[parent[i]].append(own_and_up[~is_own])
-        fronts.append((columns, int(is_own.sum()), offset))
-        sorted_members.append(own_and_up)
-        offset += len(columns) ** 2
-    keys = np.concatenate([i * n + columns for i, (columns, _, _) in enumerate(fronts)])
-    order = np.argsort(keys)
-    place = np.concatenate([np.arange(len(columns)) for columns, _, _ in fronts])[order]
-    keys = keys[order]
+    own_begin = _begins(node_of, n_nodes)
+    nodes = Nodes(
+        np.ascontiguousarray(parent), np.diff(own_begin), np.zeros(n_nodes + 1, dtype=np.int64), flat[:0], flat[:0],
+        flat[:0],
+    )  # fmt: skip
+    columns, in_parent = settle(factors, own_begin, np.argsort(node_of, kind="stable"), nodes)
+    nodes = nodes._replace(offset=_ends(np.diff(nodes.start) ** 2), columns=columns, in_parent=in_parent)
+    bounds = np.cumsum([columns.size for columns in kinds])[:-1]
+    places = np.split(factors.place, bounds)
+    found = [Kind(own, at, each.reshape(own.shape)) for own, at, each in zip(kinds, node, places, strict=True)]
+    return Fronts(n, nodes, tuple(found))
 
-    def places(node: IntArray, columns: IntArray) -> IntArray:
-        return np.asarray(place[np.minimum(np.searchsorted(keys, node * n + columns), len(keys) - 1)])
 
-    whole = tuple(
-        Front(
-            columns,
-            n_own,
-            int(parent[i]),
-            places(np.full(len(columns) - n_own, parent[i]), columns[n_own:]) if parent[i] >= 0 else columns[:0],
-            first,
-        )
-        for i, (columns, n_own, first) in enumerate(fronts)
-    )
-    sizes, offsets = np.array([len(f.columns) for f in whole]), np.array([f.offset for f in whole])
-    entries = []
-    for node, columns in zip(nodes, kinds, strict=True):
-        at = places(node[:, None], np.maximum(columns, 0) if columns.size else columns)
-        held = columns < 0
-        flat = offsets[node][:, None, None] + at[:, :, None] * sizes[node][:, None, None] + at[:, None, :]
-        flat[held[:, :, None] | held[:, None, :]] = offset
-        entries.append(flat)
-    return Fronts(n, whole, tuple(entries), tuple(kinds), offset)
+def _begins(node: IntArray, n_nodes: int) -> IntArray:
+    """(N + 1,) where each node's own begin among all, sorted."""
+    return _ends(np.bincount(node, minlength=n_nodes))
+
+
+def _ends(lengths: IntArray) -> IntArray:
+    return np.concatenate([[0], np.cumsum(lengths)])
 
 
 def _node_of_factors(columns: IntArray, node_of: IntArray, n_nodes: int) -> IntArray:

@@ -38,7 +38,7 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
         t = wheel_correction(odometry, m, values.calibration)
         e, J = error_of(motion_at(odometry, m, t), x, y, values.poses[last, 2] - values.poses[i, 2])
         s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
-        L = _scaled(odometry.information[m], s)
+        L = scaled_information(odometry.information[m], s)
         f = _times_vector(L, e)
         rho, w = loss_and_weight(loss, e[0] * f[0] + e[1] * f[1] + e[2] * f[2])
         total += rho
@@ -105,7 +105,7 @@ def _right_jacobian_inverse(e: _Three, cotangent: float) -> _Four:
 
 
 @inner
-def _scaled(L: FloatArray, s: float) -> _Upper:
+def scaled_information(L: FloatArray, s: float) -> _Upper:
     """S L S: lengths are divided by 1 + wheel_scale."""
     return s * s * L[0, 0], s * s * L[0, 1], s * L[0, 2], s * s * L[1, 1], s * L[1, 2], L[2, 2]
 

@@ -12,7 +12,8 @@ from calib.camera_model import CameraModel
 from offline.corner_factors import CornerFactors, Looks, SpatialColumns, SpatialState
 from offline.corner_problem import CornerProblem, columns_of
 from offline.factors import CalibrationPrior, OdometryFactors, ReadingFactors
-from offline.fronts import NotPositiveError, build_fronts, common_ancestor
+from offline.front_kernels import System
+from offline.fronts import Fronts, Normal, NotPositiveError, build_fronts, common_ancestor
 from offline.measured_factors import NOTHING_MEASURED
 
 CAMERAS = {
@@ -59,11 +60,11 @@ def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFa
 
 
 def made_problem(
-    seed: int, wobble_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int, wobble_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0), model: str = "plumb_bob"
 ) -> tuple[CornerProblem, SpatialState]:
     """Looks that fit the state but for some pixels, and the motions between its poses."""
     rng = np.random.default_rng(seed)
-    state, factors = made_state(rng), made_factors(rng)
+    state, factors = made_state(rng), made_factors(rng, model)
     state = replace(state, poses=np.concatenate([np.zeros((1, 3)), state.poses[1:]]))
     seen = factors.looks.corners_px + factors.residual(state).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
     noisy = seen + 0.5 * rng.standard_normal(seen.shape)
@@ -162,13 +163,12 @@ def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance(
     """R + J S J^T for all corners of a picture together, by a plain inverse, against the low-rank elimination."""
     problem, state = made_problem(3, wobble_sigma=(0.004, 0.006, 0.003))
     normals, cost = problem.linearise(state)
-    H, g = as_dense(problem, [n.matrix for n in normals]), problem.order.summed([n.gradient for n in normals])
+    H, g = as_dense(problem, normals)
     linearised, wobble = problem.corners.linearise(state, problem.columns)
     ((own, blocks),) = linearised.blocks
     jacobian = dense(problem.columns, own, blocks)
     level, _ = replace(problem, wobble_sigma=np.zeros(3)).linearise(state)
-    expected = as_dense(problem, [*(n.matrix for n in level[:-2]), 0 * level[-2].matrix, 0 * normals[-1].matrix])
-    gradient = problem.order.summed([*(n.gradient for n in level[:-2]), 0 * level[-2].gradient, normals[-1].gradient])
+    expected, gradient = as_dense(problem, level[:-2])
     looks_cost = 0.0
     for pose in np.unique(problem.corners.looks.pose):
         of = problem.corners.looks.pose == pose
@@ -184,12 +184,60 @@ def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance(
     assert cost == pytest.approx(others + 0.5 * looks_cost)
 
 
-def as_dense(problem: CornerProblem, matrices: list[FloatArray]) -> FloatArray:
+def as_dense(problem: CornerProblem, normals: list[Normal]) -> tuple[FloatArray, FloatArray]:
+    """H (n, n) and gradient (n,) of the first kinds."""
     n = problem.columns.n
-    H = np.zeros((n + 1, n + 1))
-    for columns, matrix in zip(problem.kinds(), matrices, strict=True):
+    H, g = np.zeros((n + 1, n + 1)), np.zeros(n + 1)
+    for columns, (matrix, gradient) in zip(problem.kinds(), normals, strict=False):
         np.add.at(H, (columns[:, :, None], columns[:, None, :]), matrix)
-    return H[:n, :n]
+        np.add.at(g, columns, gradient)
+    return H[:n, :n], g[:n]
+
+
+def as_built(problem: CornerProblem, system: System) -> FloatArray:
+    """H (n, n) from the fronts."""
+    nodes, H = problem.order.nodes, np.zeros((problem.columns.n, problem.columns.n))
+    for i in range(len(nodes.parent)):
+        columns = nodes.columns[nodes.start[i] : nodes.start[i + 1]]
+        upper = np.triu(system.entries[nodes.offset[i] : nodes.offset[i + 1]].reshape(len(columns), -1))
+        H[np.ix_(columns, columns)] += upper + np.triu(upper, 1).T
+    return H
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("wobble", [0.0, 0.004])
+def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wobble: float) -> None:
+    """In the fronts and by gradients alone; with looks so far off that they count for less."""
+    problem, state = made_problem(6, wobble_sigma=(wobble, wobble, wobble), model=model)
+    state = replace(state, tags=state.tags + np.array([[0.02], [0.0], [0.0]]))
+    normals, cost = problem.linearise(state)
+    H, g = as_dense(problem, normals)
+    system, same_cost = problem.system(state)
+    scale = np.sqrt(np.diag(H))
+    np.testing.assert_allclose(
+        as_built(problem, system) / np.outer(scale, scale), H / np.outer(scale, scale), atol=1e-12
+    )
+    np.testing.assert_allclose(problem.order.diagonal_of(system), np.diag(H), rtol=1e-12)
+    only, also_same_cost = problem.system(state, is_whole=False)
+    for each in (system.gradient, only.gradient):
+        np.testing.assert_allclose(each / scale, g / scale, atol=1e-10 * np.abs(g / scale).max())
+    assert (same_cost, also_same_cost) == pytest.approx((cost, cost), rel=1e-12)
+    linearised, by_standing = problem.corners.linearise(state, problem.columns)
+    share = (problem.weighed(linearised.residual, by_standing).weight < 1.0).mean()
+    assert problem.outliers(state) == pytest.approx(share)
+    assert 0.0 < share < 1.0
+
+
+def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
+    problem, state = made_problem(6)
+    behind = replace(state, tags=-state.tags)
+    assert problem.linearise(behind)[1] == problem.system(behind)[1] == np.inf
+
+
+def assembled(order: Fronts, matrices: list[FloatArray]) -> System:
+    system = order.empty()
+    order.add(system, 0, [Normal(each, np.zeros(each.shape[:2])) for each in matrices])
+    return system
 
 
 def test_fronts_solve_as_a_dense_matrix_does() -> None:
@@ -209,11 +257,11 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
         np.add.at(H, (columns[:, :, None], columns[:, None, :]), normal)
     H = H[:n, :n]
     order = build_fronts(n, node_of, parent, kinds)
-    assert min(front.n_own for front in order.fronts) == 0
+    assert order.nodes.n_own.min() == 0
     raised = rng.uniform(0, 1, n)
     for extra in (None, raised):
         whole = H if extra is None else H + np.diag(extra)
-        factor = order.factorise(order.assembled(normals), extra)
+        factor = order.factorise(assembled(order, normals), extra)
         vector = rng.standard_normal(n)
         np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(whole, vector), rtol=1e-8)
         wanted = np.array([16, 0, -1, 7, 14])
@@ -221,6 +269,6 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
         expected = inverse[np.ix_(wanted, wanted)] * ((wanted >= 0)[:, None] & (wanted >= 0))
         np.testing.assert_allclose(factor.covariance(wanted), expected, rtol=1e-8, atol=1e-12)
     with pytest.raises(NotPositiveError):
-        order.factorise(order.assembled([-normal for normal in normals]))
+        order.factorise(assembled(order, [-normal for normal in normals]))
     assert common_ancestor([0, 1], parent) == 5
     assert common_ancestor([0, 2, 3], parent) == 7

@@ -146,7 +146,7 @@ def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
     what: str, short: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(problem: CornerProblem, start: SpatialState) -> CornerSolution:
-        return replace(solve_corners(problem, start), converged=False, reason="no step lowers the cost")
+        return replace(solve_corners(problem, start), factor=None, reason="no step lowers the cost")
 
     def unfit(problem: CornerProblem, start: SpatialState) -> CornerSolution:
         found = solve_corners(problem, start)
