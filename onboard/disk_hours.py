@@ -3,9 +3,10 @@
 from typing import Final, NamedTuple
 
 _S_PER_H: Final = 3600.0
-# Compressed, index included, as measured: recorder_load in tests/benchmarks, six tags in each picture.
-_BYTES_A_LINE: Final = 31.0
-_BYTES_A_DETECTED_PICTURE: Final = 530.0
+# Compressed, six tags in each picture, as measured from 20 to 1000 lines a second (tests/test_onboard_disk_hours.py).
+_BYTES_A_LINE: Final = 34.0
+_BYTES_A_DETECTED_PICTURE: Final = 510.0
+_BYTES_A_SECOND: Final = 2000.0  # heads and indexes of the chunks, one for each time that the disk is waited for
 
 
 class Load(NamedTuple):
@@ -25,7 +26,7 @@ class Load(NamedTuple):
     def bytes_per_s(self) -> float:
         """How fast the files of a recording will grow."""
         measurements = _BYTES_A_LINE * self.lines_hz + _BYTES_A_DETECTED_PICTURE * self.pictures_hz
-        return measurements + self.picture_bytes * self.kept_pictures_hz
+        return _BYTES_A_SECOND + measurements + self.picture_bytes * self.kept_pictures_hz
 
 
 def hours_until_full(free_bytes: int, bytes_per_s: float | None) -> float | None:

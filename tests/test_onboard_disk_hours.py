@@ -1,32 +1,79 @@
 """How long a disk lasts: what `check` foresees is what `status` will measure; and what a camera's rate is."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 
+from calib.robot import parse_robot_yaml
 from onboard import check
 from onboard.camera import Camera, CameraEndedError, CameraSettings, Frame
 from onboard.clock import RunClock
 from onboard.disk_hours import Load, hours_until_full
+from onboard.disk_room import DiskRoom, space_policy
+from onboard.encoder_protocol import WheelLine, format_line
+from onboard.log_keeper import LogKeeper
+from onboard.log_segments import SegmentLimits
+from onboard.log_thread import _PERIOD_S
 from onboard.messages import StampSource
-from onboard.recorder import RecorderCore
+from onboard.recorder import RecorderCore, Run
 from onboard.robot_files import RobotFiles
 from onboard.status import Look, Rates
+from onboard.storage import Disk
 from onboard.tag_detector import Detection
 from tests.live_recording import robot_yaml
-from tests.made_cores import CAMERA, MS, START_NS, S, made_core, send
+from tests.made_cores import CAMERA, MS, ROBOT_YAML, START_NS, S
 
 MINUTE = 60 * S
 
 
-def record(core: RecorderCore, rng: np.random.Generator, pictures_hz: int, picture_bytes: int) -> None:
-    """A minute of 100 lines a second, and of pictures with six tags."""
-    next_ns = START_NS
-    for index in range(100 * MINUTE // S):
-        now_ns = send(core, index)
-        if now_ns < next_ns:
+class SteppedLog:
+    """The live recorder's log, whose disk does its work when it is told to: not from a thread."""
+
+    def __init__(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> None:
+        robot, disk = parse_robot_yaml(ROBOT_YAML, "robot.yaml"), Disk(durable=False)
+        room = DiskRoom(disk, folder.parent, robot.robot_id, space_policy(robot))
+        limits = SegmentLimits()
+        self.keeper = LogKeeper(folder, head, start_ns, disk, room, keep_pictures=keep_pictures, limits=limits)
+        self.write, self.take_notes = self.keeper.write, self.keeper.take_notes
+
+    @property
+    def last_log_time_ns(self) -> int:
+        return self.keeper.last_log_time_ns
+
+    def close(self) -> None:
+        self.keeper.finish(self.last_log_time_ns / S)
+
+
+def recorded(
+    folder: Path, rng: np.random.Generator, lines_hz: int, pictures_hz: int, picture_bytes: int
+) -> tuple[Path, float]:
+    """A drive whose speed and clock are uneven, and pictures with six tags: the run's folder, and seconds."""
+    logs: list[SteppedLog] = []
+
+    def open_log(*arguments: Any) -> SteppedLog:
+        logs.append(SteppedLog(*arguments))
+        return logs[0]
+
+    run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, START_NS - MINUTE)
+    core = RecorderCore(folder, run, open_log=open_log)
+    seconds = min(60, 12_000 // lines_hz)
+    ticks = np.cumsum(rng.normal(1500.0 / lines_hz, 100.0 / lines_hz, (seconds * lines_hz, 2)), axis=0).astype(int)
+    late_us = rng.integers(0, 20, len(ticks))
+    next_ns = next_step_ns = START_NS
+    for index, (left, right) in enumerate(ticks.tolist()):
+        t_us = index * 1_000_000 // lines_hz + int(late_us[index])
+        now_ns = START_NS + 1000 * t_us + MS
+        core.on_serial_bytes(format_line(WheelLine(7, index, t_us, left, right, 0)), now_ns)
+        core.tick(now_ns)
+        if now_ns >= next_step_ns:
+            next_step_ns += round(_PERIOD_S * S)
+            logs[0].keeper.step(now_ns / S)
+        if not pictures_hz or now_ns < next_ns:
             continue
         next_ns += S // pictures_hz
         tags = [Detection("tag36h11", k, 0, rng.uniform(30.0, 90.0), rng.uniform(0.0, 120.0, (4, 2))) for k in range(6)]
@@ -34,18 +81,23 @@ def record(core: RecorderCore, rng: np.random.Generator, pictures_hz: int, pictu
             core.on_picture(rng.bytes(picture_bytes), now_ns, now_ns)
         size_px = CAMERA.width_px, CAMERA.height_px
         core.on_detections(tags, size_px, now_ns, now_ns + MS, StampSource.STAMP_SOURCE_SIMULATION, index)
+    core.close(START_NS + seconds * S)
+    return core.folder, float(seconds)
 
 
-@pytest.mark.parametrize(("pictures_hz", "picture_bytes"), [(15, 0), (15, 3_000), (15, 20_000), (2, 20_000)])
-def test_check_foresees_what_status_measures(tmp_path: Path, pictures_hz: int, picture_bytes: int) -> None:
-    core = made_core(tmp_path)
+@pytest.mark.parametrize(
+    ("lines_hz", "pictures_hz", "picture_bytes"),
+    [(20, 0, 0), (100, 0, 0), (1000, 0, 0), (100, 15, 0), (100, 15, 3_000), (100, 15, 20_000), (100, 2, 20_000)],
+)
+def test_check_foresees_what_status_measures(
+    tmp_path: Path, lines_hz: int, pictures_hz: int, picture_bytes: int
+) -> None:
     rates = Rates()
     rates.add(Look(START_NS, {}, {}, 0))
-    record(core, np.random.default_rng(0), pictures_hz, picture_bytes)
-    core.close(START_NS + MINUTE)
-    written = sum(each.stat().st_size for each in core.folder.iterdir())
-    rates.add(Look(START_NS + MINUTE, {}, {}, written))
-    foreseen = hours_until_full(10**12, Load(100.0, pictures_hz, 5.0, picture_bytes).bytes_per_s)
+    folder, seconds = recorded(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
+    written = sum(each.stat().st_size for each in folder.iterdir())
+    rates.add(Look(START_NS + round(seconds * S), {}, {}, written))
+    foreseen = hours_until_full(10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes).bytes_per_s)
     measured = hours_until_full(10**12, rates.bytes_per_s())
     assert foreseen is not None
     assert measured is not None
@@ -86,7 +138,7 @@ def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_pat
     assert Load(50.0, 2.0, 5.0, 3_000).kept_pictures_hz == 2.0
     assert check._load_of(files, check._Found()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)
     port_only = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port}"))
-    assert check._load_of(port_only, check._Found()).bytes_per_s == pytest.approx(3_100.0)
+    assert check._load_of(port_only, check._Found()).bytes_per_s == pytest.approx(5_400.0)
 
 
 class Scripted(Camera):
