@@ -14,10 +14,10 @@ from rosbags.typesys.store import Typestore
 
 from calib.errors import GroundsbotError
 from offline.bag_definitions import DEFINITIONS
+from offline.bag_limits import METADATA, MOST_DEFINITION_CHARS, BagLimits
 from offline.errors import OfflineError
 
 _BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
-_METADATA: Final = "metadata.yaml"
 _IDL_RULE: Final = "=" * 80 + "\n"  # between the files of a definition in IDL
 
 
@@ -46,7 +46,7 @@ class BagMessage(NamedTuple):
 def is_bag(path: Path) -> bool:
     """Whether this looks like a bag: a file by its name, a folder by what lies in it."""
     if path.is_dir():
-        return (path / _METADATA).exists() or any(each.suffix in _BAG_SUFFIXES for each in path.iterdir())
+        return (path / METADATA).exists() or any(each.suffix in _BAG_SUFFIXES for each in path.iterdir())
     return path.suffix in _BAG_SUFFIXES
 
 
@@ -58,9 +58,10 @@ class Bag:
         topics: those that hold messages, by name.
     """
 
-    def __init__(self, path: Path, reader: Reader1 | Reader2) -> None:
+    def __init__(self, path: Path, reader: Reader1 | Reader2, limits: BagLimits) -> None:
         """Takes an open reader."""
         self.path = path
+        self._limits = limits
         self._reader = reader
         self._is_ros1 = isinstance(reader, Reader1)
         self._stores: dict[str, Typestore] = {}
@@ -82,7 +83,8 @@ class Bag:
         with _told(self.path):
             stores = {each.msgtype: self._store(each) for each in connections}
             # The two readers take the same arguments; their common type does not.
-            for connection, received_ns, data in self._reader.messages(connections=connections):
+            messages = self._reader.messages(connections=connections)
+            for connection, received_ns, data in self._limits.counted(messages):
                 store = stores[connection.msgtype]
                 deserialise = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
                 content = deserialise(data, connection.msgtype)
@@ -95,6 +97,11 @@ class Bag:
             carries_definition = connection.msgdef.format != MessageDefinitionFormat.NONE
             store = get_typestore(Stores.EMPTY if carries_definition else Stores.LATEST)
             if carries_definition:
+                if len(connection.msgdef.data) > MOST_DEFINITION_CHARS:
+                    raise OfflineError(
+                        f"{self.path}: the definition of {msgtype} has {len(connection.msgdef.data)} characters, limit "
+                        f"{MOST_DEFINITION_CHARS}; is the bag damaged? record it again"
+                    )
                 store.register(_types_of(connection.msgdef, msgtype))
             elif msgtype not in store.fielddefs:
                 for name in DEFINITIONS.get(msgtype.partition("/")[0], {}):
@@ -118,14 +125,16 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     if not path.exists():
         raise OfflineError(f"{path}: does not exist; give a .bag file, a folder of ROS 2, or an .mcap or .db3 file")
-    if path.is_dir() and not (path / _METADATA).exists():
-        raise OfflineError(f"{path}: has no {_METADATA}, so its recording was cut short; run `ros2 bag reindex` on it")
+    if path.is_dir() and not (path / METADATA).exists():
+        raise OfflineError(f"{path}: has no {METADATA}, so its recording was cut short; run `ros2 bag reindex` on it")
     with _told(path):
-        reader = Reader1(path) if path.suffix == ".bag" and path.is_file() else Reader2(path)
-        reader.open()
+        limits = BagLimits(path)
+        with limits.memory():
+            reader = Reader1(path) if path.suffix == ".bag" and path.is_file() else Reader2(path)
+            reader.open()
     try:
         with _told(path):
-            bag = Bag(path, reader)
+            bag = Bag(path, reader, limits)
         with _content_told(path):
             yield bag
     finally:

@@ -160,8 +160,10 @@ def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
 
 
 def _check_header(path: Path, line: int, header: list[str]) -> None:
+    seen: set[str] = set()
     for name in header:
         if not name:
             raise OfflineError(f"{path} line {line}: a column has no name; name it, or leave it out")
-        if header.count(name) > 1:
+        if name in seen:
             raise OfflineError(f"{path} line {line}: column {name!r} is there twice; leave one out")
+        seen.add(name)

@@ -17,11 +17,12 @@ from calib.picture_bytes import claimed_size
 from calib.robot import parse_robot_yaml
 from offline.errors import OfflineError
 from offline.new_log import new_log
+from offline.picture_limits import most_work_pixels, plausible_pixels, work_pixels
 from offline.stages import Progress
 from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings, Picture
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
-from onboard.log_reader import read_head, read_log
+from onboard.log_reader import files_of, read_head, read_log
 from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
 from onboard.log_writer import LogWriter
 from onboard.measurements import detections_message
@@ -39,8 +40,6 @@ from onboard.messages import (
 )
 
 _DETECTIONS: Final = "/tags/detections"
-# A camera's JPEG spends at least 6 bits on 64 pixels; a bomb takes minutes.
-_PIXELS_PER_BYTE: Final = 128
 _QUEUED: Final = 4  # pictures in memory for each process
 
 
@@ -130,16 +129,28 @@ class _OldDetections:
 
     @classmethod
     def read(cls, log: Path) -> "_OldDetections":
+        """Reads all but what the pictures show.
+
+        Raises:
+            OfflineError: they are more than a log of this size can hold.
+        """
         old = cls()
+        n_left = most = most_work_pixels(sum(file.stat().st_size for file in files_of(log)))
         for each in read_log(log, ("/wheels", _DETECTIONS, PICTURE_TOPIC), LogLosses()):
             if isinstance(each.message, WheelEncoders):
                 old.wheels.append((each.message.stamp_ns, each.message.sequence))
             elif isinstance(each.message, TagDetections):
                 del each.message.detections[:]
                 old.by_stamp_ns[each.message.stamp_ns] = each.message
-            else:
+            elif isinstance(each.message, CompressedImage):
                 old.n_pictures += 1
                 old.pictures_ns.add(each.publish_time_ns)
+                n_left -= work_pixels(each.message.data)
+                if n_left < 0:
+                    raise OfflineError(
+                        f"{log}: its pictures have more than {most} pixels, the limit for a log of its size; are they "
+                        "a camera's?"
+                    )
         old.wheels.sort()
         return old
 
@@ -201,7 +212,7 @@ def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[De
         def detect(picture: Picture) -> DetectionResult:
             if isinstance(picture, bytes):
                 width_px, height_px = claimed_size(picture)
-                if width_px * height_px > _PIXELS_PER_BYTE * len(picture):
+                if plausible_pixels(picture) is None:
                     return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
             detector = idle.get()
             try:

@@ -17,6 +17,7 @@ from calib.arrays import FloatArray
 from calib.errors import CalibError
 from calib.files import written_whole
 from calib.noise import NoiseParameters
+from offline.array_file import open_arrays
 from offline.errors import OfflineError
 from offline.kept import KeptChain, arrays_of, calibration_from, chain_from
 from offline.map_json import (
@@ -95,9 +96,11 @@ def read_map(folder: Path) -> MapResult:
             f"{path}: format_version is {version!r}, this program reads {FORMAT_VERSION}; make the map again"
         )
     try:
-        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+        with open_arrays(folder / ARRAYS_FILE) as arrays:
             if not data["components"]:
                 raise ValueError("no components")
+            if len({each["run"] for each in data["runs"]}) < len(data["runs"]):
+                raise ValueError("a run is there twice")
             components = tuple(_component(data, index, arrays, folder) for index in range(len(data["components"])))
             kept = _kept(arrays)
         return MapResult(
@@ -153,7 +156,7 @@ def _read_json(path: Path) -> dict[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise OfflineError(f"{path}: cannot be read ({error.strerror}); give the folder that `map -o` wrote") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise OfflineError(f"{path}: is not JSON ({error}); make the map again") from error
     if not isinstance(data, dict):
         raise OfflineError(f"{path}: holds no object; make the map again")

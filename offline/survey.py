@@ -5,7 +5,7 @@ shift of its own (Baarda, "A testing procedure for use in geodetic networks", 19
 say of it against what it says itself. The worst goes first, and the rest is judged anew.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -83,7 +83,10 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
     """
     components, found = [], set()
     for component in result.components:
-        matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry)]
+        named: dict[tuple[int, str], list[int]] = {}
+        for i, tag in enumerate(component.tags):
+            named.setdefault((tag.tag_id, tag.instance), []).append(i)
+        matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry, named)]
         found |= {k for _, k in matched}
         _check_different(component, [i for i, _ in matched])
         if len(matched) >= 3:
@@ -99,13 +102,10 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
     return SurveyErrors(tuple(components), tuple(notes))
 
 
-def _tags_of(component: Component, entry: SurveyEntry) -> list[int]:
-    """The component's tag that an entry means; none where that is not clear."""
-    fits = [
-        i
-        for i, tag in enumerate(component.tags)
-        if tag.tag_id == entry.tag_id and tag.instance == entry.instance and entry.family in ("", tag.family)
-    ]
+def _tags_of(component: Component, entry: SurveyEntry, named: Mapping[tuple[int, str], Sequence[int]]) -> list[int]:
+    """The component's tag that an entry means, `named` by number and instance; none where that is not clear."""
+    same = named.get((entry.tag_id, entry.instance), ())
+    fits = [i for i in same if entry.family in ("", component.tags[i].family)]
     return fits if len(fits) == 1 else []
 
 

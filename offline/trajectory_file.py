@@ -1,6 +1,6 @@
 """Trajectories as TUM text, which evo and others read: `t_s x y z qx qy qz qw` a line."""
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
@@ -44,7 +44,7 @@ def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
             stamp, x, y, _, _, _, qz, qw = line.split()
             stamps_ns.append(np.int64(int(Decimal(stamp) * _NS_PER_S)))
             poses.append([float(x), float(y), 2.0 * np.arctan2(float(qz), float(qw))])
-        except (ValueError, OverflowError, InvalidOperation) as error:
+        except (ValueError, ArithmeticError) as error:
             raise OfflineError(f"{path} line {number}: {line[:80]!r} is no pose; make the map again") from error
     if not poses:
         raise OfflineError(f"{path}: holds no pose; make the map again")

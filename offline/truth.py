@@ -1,6 +1,7 @@
 """Ground truth of simulated drives: truth.json, on the logs' clock, in the world frame."""
 
 import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -58,11 +59,12 @@ def read_truth(path: Path) -> Truth:
         raise OfflineError(
             f"{path}: cannot be read ({error.strerror}); give the truth.json of the simulation"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise OfflineError(f"{path}: is not JSON ({error}); give the truth.json of the simulation") from error
     try:
         runs = {name: _true_run(path, name, entry) for name, entry in data["runs"].items()}
         names = [(tag["family"], int(tag["tag_id"]), tag.get("instance") or "") for tag in data["tags"]]
+        twice = frozenset(name for name, n in Counter(names).items() if n > 1)
         places = [np.array(tag["position_m"][:2], dtype=np.float64) for tag in data["tags"]]
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise OfflineError(
@@ -74,7 +76,6 @@ def read_truth(path: Path) -> Truth:
             raise OfflineError(
                 f"{path}: position_m of tag {tag_id} is {place.tolist()}, must be two finite numbers; correct it"
             )
-    twice = frozenset(name for name in names if names.count(name) > 1)
     return Truth(runs, dict(zip(names, places, strict=True)), twice)
 
 

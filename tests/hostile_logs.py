@@ -11,6 +11,7 @@ from google.protobuf.message import Message
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from onboard.messages import (
     TOPICS,
@@ -57,8 +58,8 @@ def message(topic: str, content: Message | bytes, at_ns: int = START_NS) -> byte
     return head + data
 
 
-def run(robot_yaml: str = ROBOT_YAML) -> bytes:
-    return declared() + message("/run", RunInfo(run_id="r", robot_id="gb1", robot_yaml=robot_yaml))
+def run(robot_yaml: str = ROBOT_YAML, run_id: str = "r") -> bytes:
+    return declared() + message("/run", RunInfo(run_id=run_id, robot_id="gb1", robot_yaml=robot_yaml))
 
 
 def chunk(records: bytes, compressed: bool = True, claimed: int | None = None) -> bytes:
@@ -74,13 +75,13 @@ def log(*chunks: bytes) -> bytes:
 Content = tuple[str, Message | bytes, int]
 
 
-def of_messages(*contents: Content, robot_yaml: str = ROBOT_YAML, size_bytes: int = 0) -> bytes:
+def of_messages(*contents: Content, robot_yaml: str = ROBOT_YAML, size_bytes: int = 0, run_id: str = "r") -> bytes:
     """A log of these messages, padded to a little more than `size_bytes`, and as far as readers want it to be."""
-    first, rest = run(), b"".join(message(*each) for each in contents)
+    first, rest = run(run_id=run_id), b"".join(message(*each) for each in contents)
     hidden = chunk(first + rest)
     padding = random_bytes(max(len(first + rest) // 23, size_bytes) - len(hidden))
     private = struct.pack("<BQ", 0x80, len(padding)) + padding  # readers pass over it
-    return log(chunk(run(robot_yaml)), chunk(private, compressed=False), hidden)
+    return log(chunk(run(robot_yaml, run_id)), chunk(private, compressed=False), hidden)
 
 
 def random_bytes(count: int) -> bytes:
@@ -92,13 +93,12 @@ def wheels(count: int, make: Callable[[int], WheelEncoders]) -> bytes:
 
 
 def full(make: Callable[[int], bytes], start: int = 10_000) -> bytes:
-    """As large as the limit lets it be."""
-    count, data = start, b""
-    while True:
-        larger = make(count)
-        if len(larger) > LIMIT_BYTES or count > 1 << 22:
-            return data or larger[:LIMIT_BYTES]
-        data, count = larger, count * 5 // 4
+    """As large as the limit lets it be, but for some percent."""
+    count, data = start, make(start)
+    while not 0.95 * LIMIT_BYTES < len(data) <= LIMIT_BYTES and count < 1 << 22:
+        count = int(0.98 * count * LIMIT_BYTES / len(data))
+        data = make(count)
+    return data
 
 
 def reading(index: int, period_ns: int, boot_id: int = 1) -> WheelEncoders:
@@ -179,7 +179,12 @@ def tags_seen(count: int, per_message: int) -> bytes:
 
 
 def observed(
-    count: int, n_tags: int | None = None, per_message: int = 2, step_m: float = 0.05, agree: bool = False
+    count: int,
+    n_tags: int | None = None,
+    per_message: int = 2,
+    step_m: float = 0.05,
+    agree: bool = False,
+    run_id: str = "r",
 ) -> bytes:
     """A straight drive past tags that all seem to lie a metre ahead; after `n_tags` the first ones come again.
 
@@ -189,6 +194,7 @@ def observed(
         per_message: tags a look.
         step_m: from look to look.
         agree: all tags lie at the start instead, so that readings of one fit together.
+        run_id: of the run.
     """
     contents: list[Content] = []
     for index in range(count):
@@ -201,7 +207,7 @@ def observed(
         contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
         seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
         contents.append(("/tags/observations", seen, at_ns))
-    return of_messages(*contents)
+    return of_messages(*contents, run_id=run_id)
 
 
 def resets(stretches: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
@@ -223,6 +229,24 @@ def resets(stretches: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> 
     return of_messages(*contents, size_bytes=size_bytes)
 
 
+def readings_in_one_picture(count: int) -> bytes:
+    """One look at a single tag, so many times in one message."""
+    contents: list[Content] = []
+    for index in range(4):
+        at_ns = START_NS + index * 100 * MS
+        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
+        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
+    place = TagObservation.Cartesian(x_m=1.0, y_m=0.1)
+    tags = [TagObservation(family="tag36h11", tag_id=1, cartesian=place)] * count
+    seen = TagObservations(stamp_ns=START_NS + 100 * MS, frame="base", observations=tags)
+    return of_messages(*contents, ("/tags/observations", seen, START_NS + 100 * MS))
+
+
+def honest() -> bytes:
+    """No hostile one: a drive past five tags that stay where they are."""
+    return observed(40, 5, step_m=0.041, agree=True, run_id="honest")
+
+
 def driven(count: int) -> bytes:
     """Nothing but keyframes."""
     contents: list[Content] = []
@@ -233,11 +257,11 @@ def driven(count: int) -> bytes:
     return of_messages(*contents)
 
 
-def pictures(encoded: Iterable[bytes]) -> bytes:
+def pictures(encoded: Iterable[bytes], size_bytes: int = 0) -> bytes:
     contents: list[Content] = [("/wheels", WheelEncoders(stamp_ns=START_NS), START_NS)]
     for number, data in enumerate(encoded):
         contents.append(("/camera/image", CompressedImage(data=data, format="jpeg"), START_NS + number))
-    return of_messages(*contents)
+    return of_messages(*contents, size_bytes=size_bytes)
 
 
 def huge_jpeg() -> bytes:
@@ -245,6 +269,38 @@ def huge_jpeg() -> bytes:
     at = data.index(b"\xff\xc0") + 5
     data[at : at + 4] = b"\xff\xff\xff\xff"
     return bytes(data)
+
+
+def jpeg(picture: NDArray[np.uint8], n_bytes: int = 0) -> bytes:
+    """A picture, stretched to a length by what no decoder looks at, but zstd packs well."""
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 20])[1].tobytes()
+    return data[:-2] + bytes(max(0, n_bytes - len(data))) + data[-2:]
+
+
+def squares(side: int, width: int = 8) -> NDArray[np.uint8]:
+    """Nothing but squares, black or white at random; of the width of a JPEG's blocks, which take few bytes then."""
+    few = np.random.default_rng(0).integers(0, 2, (side // width, side // width), dtype=np.uint8)
+    return np.kron(255 * few, np.ones((width, width), np.uint8))
+
+
+def noisy_png() -> bytes:
+    """A piece of noise over and over: detectors find edges everywhere."""
+    tiles = np.tile(squares(50, 1), (40, 40))
+    return cv2.imencode(".png", tiles, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+
+
+def twins(count: int, copies: int) -> bytes:
+    """Each look reads one tag at so many places at once."""
+    contents: list[Content] = []
+    for index in range(count):
+        at_ns = START_NS + index * 100 * MS
+        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
+        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
+        places = [TagObservation.Cartesian(x_m=1.0, y_m=k - 0.5 * copies) for k in range(copies)]
+        tags = [TagObservation(family="tag36h11", tag_id=1, cartesian=place) for place in places]
+        seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
+        contents.append(("/tags/observations", seen, at_ns))
+    return of_messages(*contents)
 
 
 def png(side: int) -> bytes:
@@ -287,8 +343,20 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "a reset each look": lambda: resets(25, 400, size_bytes=1_010_000),
     "resets": lambda: resets(25, 10, 80, size_bytes=1_010_000),
     "resets, much seen": lambda: resets(25, 10, 530, size_bytes=1_010_000),
+    "two stretches past 400 tags": lambda: resets(2, 400),
+    "three stretches past 400 tags": lambda: resets(3, 400),
+    "twelve stretches past 400 tags": lambda: resets(12, 400),
+    "stretches past 100 tags": lambda: resets(13, 100, size_bytes=1_010_000),
+    "one tag, much read in one picture": lambda: readings_in_one_picture(150_000),
     "keyframes": lambda: full(driven),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),
+    "one tag in twenty places": lambda: twins(100, 20),
+    "one tag in five places": lambda: full(lambda n: twins(n, 5)),
+    "pictures of 8 x 8": lambda: full(lambda n: pictures([jpeg(squares(8))] * n)),
+    "pictures of squares": lambda: full(lambda n: pictures([jpeg(squares(1000))] * n), 300),
+    "as many squares as may be": lambda: pictures([jpeg(squares(1000))] * 145, size_bytes=1_010_000),
+    "as much noise as may be": lambda: pictures([jpeg(squares(1000, 1))] * 25, size_bytes=1_010_000),
+    "PNGs of noise as may be": lambda: pictures([noisy_png()] * 4, size_bytes=1_010_000),
     "PNG of 12000 x 12000": lambda: pictures([png(12000)]),
 }

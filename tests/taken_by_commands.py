@@ -3,8 +3,9 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 
 class Taken(NamedTuple):
@@ -16,61 +17,119 @@ class Taken(NamedTuple):
     said: str
 
 
-# Measures in one process what each file takes; the peak is reset in between. Children count too.
+class Form(NamedTuple):
+    """How a command is called: FILE is the hostile one, OUT a new name, any other word in capitals a file beside it."""
+
+    modules: str  # those that it is made of; what they take counts as idle
+    words: str
+
+
+_MAP: Final = "offline.map_command"
+LOG_FORMS: Final = {
+    "info": Form("offline.info", "info FILE"),
+    "salvage": Form("offline.salvage", "salvage FILE -o OUT.mcap"),
+    "detect": Form("offline.detect,onboard.picture", "detect FILE -o OUT"),
+    "map": Form(_MAP, "map FILE -o OUT"),
+    "corners": Form(_MAP, "map --model corners FILE -o OUT"),
+    "extend": Form(_MAP, "map --extend MAP/map.json FILE -o OUT"),
+    "calibrate": Form("offline.calibrate_command", "calibrate FILE -o OUT.yaml"),
+    "localize": Form("offline.localize_command", "localize FILE --map MAP -o OUT"),
+}
+"""All commands that take logs."""
+
+MAP_FORMS: Final = {
+    "compare": Form("offline.evaluation,offline.map_io,offline.survey", "compare FILE --truth TRUTH"),
+    "survey": Form("offline.evaluation,offline.map_io,offline.survey", "compare FILE --survey SURVEY"),
+    "g2o": Form("offline.map_io,offline.export", "export FILE --format g2o -o OUT"),
+    "tum": Form("offline.map_io,offline.export", "export FILE --format tum -o OUT"),
+    "extend": Form(_MAP, "map --extend FILE/map.json LOG -o OUT"),
+    "localize": Form("offline.localize_command", "localize LOG --map FILE -o OUT"),
+}
+"""All that take a map's folder."""
+
+OTHER_FORMS: Final = {
+    "import": Form("offline.importers,offline.bag_import", "import FILE -o OUT --track-width-m 0.5"),
+    "truth": Form("offline.evaluation,offline.map_io,offline.survey", "compare MAP --truth FILE"),
+    "survey": Form("offline.evaluation,offline.map_io,offline.survey", "compare MAP --survey FILE"),
+    "robot": Form(_MAP, "map LOG --robot FILE -o OUT"),
+    "noise": Form(_MAP, "map LOG --noise FILE -o OUT"),
+}
+"""Those that take other files of somebody's."""
+
+
+# Measures each file in a child of its own, which begins with all modules there. Its children count too.
 _MEASURE = """
-import contextlib, importlib, io, json, re, resource, shutil, sys, tempfile
+import contextlib, importlib, io, json, os, re, resource, shutil, sys, tempfile
 from pathlib import Path
 from offline import cli
 for name in sys.argv[1].split(","):
     importlib.import_module(name)
 
-def status(name, pid="self"):
-    return int(re.search(name + r":\\s+(\\d+)", Path(f"/proc/{pid}/status").read_text())[1]) * 1024
+def status(name):
+    return int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024
 
-def cpu_seconds():
-    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-
-for line in sys.stdin:
-    command, path = json.loads(line)
-    place = Path(tempfile.mkdtemp())
-    output = {"info": [], "salvage": ["-o", place / "new.mcap"]}.get(command, ["-o", place / "new"])
-    sys.argv = ["groundsbot-offline", command, path, *map(str, output)]
-    Path("/proc/self/clear_refs").write_text("5")
-    idle = status("VmRSS")
-    out, start = io.StringIO(), cpu_seconds()
+def run(words, write):
+    resource.setrlimit(resource.RLIMIT_CPU, (90, 90))  # so that who measures is not taken down by what is measured
+    resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is that of the command alone
+    idle, out, code = status("VmRSS"), io.StringIO(), 0
+    sys.argv = words
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         try:
             cli.main()
         except SystemExit as ended:
-            code = ended.code
+            code = ended.code or 0
         except BaseException as error:
             code = 99
             print("TRACEBACK", type(error).__name__, error)
-    taken = cpu_seconds() - start, status("VmHWM") - idle
+    os.write(write, json.dumps([code, status("VmHWM") - idle, out.getvalue()[-300:]]).encode())
+
+for line in sys.stdin:
+    place = Path(tempfile.mkdtemp())
+    words = ["groundsbot-offline", *(word.replace("OUT", str(place / "new")) for word in json.loads(line))]
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        run(words, write)
+        os._exit(0)
+    os.close(write)
+    _, _, used = os.wait4(child, 0)
+    code, extra_bytes, said = json.loads(os.read(read, 1 << 16) or b'[99, 0, "killed"]')
+    os.close(read)
     shutil.rmtree(place)
-    print(json.dumps([code or 0, *taken, out.getvalue()[-300:]]), flush=True)
+    print(json.dumps([code, used.ru_utime + used.ru_stime, extra_bytes, said]), flush=True)
 """
 
 
-_MODULES = {
-    "info": "offline.info",
-    "salvage": "offline.salvage",
-    "detect": "offline.detect,onboard.picture",
-    "map": "offline.map_command",
-}
+def measure(form: Form, files: Mapping[str, Path], beside: Mapping[str, Path] | None = None) -> dict[str, Taken]:
+    """What a command takes of each file; `beside`: the other files that its words name."""
+    return dict(measured(form, files, beside))
 
 
-def measure(command: str, files: dict[str, Path]) -> dict[str, Taken]:
-    """What `groundsbot-offline COMMAND` takes of each file."""
-    asked = "".join(json.dumps([command, str(path)]) + "\n" for path in files.values())
-    ended = subprocess.run(
-        [sys.executable, "-c", _MEASURE, _MODULES[command]],
-        input=asked,
-        capture_output=True,
+def measured(
+    form: Form, files: Mapping[str, Path], beside: Mapping[str, Path] | None = None
+) -> Iterator[tuple[str, Taken]]:
+    """As `measure`, each as it ends."""
+    with subprocess.Popen(
+        [sys.executable, "-c", _MEASURE, form.modules],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
         text=True,
-        check=False,
         cwd=Path(__file__).parents[1],
-    )
-    lines = ended.stdout.splitlines()
-    assert len(lines) == len(files), ended.stderr
-    return {name: Taken(*json.loads(line)) for name, line in zip(files, lines, strict=True)}
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for name, path in files.items():
+            process.stdin.write(json.dumps(_words(form, {"FILE": path, **(beside or {})})) + "\n")
+            process.stdin.flush()
+            yield name, Taken(*json.loads(process.stdout.readline()))
+        process.stdin.close()
+
+
+def _words(form: Form, files: Mapping[str, Path]) -> list[str]:
+    """The command line, each file's name filled in where a word is or begins with its place."""
+    words = []
+    for word in form.words.split():
+        place, slash, rest = word.partition("/")
+        words.append(f"{files[place]}{slash}{rest}" if place in files else word)
+    return words

@@ -1,0 +1,124 @@
+"""What reading somebody's bag may take: small files can be made that unfold to gigabytes, or never end.
+
+The library that reads bags unfolds whole chunks, and asks SQLite whatever a file defines. What it may take grows with
+the bag's size, far beyond what drives need: their noise cannot be packed.
+"""
+
+import resource
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Final, TypeVar
+
+from offline.errors import OfflineError
+
+_FREE_BYTES: Final = 112 << 20
+_BYTES_PER_BYTE: Final = 128  # odometry that hardly changes is packed into 60 bytes a message, and takes 3 kB here
+_FREE_MESSAGES: Final = 100_000
+_BYTES_A_MESSAGE: Final = 8
+_MOST_METADATA_BYTES: Final = 1 << 18  # some 1,000 a topic; a megabyte of YAML takes half a minute
+_STATUS: Final = Path("/proc/self/status")
+_SQLITE: Final = ".db3"
+METADATA: Final = "metadata.yaml"
+MOST_DEFINITION_CHARS: Final = 1 << 16  # those of ROS have 10,000 with all that they are made of
+
+
+_Message = TypeVar("_Message")
+
+
+class BagLimits:
+    """What one bag may take."""
+
+    def __init__(self, path: Path) -> None:
+        """Looks at its size, and whether its tables are tables.
+
+        Raises:
+            OfflineError: its metadata is far too long, or its SQLite files hold what no recorder puts there.
+        """
+        files = [path] if path.is_file() else [each for each in path.iterdir() if each.is_file()]
+        size = sum(each.stat().st_size for each in files)
+        self._path = path
+        self._bytes = _FREE_BYTES + _BYTES_PER_BYTE * size
+        taken = _data_bytes()
+        self._most_bytes = taken + self._bytes if taken else resource.RLIM_INFINITY
+        self._messages_left = _FREE_MESSAGES + size / _BYTES_A_MESSAGE
+        for each in files:
+            if each.suffix == _SQLITE:
+                _check_sqlite(each)
+            elif each.name == METADATA and each.stat().st_size > _MOST_METADATA_BYTES:
+                raise OfflineError(
+                    f"{each}: has {each.stat().st_size} bytes, limit {_MOST_METADATA_BYTES}; run `ros2 bag reindex`"
+                )
+
+    @contextmanager
+    def memory(self) -> Iterator[None]:
+        """While the block runs, this process may not grow beyond what it took at first and what the bag is worth.
+
+        Raises:
+            OfflineError: it would.
+        """
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        if self._most_bytes != resource.RLIM_INFINITY:
+            most = self._most_bytes if soft == resource.RLIM_INFINITY else min(soft, self._most_bytes)
+            resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+        try:
+            yield
+        except MemoryError as error:
+            raise OfflineError(
+                f"{self._path}: unfolds to more than {self._bytes >> 20} MiB, the limit for a bag of its size; is it "
+                "damaged? record it again"
+            ) from error
+        finally:
+            resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+    def counted(self, messages: Iterable[_Message]) -> Iterator[_Message]:
+        """The same messages.
+
+        Raises:
+            OfflineError: more than a bag of its size can tell of.
+        """
+        iterator = iter(messages)
+        while True:
+            with self.memory():
+                each = next(iterator, None)
+            if each is None:
+                return
+            self._messages_left -= 1
+            if self._messages_left < 0:
+                raise OfflineError(
+                    f"{self._path}: holds more messages than a bag of its size can tell of; is it damaged? record it "
+                    "again"
+                )
+            yield each
+
+
+def _data_bytes() -> int:
+    """What this process takes as the limit counts it; 0 where the system does not tell."""
+    try:
+        lines = _STATUS.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:")), 0)
+
+
+def _check_sqlite(path: Path) -> None:
+    """Refuses a file whose tables are made up by queries or whose pages are shared: either may go on for ever.
+
+    Raises:
+        OfflineError: it is such a file, or none of SQLite.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)) as database:
+            made_up = database.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
+            tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            for name in tables if made_up is None else []:
+                columns = database.execute("SELECT name, hidden FROM pragma_table_xinfo(?)", (name,))
+                made_up = made_up or next((column for column in columns if column[1]), None)
+            (found,) = ("ok",) if made_up else database.execute("PRAGMA quick_check(1)").fetchone()
+    except sqlite3.Error as error:
+        raise OfflineError(f"{path}: cannot be read as a bag: {error}; run `ros2 bag reindex`") from error
+    if made_up is not None:
+        raise OfflineError(f"{path}: its {made_up[0]} is made up by a query, which no recorder does; record it again")
+    if found != "ok":
+        raise OfflineError(f"{path}: is damaged ({' '.join(str(found).split())[:200]}); run `ros2 bag reindex`")
