@@ -57,6 +57,13 @@ def map_command(
             help="What the map is solved on last: tags' corners in pixels, or their places on the floor only."
         ),
     ] = MapModel.FLOOR,
+    upright_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="All tags hang upright, faces vertical and edges level, to this sigma in degrees; only with --model "
+            "corners.",
+        ),
+    ] = None,
     calibrate: Annotated[
         str,
         typer.Option(
@@ -88,6 +95,7 @@ def map_command(
         distance or (),
         keep_suspects,
         corners=model is MapModel.CORNERS,
+        upright_deg=upright_deg,
         extend=extend,
         calibrate=calibrate,
     )

@@ -40,7 +40,8 @@ class SolvedComponent(NamedTuple):
         graph: its chains are the members' in order.
         solution: of the graph, on places of tags.
         suspects: tags that do not belong.
-        refined: on corners; None where it is not, and `refused` then says why, where anybody asked.
+        refined: on corners; None where it is not.
+        told: why it is not, where anybody asked; or which tags do not hang as was said.
     """
 
     members: Group
@@ -48,7 +49,7 @@ class SolvedComponent(NamedTuple):
     solution: Solution
     suspects: list[SuspectTag]
     refined: Refined | None = None
-    refused: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
 
 def solved_component(
@@ -59,6 +60,7 @@ def solved_component(
     *,
     keep_suspects: bool,
     corners: bool,
+    upright_sigma_rad: float | None = None,
 ) -> SolvedComponent:
     """Solves the members of a group together, tags that do not belong apart unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
@@ -72,8 +74,8 @@ def solved_component(
     if not corners or not has_corners(graph):
         return solved
     with stages.stage("refining on tag corners"):
-        refined, refused = refine(graph, solution)
-    return solved._replace(refined=refined, refused=tuple(refused))
+        refined, told = refine(graph, solution, upright_sigma_rad)
+    return solved._replace(refined=refined, told=tuple(told))
 
 
 @dataclass
@@ -94,9 +96,9 @@ class Found:
     ) -> Solved:
         """Takes what one more component says."""
         index = len(self.components)
-        members, graph, solution, suspects, refined, refused = solved
+        members, graph, solution, suspects, refined, told = solved
         self.suspects += suspects
-        self.warnings += [f"component {index}: {sentence}" for sentence in refused]
+        self.warnings += [f"component {index}: {sentence}" for sentence in told]
         with stages.stage("covariances"):
             self.components.append(component_of(graph, solution, refined))
             last = refined.solution if refined else solution

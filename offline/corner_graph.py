@@ -15,6 +15,7 @@ from offline.corner_problem import CornerProblem, columns_of
 from offline.corner_start import tags_hung
 from offline.factors import CalibrationPrior, ReadingFactors, State
 from offline.graph import Graph, Parameter, camera_parameters_of, mount_parameters_of, scale_parameter_of
+from offline.upright import NOTHING_UPRIGHT, UprightFactors
 
 _CORNER_NOISE: Final = "sigma_corner_px"
 
@@ -49,7 +50,7 @@ def has_corners(graph: Graph) -> bool:
 
 
 def corner_graph(
-    graph: Graph, state: State, wobble_sigma: FloatArray | None = None
+    graph: Graph, state: State, wobble_sigma: FloatArray | None = None, upright_sigma_rad: float | None = None
 ) -> tuple[CornerGraph, SpatialState]:
     """The problem, and its start: the floor's solution with every tag hung where its looks put it.
 
@@ -57,6 +58,7 @@ def corner_graph(
         graph: of the floor; a reading of it stands for each look.
         state: its solution.
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
+        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
     """
     chains = graph.chains
     seeing = [chain for chain in chains if _from_corners(chain).any()]
@@ -77,6 +79,9 @@ def corner_graph(
         columns=columns_of(len(state.poses), seen, sigmas),
         anchor=floor.anchor,
         wobble_sigma=np.zeros(3) if wobble_sigma is None else wobble_sigma,
+        upright=NOTHING_UPRIGHT
+        if upright_sigma_rad is None
+        else UprightFactors(np.flatnonzero(seen), upright_sigma_rad),
     )
     start = SpatialState(
         poses=state.poses,

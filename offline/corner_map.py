@@ -57,15 +57,22 @@ class Refined:
         return mount.model_copy(update={"z_m": mount.z_m + float(state.calibration[height])})
 
 
-def refine(graph: Graph, solution: Solution) -> tuple[Refined | None, list[str]]:
+def refine(
+    graph: Graph, solution: Solution, upright_sigma_rad: float | None = None
+) -> tuple[Refined | None, list[str]]:
     """Minimises the distance in pixels between corners seen and predicted, from the solution on the floor.
 
+    Args:
+        graph: of the floor.
+        solution: of it.
+        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
+
     Returns:
-        What came of it, or None and a sentence that says why the map stays as it was.
+        What came of it, or None, and sentences that say why the map stays as it was, or which tags lean.
     """
     if not solution.converged:
         return None, []  # the map says so already
-    corners, start = corner_graph(graph, solution.state)
+    corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
     found = solve_corners(corners.problem, start)
     sigma = guessed_wobble(found.problem, found.state)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
@@ -79,4 +86,4 @@ def refine(graph: Graph, solution: Solution) -> tuple[Refined | None, list[str]]
         )
     if reason:
         return None, [f"not refined on tag corners: {reason}; the map is that of tag positions on the floor"]
-    return Refined(corners, found), []
+    return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags)

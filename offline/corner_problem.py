@@ -21,6 +21,7 @@ from offline.linearise_kernels import Odometry, Values
 from offline.measured_factors import Measured
 from offline.robust import Loss, huber, losses_and_weights
 from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
+from offline.upright import NOTHING_UPRIGHT, UprightFactors
 
 # Beyond it lie as many of good looks, with their eight numbers, as of good readings with two.
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
@@ -53,6 +54,7 @@ class CornerProblem:
         readings: of tags whose corners nobody kept.
         anchor: (T,) a pose from which each tag was seen.
         wobble_sigma: (3,) how far off level pictures are, in WOBBLE; zeros on a hall floor.
+        upright: tags that somebody knows to hang so.
     """
 
     odometry: OdometryFactors
@@ -63,6 +65,7 @@ class CornerProblem:
     columns: SpatialColumns
     anchor: IntArray
     wobble_sigma: FloatArray
+    upright: UprightFactors = NOTHING_UPRIGHT
 
     @property
     def n_residuals(self) -> int:
@@ -135,6 +138,7 @@ class CornerProblem:
                 ],
                 axis=1,
             ),
+            columns.turns[self.upright.tag],
             look,
             look[self.pairs].reshape(len(self.pairs), 2 * N_LOOK),
         ]
@@ -174,6 +178,7 @@ class CornerProblem:
             _normal(self.readings.linearise(state, self.columns), DEFAULT_LOSSES.readings),
             _normal(self.prior.linearise(state, self.columns), None),
             *(_normal(kind, None) for kind in self.measured.linearise(state, self.columns)),
+            _normal(self.upright.linearise(state, self.columns), None),
         ]
 
     def _level_looks(self, state: SpatialState, system: System) -> tuple[FloatArray, float]:

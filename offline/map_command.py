@@ -29,6 +29,7 @@ from offline.run_noise import NOT_NEEDED
 from offline.self_calibration_option import OFF, parse_calibrate
 from offline.self_calibration_words import freed_lines
 from offline.stages import StageCost, Stages
+from offline.upright import check_upright
 from offline.workings import Workings
 from onboard.log_reader import find_logs
 
@@ -48,6 +49,7 @@ class MapOptions:
     distances: Sequence[str] = ()
     keep_suspects: bool = False
     corners: bool = False
+    upright_deg: float | None = None
     extend: Path | None = None
     calibrate: str = OFF
 
@@ -61,6 +63,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     Raises:
         GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
     """
+    upright_sigma_rad = check_upright(options.upright_deg, corners=options.corners)
     logs = find_logs(list(options.logs))
     check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
     extending = None if options.extend is None else _read_extended(options.extend, options)
@@ -76,6 +79,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             TapeOptions(options.starts, options.distances),
             keep_suspects=options.keep_suspects,
             corners=options.corners,
+            upright_sigma_rad=upright_sigma_rad,
             calibrate=calibrate,
             workings=workings,
             extending=extending,

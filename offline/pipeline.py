@@ -90,6 +90,7 @@ def build_map(
     *,
     keep_suspects: bool = False,
     corners: bool = False,
+    upright_sigma_rad: float | None = None,
     calibrate: Calibrate = Calibrate(),
     workings: Workings | None = None,
     extending: MapResult | None = None,
@@ -104,6 +105,8 @@ def build_map(
         prior_noise: where the fit begins, and what stays where the runs tell nothing.
         keep_suspects: tags that do not belong are named only, not told apart from what they were.
         corners: the solved map is refined on the tags' corners, where logs have them.
+        upright_sigma_rad: to which tags are known to hang upright, which corners then respect; None: they may hang
+            anyhow.
         calibrate: which numbers of robot.yaml the drives may set.
         workings: takes what the map was made from.
         extending: a map that was kept, whose runs come first, and under whose noise all is solved.
@@ -138,12 +141,20 @@ def build_map(
         maps = with_outliers_apart(maps, merged)
     workings.maps += maps
     components = [
-        solved_component(maps, members, measurements, stages, keep_suspects=keep_suspects, corners=corners)
+        solved_component(
+            maps,
+            members,
+            measurements,
+            stages,
+            keep_suspects=keep_suspects,
+            corners=corners,
+            upright_sigma_rad=upright_sigma_rad,
+        )
         for members in merged.groups
     ]
     joins: list[TagJoin] = []
     if corners and len(components) > 1:
-        components, joins = joined_over_tags(maps, merged, components, measurements, stages)
+        components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
         merged = replace(merged, groups=tuple(each.members for each in components))
     found = Found()
     workings.solved += [found.take(maps, each, measurements, stages) for each in components]

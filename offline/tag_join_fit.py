@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.condensed import quarter_turned
+from offline.corner_factors import SpatialState
 from offline.corner_solver import CornerSolution
 from offline.joint_fit import FALSE_ALARM, REACH_M, UNMODELLED_SIGMA_M
 
@@ -137,7 +138,11 @@ def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
     heading[columns.poses[anchor, 2]] -= 1.0
     way = solution.factor.solve(heading[:-1])
     way *= _STRAIGHT_SIGMAS / np.sqrt(heading[:-1] @ way)
-    rises = [solution.problem.linearise(solution.problem.moved(state, step))[1] - solution.cost for step in (way, -way)]
+
+    def cost_at(state: SpatialState) -> float:
+        return solution.problem.system(state, is_whole=False)[1]
+
+    rises = [cost_at(solution.problem.moved(state, step)) - cost_at(state) for step in (way, -way)]
     return min(rises) / (0.5 * _STRAIGHT_SIGMAS**2)
 
 

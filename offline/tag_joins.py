@@ -69,6 +69,7 @@ def joined_over_tags(
     solved: Sequence[SolvedComponent],
     measurements: Measurements,
     stages: Stages,
+    upright_sigma_rad: float | None = None,
 ) -> tuple[list[SolvedComponent], list[TagJoin]]:
     """Joins components of which no two runs share more than a tag, as far as the tags tell how they lie.
 
@@ -78,11 +79,12 @@ def joined_over_tags(
         solved: these, refined on corners.
         measurements: what somebody measured.
         stages: told what is being done.
+        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
 
     Returns:
         The components, largest first, and all joins tried: those made, then those not made with their reasons.
     """
-    joiner = _Joiner(maps, merged, measurements)
+    joiner = _Joiner(maps, merged, measurements, upright_sigma_rad)
     with stages.stage("joining over single tags"):
         components = joiner.joined(list(solved))
     components.sort(key=lambda each: size_rank(maps, each.members))
@@ -101,8 +103,10 @@ class _Try(NamedTuple):
 
 
 class _Joiner:
-    def __init__(self, maps: Sequence[LocalMap], merged: Merge, measurements: Measurements) -> None:
-        self._maps, self._measurements = maps, measurements
+    def __init__(
+        self, maps: Sequence[LocalMap], merged: Merge, measurements: Measurements, upright_sigma_rad: float | None
+    ) -> None:
+        self._maps, self._measurements, self._upright_sigma_rad = maps, measurements, upright_sigma_rad
         # Where a pair of runs shares more than a tag, alignment had the say.
         self._decided = {frozenset((pair.a, pair.b)) for pair in merged.pairs if len(pair.shared) > 1}
         self._judged: dict[_Key, TagJoin | None] = {}
@@ -123,7 +127,7 @@ class _Joiner:
             a, b, join = min(good, key=lambda each: each.join.verdict.best.heading_sigma_rad)
             whole = self._together(a, b, join.verdict.best.T_a_b)
             if whole.refined is None:
-                self.refused[_key(a, b)] = join.refused("; ".join(whole.refused) or "both together have no solution")
+                self.refused[_key(a, b)] = join.refused("; ".join(whole.told) or "both together have no solution")
             else:
                 self.made[_key(a, b)] = join
                 components = [whole, *(each for each in components if each is not a and each is not b)]
@@ -183,9 +187,9 @@ class _Joiner:
         start = graph.start(np.concatenate([poses[m][1] for m in members]), tags, calibration)
         solution = solve(_held(graph, start).problem, start)
         T_frame_start = solution.state.poses[graph.first_pose]
-        refined, refused = refine(graph, solution)
+        refined, told = refine(graph, solution, self._upright_sigma_rad)
         return SolvedComponent(
-            Group(members, T_frame_start), graph, solution, a.suspects + b.suspects, refined, tuple(refused)
+            Group(members, T_frame_start), graph, solution, a.suspects + b.suspects, refined, tuple(told)
         )
 
 
