@@ -24,14 +24,15 @@ def written_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)  # of a process of the same number that was killed, as in containers
         yield temporary
         if durable:
-            _sync(temporary)  # else, after a power cut, the final name may hold nothing
+            sync(temporary)  # else, after a power cut, the final name may hold nothing
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def _sync(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+def sync(path: Path) -> None:
+    """Returns once a file's content, or the names in a folder, are on the disk."""
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         os.fsync(file)
     finally:
@@ -40,7 +41,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yields an empty folder beside `folder`, which takes its place if the block ends well.
+    """Yields an empty folder beside `folder`, which takes its place if the block ends well, once all is on the disk.
 
     If the block fails, everything is as it was before; folders that were missing on the way to it are not left behind
     either.
@@ -66,9 +67,12 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
             partial.mkdir(parents=True)
         yield partial
         with _told(folder):
+            for each in (*partial.rglob("*"), partial):
+                sync(each)
             if replace and folder.exists():
                 folder.rename(replaced)
             partial.rename(folder)
+            sync(folder.parent)
     finally:
         _put_back(folder, partial, replaced)
         for parent in made:

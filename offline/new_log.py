@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from calib.files import folder_written_whole
+from calib.files import folder_written_whole, sync
 from offline.errors import OfflineError
 
 
@@ -24,7 +24,6 @@ def new_log(output: Path) -> Iterator[Path]:
     if output.suffix != ".mcap":
         with folder_written_whole(output) as folder:
             yield folder
-            _sync([*folder.iterdir(), folder])
         return
     with ExitStack() as stack:
         with _told(output):
@@ -34,9 +33,9 @@ def new_log(output: Path) -> Iterator[Path]:
             folder = Path(stack.enter_context(made))
         yield folder
         with _told(output):
-            _sync([folder / output.name])
+            sync(folder / output.name)
             (folder / output.name).rename(output)
-            _sync([output.parent])
+            sync(output.parent)
 
 
 @contextmanager
@@ -46,13 +45,3 @@ def _told(output: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OfflineError(f"{output}: cannot be written: {error.strerror or error}; choose another place") from error
-
-
-def _sync(paths: list[Path]) -> None:
-    """Returns once files and folders' names are on the disk: a power cut must not leave a name without its content."""
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

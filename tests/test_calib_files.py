@@ -151,3 +151,14 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
     with written_whole(path, durable=False) as partial:
         partial.write_text("of now")
     assert sizes == [5]
+
+
+def test_a_folder_has_its_name_once_all_in_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(Path(f"/proc/self/fd/{file}").readlink().name))
+    folder = tmp_path / "folder"
+    with folder_written_whole(folder) as partial:
+        (partial / "sub").mkdir()
+        (partial / "sub" / "file").write_text("all")
+    assert sorted(synced[:2]) == ["file", "sub"]
+    assert synced[2:] == [partial.name, tmp_path.name]  # the new name comes last
