@@ -86,6 +86,7 @@ class Board:
 
 
 DEFAULT_BOARD: Final = Board()
+DEFAULT_VIEWS: Final = 30  # pictures of it that a calibration wants
 
 
 def parse_board(specification: str) -> Board:

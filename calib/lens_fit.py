@@ -90,30 +90,20 @@ def fitted_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit
 
 
 def first_guess(seen: Observations, n_views: int, size_px: tuple[int, int], kind: str, name: str) -> CameraModel:
-    """A camera without distortion whose focal length explains some of the views best.
-
-    Raises:
-        CalibError: none does.
-    """
+    """A camera without distortion whose focal length explains some of the views best."""
     some = np.zeros(n_views, dtype=np.bool_)
     largest_first = np.argsort(-np.bincount(seen.view, minlength=n_views), kind="stable")
     some[largest_first[:_VIEWS_FOR_GUESS]] = True
     own, count = renumbered(seen, some), int(some.sum())
-    best, least = None, np.inf
-    for focal in _FOCALS:
-        camera = undistorted_camera(name, size_px, kind, float(focal * size_px[0]))
+
+    def misfit(camera: CameraModel) -> float:
         poses, good = poses_of(camera, own, count)
         pixels = camera.project(poses.points(own.view, own.points_m)[0])
         error = np.linalg.norm(pixels - own.pixels, axis=1)
         error[~good[own.view] | ~np.isfinite(error)] = size_px[0]
-        misfit = float(np.mean(np.sqrt(error)))  # a view that does not fit weighs little
-        if misfit < least:
-            best, least = camera, misfit
-    if best is None:
-        raise CalibError(
-            "no focal length explains the views; are the pictures of one camera, and not cut or stretched?"
-        )
-    return best
+        return float(np.mean(np.sqrt(error)))  # a view that does not fit weighs little
+
+    return min((undistorted_camera(name, size_px, kind, float(focal * size_px[0])) for focal in _FOCALS), key=misfit)
 
 
 def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[CameraModel, Poses]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
 from calib.command_line import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
 
 if TYPE_CHECKING:
@@ -104,8 +105,8 @@ def check(
 def capture(
     robot: RobotOption,
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures; may hold earlier ones.")],
-    board: Annotated[str, typer.Option(help="The word that is printed on the board.")] = "7x9-25mm-18mm-5x5_100",
-    views: Annotated[int, typer.Option(help="How many pictures.")] = 30,
+    board: Annotated[str, typer.Option(help="The word that is printed on the board.")] = DEFAULT_BOARD.specification,
+    views: Annotated[int, typer.Option(help="How many pictures.")] = DEFAULT_VIEWS,
     size: Annotated[
         str | None,
         typer.Option(metavar="WxH", help="Of the pictures, in px.  [default: the calibration's, else 1280x720]"),
