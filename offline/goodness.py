@@ -140,6 +140,7 @@ def fitted_windows(
     state = _dead_reckoned(problem, apart)
     left = effort.steps(apart, share, _MAX_FITS * MAX_STEPS) if effort else _MAX_FITS * MAX_STEPS
     factors, redundancy = np.ones(2), np.zeros(2)
+    last = np.ones(2)
     for _ in range(_MAX_FITS):
         solution = _nearly_solved(_scaled(apart, *factors), state, losses, min(left, MAX_STEPS))
         left -= len(solution.costs)
@@ -148,10 +149,13 @@ def fitted_windows(
         squares, redundancy = _left_over(solution)
         squares = squares * factors**2
         believed = (squares + _TOLD) / (redundancy + _TOLD)
-        before, factors = factors, np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD))
+        found = np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD))
+        # Wheels and readings share out what is left over: one that turns back had gone too far, and half is taken.
+        turns_back = (found / factors - 1.0) * (factors / last - 1.0) < 0.0
+        last, factors = factors, np.where(turns_back, np.sqrt(found * factors), found)
         state = solution.state
         del solution  # and what it takes, before the next one
-        if left <= 0 or np.abs(factors / before - 1.0).max() < _FACTOR_TOLERANCE:
+        if left <= 0 or np.abs(factors / last - 1.0).max() < _FACTOR_TOLERANCE:
             break
     # Drives that only a tape joins have more unknowns together than apart.
     n_conditions = max(0, freedom_of(problem) - freedom_of(apart))

@@ -4,6 +4,7 @@ A run on its own first: a tag that was carried about while it drove wrecks a loc
 all runs of a component together, begun with those tags apart that alignments found elsewhere.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -12,14 +13,13 @@ from typing import Final
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from offline.factors import State
 from offline.graph import Graph, build_graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured_factors import Measured
 from offline.merge import Merge
 from offline.run import TagKey
 from offline.solver import Solution, solve
-from offline.suspects_evidence import Evidence, contradicted, gathered, noise_scales, to_other_tags
+from offline.suspects_evidence import Evidence, Heard, contradicted, gathered, heard, noise_scales, to_other_tags
 from offline.suspects_passings import few_of_each_tag
 from offline.suspects_places import Places, settled
 from offline.suspects_search import FALSE_ALARM, bound, excess, search
@@ -101,7 +101,7 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     found = local_map
     if not found.goodness.fits:
         factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
-        sightings = _sightings(found.graph, found.solution.state, factors)
+        sightings = _sightings(found.graph, heard(found.graph, found.solution.state, factors))
         if len(sightings) > len(sightings.ids):
             found = _in_few_places(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
@@ -124,7 +124,8 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
     """
     found = _settled_alone(local_map, scales, false_alarm)
-    for tag in [each for each in {key.whole: 0 for key in found.chain.tags} if _n_places(found, each) >= _MANY_PLACES]:
+    n_places = Counter(key.whole for key in found.chain.tags)
+    for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
         seen = _looked_at(local_map.graph, local_map.solution, scales)
         for place in _joins(seen, tag)[:_MOST_JOINS]:
             other = _settled_alone(_relabelled(local_map, seen.sightings, place), scales, false_alarm)
@@ -218,17 +219,18 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Search
     return seen
 
 
-def _sightings(graph: Graph, state: State, scales: FloatArray) -> Sightings:
+def _sightings(graph: Graph, at: Heard) -> Sightings:
     """Cut also where a tag moved in sight."""
     whole = sightings_of(graph.chains)
-    cut = contradicted(graph, state, whole, scales)
+    cut = contradicted(at, whole)
     return few_of_each_tag(graph, sightings_of(graph.chains, cut) if cut.any() else whole)
 
 
 def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
-    sightings = _sightings(graph, solution.state, scales)
+    at = heard(graph, solution.state, scales)
+    sightings = _sightings(graph, at)
     place = places_told_apart(graph.chains, sightings)
-    evidence = gathered(graph, solution.state, sightings, scales)
+    evidence = gathered(at, sightings)
     return Searched(graph, solution, sightings, place, evidence, settled(evidence, place[evidence.which]))
 
 

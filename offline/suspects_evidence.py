@@ -60,11 +60,37 @@ def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
     return np.array(rows).reshape(-1, 2)
 
 
+@dataclass(frozen=True)
+class Heard:
+    """A problem under its chains' own noise, and what its readings say at a state.
+
+    Attributes:
+        residual: (M, 2) of the readings, whitened.
+        by_tag: (M, 2, 2) their derivatives by the places of tags.
+    """
+
+    problem: Problem
+    state: State
+    residual: FloatArray
+    by_tag: FloatArray
+
+
+def heard(graph: Graph, state: State, scales: FloatArray) -> Heard:
+    """Linearises the readings of a graph.
+
+    Args:
+        graph: of some chains.
+        state: near an optimum.
+        scales: (C, 2) of each chain's noise, see `noise_scales`.
+    """
+    problem = _scaled(graph, scales)
+    readings = problem.readings.linearise(state, problem.columns)
+    return Heard(problem, state, readings.residual, readings.blocks[1][1])
+
+
 def gathered(
-    graph: Graph,
-    state: State,
+    at: Heard,
     sightings: Sightings,
-    scales: FloatArray,
     unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
     *,
     weighed: bool = True,
@@ -72,20 +98,15 @@ def gathered(
     """Linearises all factors at a state and eliminates all but the sightings' places.
 
     Args:
-        graph: of the chains that the sightings are of.
-        state: near an optimum.
+        at: the chains that the sightings are of, near an optimum.
         sightings: S of them.
-        scales: (C, 2) of each chain's noise, see `noise_scales`.
         unmodelled_sigma_m: of each coordinate of a sighting, beyond what the covariances say.
         weighed: whether readings count by how well they fit the others of their sighting, or all alike.
     """
     which = np.flatnonzero(np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] > 1)
     if not len(which):
         return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
-    problem = _scaled(graph, scales)
-    if weighed:
-        problem = _weighed(problem, state, sightings)
-    apart, state = _apart(problem, state, sightings)
+    apart, state = _apart(_weighed(at, sightings) if weighed else at.problem, at.state, sightings)
     system, _ = apart.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
     factorisation, _ = factorised(apart.arrowhead, system, 0.0)
@@ -130,28 +151,25 @@ def to_other_tags(measured: Measured, index: IntArray) -> Measured:
     return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
 
 
-def contradicted(graph: Graph, state: State, sightings: Sightings, scales: FloatArray) -> BoolArray:
+def contradicted(at: Heard, sightings: Sightings) -> BoolArray:
     """(M,) readings before which a tag seems to have moved though it was in sight.
 
     The poses count as known, which a few metres apart they nearly are: that finds a move too many rather than one too
     few, and whether it is one the joint evidence tells.
     """
-    problem = _scaled(graph, scales)
-    lin = problem.readings.linearise(state, problem.columns)
-    by_tag = lin.blocks[1][1]
-    square = np.einsum("mki,mkj->mij", by_tag, by_tag)
-    pull = -np.einsum("mki,mk->mi", by_tag, lin.residual)
+    square = np.einsum("mki,mkj->mij", at.by_tag, at.by_tag)
+    pull = -np.einsum("mki,mk->mi", at.by_tag, at.residual)
     cut = np.zeros(len(pull), dtype=np.bool_)
-    order = np.lexsort((problem.readings.pose, sightings.of_reading))
+    order = np.lexsort((at.problem.readings.pose, sightings.of_reading))
     n_readings = sightings.n_readings
     while len(order):
-        at, gain = _best_cuts(square[order], pull[order], n_readings)
+        begins, gain = _best_cuts(square[order], pull[order], n_readings)
         ends = np.cumsum(n_readings)
         found = gain > -2.0 * np.log(_MOVED_IN_SIGHT / n_readings)  # chi-square with 2 degrees
-        cut[order[at[found]]] = True
+        cut[order[begins[found]]] = True
         # Those that were cut are looked at again, in two parts.
         order = order[np.repeat(found, n_readings)]
-        before = (at - (ends - n_readings))[found]
+        before = (begins - (ends - n_readings))[found]
         n_readings = np.stack([before, n_readings[found] - before], axis=-1).reshape(-1)
     return cut
 
@@ -204,15 +222,14 @@ def _scaled(graph: Graph, scales: FloatArray) -> Problem:
     )
 
 
-def _weighed(problem: Problem, state: State, sightings: Sightings) -> Problem:
+def _weighed(at: Heard, sightings: Sightings) -> Problem:
     """The problem with readings weighed by the others of their sighting.
 
     Not by where the tag is said to be: what is off together was moved, and is to be heard in full.
     """
-    readings = problem.readings
-    lin = readings.linearise(state, problem.columns)
-    root = np.sqrt(_own_weights(lin.residual, lin.blocks[1][1], sightings))
-    return replace(problem, readings=replace(readings, whitening=readings.whitening * root[:, None, None]))
+    readings = at.problem.readings
+    root = np.sqrt(_own_weights(at.residual, at.by_tag, sightings))
+    return replace(at.problem, readings=replace(readings, whitening=readings.whitening * root[:, None, None]))
 
 
 def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Sightings) -> FloatArray:

@@ -6,14 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offline import pipeline
-from offline.chain import Chain
+from calib import se2
+from calib.arrays import FloatArray
+from calib.noise import NoiseParameters
+from offline import goodness, pipeline
+from offline.chain import Chain, chains_of
 from offline.effort import Effort
 from offline.goodness import Goodness, fitted_windows, in_windows
 from offline.graph import build_graph
 from offline.local_map import LocalMap, solve_local_map
-from offline.solver import solve
-from tests.made_drives import MadeTag, made_drive, write_drive
+from offline.run import TagKey
+from offline.solver import Solution, solve
+from tests.made_drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
 from tests.made_long_drives import made_long_drive, with_a_moved_tag
 
 LENGTH_M = 500.0
@@ -56,6 +60,27 @@ def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> N
     assert other.reading_factor == pytest.approx(2.0 * one.reading_factor, rel=0.05)
     assert other.expected == one.expected
     assert other.chi_square == pytest.approx(one.chi_square, rel=0.3)
+
+
+def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wheels and readings take turns at what rounding leaves over; both would go on to and fro."""
+    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
+    stamps_ns, tag = drive.stamps_ns[::5], np.arange(len(drive.stamps_ns[::5])) % 3
+    places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]
+    positions = made_positions(stamps_ns, tag, se2.apply(se2.inverse(drive.at(stamps_ns)), places))
+    tags = [TagKey(FAMILY, i) for i in range(3)]
+    (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    rounds = []
+    left_over = goodness._left_over
+
+    def counted(solution: Solution) -> tuple[FloatArray, FloatArray]:
+        rounds.append(solution)
+        return left_over(solution)
+
+    monkeypatch.setattr(goodness, "_left_over", counted)
+    windows = fitted_windows(build_graph([chain]).problem)
+    assert (windows.factors < 0.1).all()
+    assert len(rounds) <= 8
 
 
 def test_single_wrong_readings_do_not_count_against_a_map() -> None:

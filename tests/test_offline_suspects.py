@@ -24,7 +24,7 @@ from offline.run import Run, TagKey
 from offline.solver import PLAIN_SQUARES, solve
 from offline.stages import Stages
 from offline.suspects import Searched, split_together
-from offline.suspects_evidence import gathered, noise_scales
+from offline.suspects_evidence import gathered, heard, noise_scales
 from offline.suspects_information import rows_of
 from offline.suspects_phantoms import Views, chances
 from offline.suspects_places import NOWHERE, gain_of, settled
@@ -139,8 +139,8 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
     seen = searched()
     own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
-    scales = np.ones((4, 2))
-    bare = gathered(seen.graph, seen.solution.state, seen.sightings, scales, unmodelled_sigma_m=1e-4, weighed=False)
+    plain = heard(seen.graph, seen.solution.state, np.ones((4, 2)))
+    bare = gathered(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
     at = int(np.flatnonzero(bare.which == own)[0])
     gain, _ = gain_of(settled(bare, seen.place[bare.which]), np.array([at]))
     joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)
@@ -161,7 +161,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
     whole = information.times(np.eye(n))
     monkeypatch.setattr(arrowhead_covariance, "_FEW", 0)
     scales = noise_scales([each.goodness for each in local_maps()])
-    apart = gathered(seen.graph, seen.solution.state, seen.sightings, scales).information
+    apart = gathered(heard(seen.graph, seen.solution.state, scales), seen.sightings).information
     assert apart.root.below.shape[0] > 0
     assert information.root.below.shape[0] == 0
     gather = np.zeros((2 * int(seen.places.place.max()) + 2, n))
