@@ -2,14 +2,19 @@
 
 Around a corner the light is modelled as
 
-    (1 + g . (x - c)) (a + b erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2))),
-    l_k(x) = n_k . (x - c) - kappa_k / 2 ((t_k . (x - c))^2 + s_k^2)
+    (1 + g . (x - c)) (a + b (erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2)) - m(x))),
+    l_k(x) = n_k . (x - c) - y_k(u) - y_k''(u) s_k^2 / 2,   u = t_k . (x - c)
 
 two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
-shutter was open. Their bends kappa_k are given: a lens bends lines, and a bend left out moves corners; so does blur,
-which draws a bent edge inwards by the bend's mean over it. Whatever makes black grow or shrink (too much light, a print
-that bleeds) moves the two halves of an edge in opposite directions, and the corner not at all. Light that grows along
-an edge (g: the lens's falloff, a lamp) would move both halves alike.
+shutter was open. How they bend away from their tangents, y_k, is given: a lens bends lines, and a bend left out moves
+corners; so does blur, which draws a bent edge inwards by the bend's mean over it. Whatever makes black grow or shrink
+(too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and the corner not at all.
+Light that grows along an edge (g: the lens's falloff, a lamp) would move both halves alike.
+
+Blur carries the black of markers out into the white around them; m is how much of it, known from the first look's blur.
+Where squares grow across the picture one of the two markers is nearer than the other, and would draw the corner to
+itself. So where markers begin is told by a map of second order: by an affine one 0.001 px in a fisheye, and 0.008 px
+where the lens blurs by 1 px.
 
 What the light's noise moves a corner by falls with the root of the edges' length, so they are followed to the middle
 of the squares, where those of the next corner begin: no pixel tells of two corners.
@@ -26,16 +31,14 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.corner_surroundings import FIRST_RADIUS_PX, Surroundings
 
-FIRST_RADIUS_PX: Final = 6  # about a corner whose edges' bends are not known yet
-RADIUS_PX: Final = 16  # with bends; time grows with its square, what is gained ends with half a square
+FIRST_BLUR_PX: Final = 0.7
 _ROUNDS: Final = 15
 _N: Final = 10  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2), g (2)
 _BLURS: Final = slice(6, 8)
 _SLOPE: Final = slice(8, 10)  # share of the light over the radius
 _ARRIVED_PX: Final = 1e-4
-_FIRST_BLUR_PX: Final = 0.7
-_CLEAR_OF_PX: Final = 1.5  # of the blur of what else is printed
 _FARTHEST_SQUARES: Final = 0.3  # that a corner may lie from where it was thought to be
 _LEAST_CONTRAST: Final = 16.0  # grey levels between black and white: markers are hardly read below
 _ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than two edges
@@ -66,44 +69,16 @@ class Corners:
         return Corners(*(getattr(self, field.name)[mask] for field in dataclass_fields(self)))
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What is known around N corners before they are fitted.
-
-    Attributes:
-        pixels: (N, 2) about where they are.
-        squares_px: (N, 2, 2) in its columns, how far one square along the board's x and y leads.
-        white_diagonal: (N,) whether white lies where x and y both grow.
-        bend: (N, 2) curvature (1/px) of the edges along x and along y, see `bends`.
-        clear: how far in squares a white square is clear of its marker.
-        radius_px: how far from a corner pixels are looked at.
-    """
-
-    pixels: FloatArray
-    squares_px: FloatArray
-    white_diagonal: BoolArray
-    bend: FloatArray
-    clear: float
-    radius_px: int
-
-
 def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
     """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
-    inside = np.isfinite(around.pixels).all(axis=1) & np.isfinite(around.squares_px).all(axis=(1, 2))
+    known = (around.pixels[:, None], around.squares_px, around.growth_px, around.bend)
+    inside = np.all([np.isfinite(each).all(axis=(1, 2)) for each in known], axis=0)
     size = np.array(picture.shape[::-1])
     inside &= ((around.pixels > FIRST_RADIUS_PX) & (around.pixels < size - 1 - FIRST_RADIUS_PX)).all(axis=1)
-    kept = Surroundings(
-        around.pixels[inside],
-        around.squares_px[inside],
-        around.white_diagonal[inside],
-        around.bend[inside],
-        around.clear,
-        around.radius_px,
-    )
     if not inside.any():
         none = np.zeros((0, 2))
         return Corners(ids[:0], none, np.zeros((0, 2, 2)), none[:, 0], none[:, 0])
-    return _Patches(picture, kept).fitted(ids[inside])
+    return _Patches(picture, around.where(inside)).fitted(ids[inside])
 
 
 class _Patches:
@@ -115,13 +90,14 @@ class _Patches:
         middle = np.rint(around.pixels).astype(np.int64)
         places = np.stack([middle[:, :1] + dx, middle[:, 1:] + dy], axis=-1)
         self._around = around
-        seen = _own_squares(around, places.astype(np.float64), np.array(picture.shape[::-1]))
+        seen = around.own_squares(places.astype(np.float64), np.array(picture.shape[::-1]))
         kept = np.argsort(~seen, axis=1, kind="stable")[:, : int(seen.sum(axis=1).max())]
         self._seen = np.take_along_axis(seen, kept, axis=1).astype(np.float64)  # (N, P) 1.0 where it counts
         places = np.take_along_axis(places, kept[..., np.newaxis], axis=1)
         columns, rows = np.moveaxis(places.clip(0, np.array(picture.shape[::-1]) - 1), -1, 0)
         self._light = picture[rows, columns].astype(np.float64)  # (N, P)
         self._places = places.astype(np.float64)  # (N, P, 2)
+        self._marker = around.marker_light(self._places)  # (N, P)
 
     def fitted(self, ids: IntArray) -> Corners:
         """The corners that look right."""
@@ -161,7 +137,7 @@ class _Patches:
         along_x, along_y = around.squares_px[:, :, 0], around.squares_px[:, :, 1]
         p[:, 2] = np.arctan2(along_x[:, 0], -along_x[:, 1])  # normals: the directions turned by 90 degrees
         p[:, 3] = np.arctan2(along_y[:, 0], -along_y[:, 1])
-        p[:, _BLURS] = np.log(_FIRST_BLUR_PX)
+        p[:, _BLURS] = np.log(FIRST_BLUR_PX)
         p[:, 5] = 1.0
         residual, _ = self._linearise(p)
         shape = residual + self._seen * self._light  # the light of a = 0, b = 1
@@ -179,24 +155,28 @@ class _Patches:
         for k in (0, 1):
             cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
             across, along = cos * off[..., 0] + sin * off[..., 1], -sin * off[..., 0] + cos * off[..., 1]
-            bend = self._around.bend[of, k, None]
             blur = np.exp(p[:, 6 + k])[:, None]
-            q = (across - 0.5 * bend * (along**2 + blur**2)) / (np.sqrt(2.0) * blur)
+            second, third, fourth = (each[..., None] for each in np.moveaxis(self._around.bend[of, k], -1, 0))
+            bend, change = second + along * (third + 0.5 * fourth * along), third + fourth * along
+            sag = along**2 * (0.5 * second + along * (third / 6.0 + fourth / 24.0 * along))
+            slope = along * (second + along * (0.5 * third + fourth / 6.0 * along)) + 0.5 * change * blur**2
+            q = (across - sag - 0.5 * bend * blur**2) / (np.sqrt(2.0) * blur)
             edges.append(erf(q))
             slopes.append((2.0 / np.sqrt(np.pi)) * np.exp(-(q**2)))
             scale = 1.0 / (np.sqrt(2.0) * blur)
             by_blur = -q - scale * bend * blur**2
-            by_centre.append((scale * (-cos - bend * along * sin), scale * (-sin + bend * along * cos), by_blur))
-            by_turn.append(scale * (along + bend * along * across))
+            by_centre.append((scale * (-cos - slope * sin), scale * (-sin + slope * cos), by_blur))
+            by_turn.append(scale * (along + slope * across))
         a, b = p[:, 4, None], p[:, 5, None]
         jacobian = np.empty((*off.shape[:2], _N))
         first, second = b * slopes[0] * edges[1], b * slopes[1] * edges[0]
         for axis in (0, 1):
             jacobian[..., axis] = first * by_centre[0][axis] + second * by_centre[1][axis]
         jacobian[..., 2], jacobian[..., 3] = first * by_turn[0], second * by_turn[1]
-        jacobian[..., 4], jacobian[..., 5] = 1.0, edges[0] * edges[1]
+        shape = edges[0] * edges[1] - self._marker[of]
+        jacobian[..., 4], jacobian[..., 5] = 1.0, shape
         jacobian[..., 6], jacobian[..., 7] = first * by_centre[0][2], second * by_centre[1][2]
-        reflected = a + b * edges[0] * edges[1]
+        reflected = a + b * shape
         away = (self._places[of] - self._around.pixels[of, None]) / self._around.radius_px
         falling = self._seen[of] * (1.0 + np.einsum("npi,ni->np", away, p[:, _SLOPE]))
         jacobian[..., : _SLOPE.start] *= falling[..., None]
@@ -230,29 +210,3 @@ class _Patches:
         return Corners(
             ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5])
         )
-
-
-def _own_squares(around: Surroundings, places: FloatArray, size: IntArray) -> BoolArray:
-    """(N, P) whether nothing is printed there but the corner's own four squares, and it is nearest to this corner."""
-    place = np.einsum("nij,npj->npi", np.linalg.inv(around.squares_px), places - around.pixels[:, None])
-    side_px = np.linalg.norm(around.squares_px, axis=1)[:, None]  # (N, 1, 2)
-    blur = _CLEAR_OF_PX / side_px  # in squares
-    # Where squares are small, some pixels are shared: too few would be left.
-    own = np.maximum(0.5, FIRST_RADIUS_PX / side_px)
-    near = (np.abs(place) < np.minimum(own, 1.0 - blur)).all(axis=-1)
-    white = (place.prod(axis=-1) > 0.0) == around.white_diagonal[:, None]
-    in_marker = (np.abs(place) > around.clear - blur).all(axis=-1) & white
-    in_picture = ((places >= 0.0) & (places < size)).all(axis=-1)
-    return np.asarray(near & ~in_marker & in_picture)
-
-
-def bends(before_px: FloatArray, at_px: FloatArray, after_px: FloatArray) -> FloatArray:
-    """(N,) curvature of lines through three neighbouring points (N, 2) each, as `Surroundings` has it.
-
-    Positive where the line bends to its right-hand normal turned by 90 degrees from its direction (-y, x).
-    """
-    along = 0.5 * (after_px - before_px)
-    turned = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    second = after_px - 2.0 * at_px + before_px
-    length = np.linalg.norm(along, axis=1)
-    return np.asarray((turned * second).sum(axis=1) / np.maximum(length, 1e-12) ** 3)

@@ -1,7 +1,8 @@
 """From pictures of a board to a camera: find corners, fit, look at the corners again with what was learnt, fit again.
 
 A lens bends the board's edges, and corners fitted with straight ones lie hundredths of a pixel off, all alike in one
-part of the picture. So a first camera tells the bends and which corners must be in the picture too.
+part of the picture. So a first camera tells the bends and which corners must be in the picture too; where the second
+one bends edges so much otherwise that it matters, they are looked at again.
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from calib.lens_fit import MEDIAN_CHI2, LensFit, first_guess, fitted_lens
 
 KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # the fewest coefficients first
 _FOLDS: Final = 5
+_LOOKS: Final = 3  # with bends; more than two have not been seen to matter
 _TOO_BLURRED: Final = 4.0  # robust sigmas of the views' blur
 _LEAST_BLUR_SCATTER: Final = 0.1  # of its logarithm
 
@@ -61,17 +63,55 @@ def calibrated(views: Sequence[View], finder: BoardFinder, name: str, kinds: Seq
         CalibError: the views do not tell a camera.
     """
     lens = first_fit(views, finder, name, kinds)
-    poses = every_pose(lens, observed(views, finder), len(views))
-    views = seen_again(views, finder, lens.fit.model, poses)
-    lens = _fitted_without(blurred(views), observed(views, finder), lens.fit.model)
-    poses = every_pose(lens, observed(views, finder), len(views))
-    scores = {lens.fit.model.distortion_model: 0.0}
+    found = _looked(_Look(views, lens, every_pose(lens, observed(views, finder), len(views))), finder)
+    scores = {found.lens.fit.model.distortion_model: 0.0}
     if len(kinds) > 1:
-        chosen, scores = _cross_validated(lens, kinds)
-        if chosen.distortion_model != lens.fit.model.distortion_model:
-            lens = _fitted_without(blurred(views), observed(views, finder), chosen)
-            poses = every_pose(lens, observed(views, finder), len(views))
-    return Calibration(lens, views, poses, blurred(views), scores)
+        chosen, scores = _cross_validated(found.lens, kinds)
+        if chosen.distortion_model != found.lens.fit.model.distortion_model:
+            found = _looked(_refitted(found, chosen, finder), finder)
+    return Calibration(found.lens, found.views, found.poses, blurred(found.views), scores)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Views as seen last, camera and poses that follow, and the (V, K, 13, 2) places by which they were looked at."""
+
+    views: Sequence[View]
+    lens: LensFit
+    poses: Poses
+    expected: FloatArray | None = None
+
+
+def _looked(look: _Look, finder: BoardFinder) -> _Look:
+    """Looks for corners where the camera says that they are, as bent as it says, until it says the same afterwards."""
+    for _ in range(_LOOKS):
+        expected = _expected_places(look, finder)
+        if look.expected is not None and _settled(look, finder.moved_by_bends_px(look.expected, expected)):
+            break
+        views = [finder.find_again(view, each) for view, each in zip(look.views, expected, strict=True)]
+        look = _refitted(replace(look, views=views, expected=expected), look.lens.fit.model, finder)
+    return look
+
+
+def _expected_places(look: _Look, finder: BoardFinder) -> FloatArray:
+    """(V, K, 13, 2) where the camera has the places around each corner."""
+    places = np.einsum("vij,kmj->vkmi", look.poses.rotation, finder.places_around_m())
+    return look.lens.fit.model.project(places + look.poses.place_m[:, None, None])
+
+
+def _settled(look: _Look, moved_px: FloatArray) -> bool:
+    """Whether corners that move by (V, K) move no camera: all together, no more than noise moves its parameters."""
+    corners = [view.corners for view in look.views]
+    moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
+    variance = 0.5 * np.trace(look.lens.seen.covariance, axis1=1, axis2=2) + look.lens.extra_sigma_px**2
+    return bool((moved**2 / variance).sum() < len(look.lens.fit.information))
+
+
+def _refitted(look: _Look, start: CameraModel, finder: BoardFinder) -> _Look:
+    """With the camera and the poses that follow from its views, the camera from a start."""
+    seen = observed(look.views, finder)
+    lens = _fitted_without(blurred(look.views), seen, start)
+    return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
 
 
 def observed(views: Sequence[View], finder: BoardFinder) -> Observations:
@@ -83,16 +123,6 @@ def observed(views: Sequence[View], finder: BoardFinder) -> Observations:
         np.concatenate([each.pixels for each in corners]),
         np.concatenate([each.covariance for each in corners]),
     )
-
-
-def seen_again(views: Sequence[View], finder: BoardFinder, model: CameraModel, poses: Poses) -> list[View]:
-    """The views with all corners that a camera says are in them, edges bent as it bends them."""
-    around = finder.places_around_m()
-    again = []
-    for index, view in enumerate(views):
-        places = np.einsum("ij,kmj->kmi", poses.rotation[index], around) + poses.place_m[index]
-        again.append(finder.find_again(view, model.project(places)))
-    return again
 
 
 def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:

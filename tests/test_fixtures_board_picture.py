@@ -7,7 +7,15 @@ import pytest
 from calib.arrays import FloatArray
 from calib.board import DEFAULT_BOARD
 from calib.camera_model import CameraModel
-from fixtures.board_picture import BoardPainter, Glare, View, corners_of, drawn_views
+from fixtures.board_picture import (
+    BoardPainter,
+    Glare,
+    View,
+    between_rays,
+    corners_of,
+    drawn_views,
+    second_differences,
+)
 from fixtures.textures import ByteArray
 from fixtures.world import Pictures
 
@@ -61,6 +69,19 @@ def test_corners_are_found_where_they_are_projected(camera: CameraModel) -> None
     # OpenCV's refinement errs by tenths where squares are small; the middle of the crowd is the renderer's.
     assert np.abs(np.median(all_errors, axis=0)).max() < 0.02
     assert np.median(np.abs(all_errors)) < 0.05
+
+
+@pytest.mark.parametrize("camera", [NARROW, FISHEYE], ids=lambda camera: camera.name)
+def test_a_ray_between_the_corners_of_a_pixel_is_where_the_lens_has_it(camera: CameraModel) -> None:
+    """Along straight lines it would be up to 0.0004 px off in a fisheye, and on one side."""
+    columns, rows = np.meshgrid(np.arange(400, 412) - 0.5, np.arange(100, 110) - 0.5)
+    rays = camera.unproject(np.stack([columns, rows], axis=-1))
+    bent = np.stack([second_differences(rays, axis) for axis in (1, 0)], axis=-1)
+    shares = (0.2, 0.5, 0.9)
+    places = [(row, column, s, t) for row in (1, 7) for column in (1, 5, 9) for s in shares for t in shares]
+    found = camera.project(np.array([between_rays(rays, bent, *place) for place in places]))
+    true = np.array([(399.5 + column + s, 99.5 + row + t) for row, column, s, t in places])
+    np.testing.assert_allclose(found, true, atol=1e-5)
 
 
 def test_motion_smears_along_its_direction_and_keeps_the_middle() -> None:
