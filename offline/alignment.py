@@ -15,16 +15,18 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray
-from offline.alignment_rivals import MARGIN_NATS, Rivalry
-from offline.alignment_search import Explanation, explanations, settled, without
+from offline.alignment_rivals import CHANCE_NATS, Rivalry
+from offline.alignment_search import Explanation, explanations, halves, settled, without
 from offline.condensed import CondensedMap
-from offline.joint_fit import FALSE_ALARM, REACH_M, JointFit
+from offline.joint_fit import REACH_M, JointFit
 from offline.measured import Placement
 from offline.run import TagKey
+from offline.tag_fit import FALSE_ALARM
 
-# Other choices of tags count down to this much less evidence than the best has, up to so many tags fewer, and of each
-# number so many.
-_DOUBT_NATS: Final = 2.0 * MARGIN_NATS
+# An alignment's covariance holds for other choices of tags as well, down to this much less likely: that costs width
+# only, and a claim is wrong where the truth is beyond it.
+_DOUBT_NATS: Final = log(1e4)
+# Such choices are of so many tags fewer at most, and of each number so many.
 _MOST_DOUBTED: Final = 6
 _BEAM: Final = 12
 _AREA_M2: Final = REACH_M**2
@@ -96,8 +98,8 @@ class _Judge(Rivalry):
     def __init__(
         self, a: CondensedMap, b: CondensedMap, shared: tuple[TagKey, ...], placement: Placement | None
     ) -> None:
-        super().__init__(len(shared))
         self.fit = JointFit(a.tree(shared), b.tree(shared))
+        super().__init__(self.fit.places_a, self.fit.places_b)
         self.shared = shared
         self.placement = placement
         self.frames = a.frame_covariance, b.frame_covariance
@@ -111,18 +113,22 @@ class _Judge(Rivalry):
         found = self._united(explained)
         evidence, best = found[0]
         groups = [each for _, each in found]
-        each_once = {each.members.tobytes(): (its, each) for its, each in found + self._doubted(evidence, best)}
+        found += self._doubted(evidence, best) + [(self.evidence(each), each) for each in halves(self.fit, best)]
+        each_once = {each.members.tobytes(): (its, each) for its, each in found}
         found = sorted(each_once.values(), key=lambda f: -f[0])
         rivals: list[Explanation] = []
         for each in self.rivals(best, found, groups):
             if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
-        told = tuple(self._told(rival, found, (), is_sure=False) for rival in rivals)
-        beats_chance = best.n == len(self.shared) or evidence > MARGIN_NATS
-        return self._told(best, found, told, is_sure=beats_chance and not rivals)
+        told = tuple(self._told(rival, found, groups, (), is_sure=False) for rival in rivals)
+        beats_chance = best.n == len(self.shared) or evidence > CHANCE_NATS
+        return self._told(best, found, groups, told, is_sure=beats_chance and not rivals)
 
     def _doubted(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
-        """The best without tags that it gains little from, several together too: two wrong ones bear each other out."""
+        """The best without tags that it gains little from, and with others that fit then.
+
+        Several together too, as two wrong ones bear each other out.
+        """
         found = last = [(evidence, best)]
         for _ in range(_MOST_DOUBTED):
             fewer: dict[bytes, tuple[float, Explanation]] = {}
@@ -132,8 +138,10 @@ class _Judge(Rivalry):
                 held = np.flatnonzero(each.members)
                 for tag in held[each.held.worth_nats() < its - evidence + _DOUBT_NATS]:
                     less = without(each, tag)
-                    if (key := less.members.tobytes()) not in fewer:
-                        fewer[key] = self.evidence(less), less
+                    instead = less.joining & ~each.members
+                    for other in (less, less.with_more(instead)) if instead.any() else (less,):
+                        if (key := other.members.tobytes()) not in fewer:
+                            fewer[key] = self.evidence(other), other
             last = sorted((f for f in fewer.values() if f[0] > evidence - _DOUBT_NATS), key=lambda f: -f[0])[:_BEAM]
             found = found + last
         return found
@@ -162,7 +170,7 @@ class _Judge(Rivalry):
                 return ranked
 
     def evidence(self, explanation: Explanation) -> float:
-        """Log of the likelihood of the shared tags over that of all being wrong, with what was measured."""
+        """Log of the likelihood of the shared tags over that by chance, with what was measured."""
         return super().evidence(explanation) + self._evidence_of_placement(explanation)
 
     def _evidence_of_placement(self, explanation: Explanation) -> float:
@@ -188,17 +196,20 @@ class _Judge(Rivalry):
         covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
         return se2.log(se2.between(placement.T_a_b, explanation.T_a_b)), covariance
 
-    def _covering_covariance(self, explanation: Explanation, found: Sequence[tuple[float, Explanation]]) -> FloatArray:
+    def _covering_covariance(
+        self, explanation: Explanation, found: Sequence[tuple[float, Explanation]], groups: Sequence[Explanation]
+    ) -> FloatArray:
         """(3, 3) of the right tangent of T_a_b, with the doubt of which tags fit.
 
-        True whichever choice of tags is that puts the map in the same place, of those that are not a hundred times less
-        likely, tags that it leaves out as a group included; second moments about this one.
+        True whichever choice of tags is that puts the map in the same place, of those that are not 10,000 times less
+        likely, tags that it leaves out as a group included; second moments about this one. A union of unions depends on
+        their order, so this is that of the tags.
         """
         near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
-        worth = [its + self.of_group(each, [explanation]) for its, each in near]
+        worth = [its + self.of_group(each, [explanation, *groups]) for its, each in near]
         covering = self.covariance(explanation)
-        for its, (_, each) in zip(worth, near, strict=True):
-            if its > max(worth) - MARGIN_NATS:
+        for its, (_, each) in sorted(zip(worth, near, strict=True), key=lambda w: w[1][1].members.tobytes()):
+            if its > max(worth) - _DOUBT_NATS:
                 off = se2.log(se2.between(explanation.T_a_b, each.T_a_b))
                 covering = covariance_union(covering, self.covariance(each) + np.outer(off, off))
         return covering
@@ -207,6 +218,7 @@ class _Judge(Rivalry):
         self,
         explanation: Explanation,
         found: Sequence[tuple[float, Explanation]],
+        groups: Sequence[Explanation],
         rivals: tuple[Alignment, ...],
         *,
         is_sure: bool,
@@ -216,7 +228,7 @@ class _Judge(Rivalry):
         apart = self.fit.places_a[inlier] - se2.apply(explanation.T_a_b, self.fit.places_b[inlier])
         return Alignment(
             T_a_b=explanation.T_a_b,
-            covariance=self._covering_covariance(explanation, found),
+            covariance=self._covering_covariance(explanation, found, groups),
             shared=self.shared,
             inlier=inlier,
             off_m=np.where(inlier, 0.0, np.linalg.norm(off_m, axis=1)),

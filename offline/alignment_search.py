@@ -13,11 +13,13 @@ from math import log
 from typing import Final
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.joint_fit import FALSE_ALARM, TAG_GATE, Bend, Held, JointFit, Linear, hold, ill_fitting, squared_sigmas
+from offline.joint_fit import Bend, Held, JointFit, Linear, hold
+from offline.tag_fit import FALSE_ALARM, TAG_GATE, WRONG_FROM_M, ill_fitting, log_wrong_there, squared_sigmas
 
 # Looked for until an alignment with half the tags of the best one would be missed so rarely.
 MISSED: Final = 1e-4
@@ -30,6 +32,8 @@ _SEED: Final = 20170501
 # Of the tags not tried yet, those are next whose variance is foretold to within this factor of the least.
 _NEXT_VARIANCE: Final = 4.0
 _MOST_CHANGES: Final = 100
+# What links two groups of tags this well keeps them together: five sigmas are as little as a wrong tag is off.
+_LOOSE_SIGMA_M: Final = 0.2 * WRONG_FROM_M
 
 
 @dataclass(frozen=True)
@@ -46,10 +50,29 @@ class Explanation:
         return self.held.T_a_b
 
     @cached_property
+    def _others(self) -> tuple[FloatArray, FloatArray]:
+        return self.held.others()
+
+    @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray]:
         """(n, 2) of each tag from where the members foretell it, and (n,) in squared sigmas; 0 for members."""
-        off_m, spread = self.held.others()
+        off_m, spread = self._others
         return off_m, np.where(self.members, 0.0, squared_sigmas(off_m, spread))
+
+    @cached_property
+    def log_wrong(self) -> FloatArray:
+        """(n,) log density of each tag, if it is wrong, where it is; of members it means nothing."""
+        return log_wrong_there(*self._others)
+
+    @cached_property
+    def joining(self) -> BoolArray:
+        """(n,) which tags it does not count that fit it and rather stayed than are wrong."""
+        return ~self.members & (ill_fitting(*self._others) < 1.0)
+
+    def with_more(self, tags: BoolArray) -> "Explanation":
+        """The same tags and these (n,)."""
+        members = self.members | tags
+        return Explanation(members, self.linear, hold(self.linear, members))
 
     @property
     def fits(self) -> BoolArray:
@@ -85,6 +108,29 @@ def without(explanation: Explanation, tags: IntArray) -> Explanation:
     members = explanation.members.copy()
     members[tags] = False
     return Explanation(members, explanation.linear, hold(explanation.linear, members))
+
+
+def halves(fit: JointFit, explanation: Explanation) -> list[Explanation]:
+    """Both parts of its tags wherever these hang together loosely: where maps bend a part may have moved as one.
+
+    By the distances of tags: each link of the tree of the best known ones is cut in turn. Two tags are a part at least.
+    """
+    held = np.flatnonzero(explanation.members)
+    first, second = np.triu_indices(len(held), 1)
+    tags = held[first], held[second]
+    variance = distances(fit.places_a, fit.covariance_a, *tags)[1] + distances(fit.places_b, fit.covariance_b, *tags)[1]
+    weight = np.zeros((len(held), len(held)))
+    weight[first, second] = variance + fit.unmodelled_m2
+    tree = minimum_spanning_tree(weight).toarray()
+    parts = []
+    for link in zip(*np.nonzero(tree > _LOOSE_SIGMA_M**2), strict=True):
+        cut = tree.copy()
+        cut[link] = 0.0
+        _, part = connected_components(cut, directed=False)
+        parts += [
+            without(explanation, held[part == which]) for which in (0, 1) if 2 <= (part == which).sum() <= len(held) - 2
+        ]
+    return parts
 
 
 def _draws_needed(share: float) -> float:

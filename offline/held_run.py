@@ -18,13 +18,14 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.factors import State
 from offline.graph import Graph, build_graph, unheld
-from offline.joint_fit import UNMODELLED_SIGMA_M, squared_sigmas
+from offline.joint_fit import UNMODELLED_SIGMA_M
 from offline.known_map import KnownMap
 from offline.local_map import LocalMap
 from offline.run import TagKey
 from offline.solver import Solution, solve
 from offline.suspects import renamed
 from offline.suspects_search import FALSE_ALARM
+from offline.tag_fit import squared_sigmas
 
 _MOST_CHANGES: Final = 20
 _MOVED: Final = "moved, "

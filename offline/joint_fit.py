@@ -19,7 +19,6 @@ sigma of 1 cm for each tag, which is little against any tag that was moved.
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import pi
 from typing import Final
 
 import numpy as np
@@ -29,16 +28,12 @@ from scipy.stats import chi2
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.condensed import AnchorTree, quarter_turned
+from offline.tag_fit import FALSE_ALARM, ill_fitting, worth_nats
 
-# What is as both maps have it is taken for wrong so rarely.
-FALSE_ALARM: Final = 1e-4
-# A wrong tag lies anywhere within about this of where it should: the next wall, the next door. What lies farther off
-# fits nothing by chance.
+# What is told to no better than this is told to be somewhere: the next wall, the next door.
 REACH_M: Final = 10.0
 # Of each coordinate of a shared tag, beyond what the covariances say.
 UNMODELLED_SIGMA_M: Final = 0.01
-
-TAG_GATE: Final = float(chi2.isf(FALSE_ALARM, 2))  # squared sigmas
 
 _STEPS: Final = 8
 _CONVERGED_SIGMAS: Final = 1e-3
@@ -236,10 +231,8 @@ class Held:
         return ill_fitting(*self.without_each())
 
     def worth_nats(self) -> FloatArray:
-        """(m,) log of how much better each tag held fits than it would anywhere in reach; three tags at least."""
-        off, covariance = self.without_each()
-        worth: FloatArray = 0.5 * (_better_than_wrong(covariance) - squared_sigmas(off, covariance))
-        return worth
+        """(m,) log of how much better each tag held fits than as a wrong one; three tags at least."""
+        return worth_nats(*self.without_each())
 
     def motion_covariance(self) -> FloatArray:
         """(3, 3) of the motion."""
@@ -249,36 +242,6 @@ class Held:
 @lru_cache
 def _most_rise(freedom: int) -> float:
     return float(chi2.isf(FALSE_ALARM, freedom))
-
-
-def ill_fitting(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(m,) squared sigmas of differences (m, 2) with covariances (m, 2, 2), over what a tag may have that fits.
-
-    It fits if chance explains the difference, chi-square with 2 degrees, and explains it better than a wrong tag would
-    that lies anywhere in reach. So a tag whose place is foretold to a few metres only proves nothing.
-    """
-    ratio: FloatArray = squared_sigmas(off_m, covariance) / np.clip(_better_than_wrong(covariance), 1e-6, TAG_GATE)
-    return ratio
-
-
-def _better_than_wrong(covariance: FloatArray) -> FloatArray:
-    """(m,) squared sigmas up to which a tag with covariance (m, 2, 2) rather fits than lies anywhere in reach."""
-    squares: FloatArray = 2.0 * np.log(REACH_M**2 / (2.0 * pi)) - np.log(_determinants(covariance))
-    return squares
-
-
-def squared_sigmas(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(m,) v' C^-1 v of differences (m, 2) with covariances (m, 2, 2)."""
-    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    x, y = off_m[:, 0], off_m[:, 1]
-    squares: FloatArray = (d * x * x - 2.0 * b * x * y + a * y * y) / _determinants(covariance)
-    return squares
-
-
-def _determinants(matrices: FloatArray) -> FloatArray:
-    """(m,) of (m, 2, 2), positive whatever the rounding."""
-    determinants: FloatArray = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
-    return np.maximum(determinants, 1e-300)
 
 
 def hold(linear: Linear, members: BoolArray) -> Held:

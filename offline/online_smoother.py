@@ -16,7 +16,7 @@ from calib import se2
 from calib.arrays import FloatArray
 from calib.robot import Robot
 from offline.graph import Parameter
-from offline.joint_fit import TAG_GATE, UNMODELLED_SIGMA_M
+from offline.joint_fit import UNMODELLED_SIGMA_M
 from offline.known_map import KnownMap
 from offline.online_answers import move, moved_on, substituted
 from offline.online_drive import Drive, TagReading
@@ -26,6 +26,7 @@ from offline.online_prior import Numbers, OnlinePrior
 from offline.online_root import SLICE, OnlineRoot
 from offline.online_turn import pose_among
 from offline.run import TagKey
+from offline.tag_fit import TAG_GATE
 
 _POSES_A_SLICE: Final = 256
 

@@ -13,12 +13,13 @@ import numpy as np
 
 from calib import se2
 from calib.arrays import FloatArray, IntArray
-from offline.alignment_rivals import MARGIN_NATS, Rivalry
+from offline.alignment_rivals import CHANCE_NATS, Rivalry
 from offline.alignment_search import Explanation, distances, is_same_distance, through
 from offline.condensed import quarter_turned
-from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold, ill_fitting
+from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold
 from offline.known_map import KnownMap
 from offline.run import TagKey
+from offline.tag_fit import ill_fitting
 
 _STEPS: Final = 4
 # Two tags are held against each other by their distance alone, which a tag that was moved aside keeps: nothing
@@ -71,7 +72,7 @@ class StartSearch:
             return None
         if pairs == self._pairs and self._left is not None and not self._left:
             self._left = None
-            return self._verdict(len(pairs))
+            return self._verdict(_RigidFit(self._known, seen, pairs))
         fit = _RigidFit(self._known, seen, pairs)
         if pairs != self._pairs or self._left is None:  # all of it anew: by now the places are better known
             self._pairs, self._found, self._left = pairs, [], fit.same_distances()
@@ -84,11 +85,12 @@ class StartSearch:
         self.reason = "looking for the start"
         return None
 
-    def _verdict(self, n: int) -> Start | None:
+    def _verdict(self, fit: "_RigidFit") -> Start | None:
+        n = fit.n
         if not self._found:
             self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
             return None
-        rivalry = Rivalry(n)
+        rivalry = Rivalry(fit.places_a, fit.places_b)
         found = sorted(((rivalry.evidence(each), each) for each in self._found), key=lambda f: -f[0])
         evidence, best = found[0]
         if rivalry.rivals(best, found, [each for _, each in found]):
@@ -98,7 +100,7 @@ class StartSearch:
         if len(fitting) < LEAST_FITTING:
             self.reason = f"{len(fitting)} tags fit the map, {LEAST_FITTING} must, as any one may have been moved"
             return None
-        if best.n < n and evidence <= MARGIN_NATS:
+        if best.n < n and evidence <= CHANCE_NATS:
             self.reason = f"of {n} tags that may be the map's {best.n} fit, which chance may bring about"
             return None
         self.reason = ""
@@ -112,25 +114,25 @@ class _RigidFit:
         own = np.array([i for i, _ in pairs], dtype=np.int64)
         rows: IntArray = (2 * own[:, None] + np.arange(2)).reshape(-1)
         in_map = known.rows([tag for _, tag in pairs])
-        self._n, self._own = len(pairs), own
-        self._a, self._b = known.mean[in_map].reshape(-1, 2), seen.places_m[own]
+        self.n, self._own = len(pairs), own
+        self.places_a, self.places_b = known.mean[in_map].reshape(-1, 2), seen.places_m[own]
         self._covariance_a = known.covariance[np.ix_(in_map, in_map)]
         self._covariance_b = seen.covariance[np.ix_(rows, rows)]
 
     def same_distances(self) -> list[tuple[int, int]]:
         """Which two pairs are of different tags that lie as far apart here as there."""
-        first, second = np.triu_indices(self._n, 1)
-        length_a, variance_a = distances(self._a, self._covariance_a, first, second)
-        length_b, variance_b = distances(self._b, self._covariance_b, first, second)
+        first, second = np.triu_indices(self.n, 1)
+        length_a, variance_a = distances(self.places_a, self._covariance_a, first, second)
+        length_b, variance_b = distances(self.places_b, self._covariance_b, first, second)
         fits = is_same_distance(length_a, length_b, variance_a + variance_b + 2.0 * UNMODELLED_SIGMA_M**2)
         fits &= self._own[first] != self._own[second]
         return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
 
     def grown(self, i: int, j: int) -> Explanation | None:
         """What fits with two pairs; None where they do not themselves."""
-        members = np.zeros(self._n, dtype=np.bool_)
+        members = np.zeros(self.n, dtype=np.bool_)
         members[[i, j]] = True
-        T = through(self._a[[i, j]], self._b[[i, j]])
+        T = through(self.places_a[[i, j]], self.places_b[[i, j]])
         for _ in range(_STEPS):
             held = hold(self._linear(T), members)
             T = held.T_a_b
@@ -145,9 +147,9 @@ class _RigidFit:
     def _linear(self, T: FloatArray) -> Linear:
         cos, sin = np.cos(T[2]), np.sin(T[2])
         R = np.array([[cos, -sin], [sin, cos]])
-        n = self._n
+        n = self.n
         turned = np.einsum("ab,ibjc,dc->iajd", R, self._covariance_b.reshape(n, 2, n, 2), R).reshape(2 * n, 2 * n)
-        in_a = se2.apply(T, self._b)
+        in_a = se2.apply(T, self.places_b)
         centre = in_a.mean(axis=0)
         by_transform = np.zeros((n, 2, 3))
         by_transform[:, :, :2] = -np.eye(2)
@@ -156,4 +158,6 @@ class _RigidFit:
         covariance[np.diag_indices(2 * n)] += UNMODELLED_SIGMA_M**2
         unbent = Bend(T, _NONE, _NONE)
         none = np.zeros((2 * n, 0))
-        return Linear(unbent, centre, (self._a - in_a).reshape(-1), covariance, by_transform.reshape(-1, 3), none, none)
+        return Linear(
+            unbent, centre, (self.places_a - in_a).reshape(-1), covariance, by_transform.reshape(-1, 3), none, none
+        )

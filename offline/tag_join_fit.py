@@ -21,7 +21,8 @@ from calib.arrays import FloatArray, IntArray
 from offline.condensed import quarter_turned
 from offline.corner_factors import SpatialState
 from offline.corner_solver import CornerSolution
-from offline.joint_fit import FALSE_ALARM, REACH_M, UNMODELLED_SIGMA_M
+from offline.joint_fit import REACH_M, UNMODELLED_SIGMA_M
+from offline.tag_fit import FALSE_ALARM
 
 _STEPS: Final = 6
 _STRAIGHT_SIGMAS: Final = 2.0
