@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -57,23 +57,27 @@ OTHER_FORMS: Final = {
 """Those that take other files of somebody's."""
 
 
-# Measures each file in a child of its own, which begins with all modules there. Its children count too.
+# Measures in one process what each file takes; the peak is reset in between. Children count too. Not in forks of it:
+# they would begin without the pages of libraries, which they take later.
 _MEASURE = """
-import contextlib, importlib, io, json, os, re, resource, shutil, sys, tempfile
+import contextlib, importlib, io, json, re, resource, shutil, sys, tempfile
 from pathlib import Path
 from offline import cli
 for name in sys.argv[1].split(","):
     importlib.import_module(name)
+resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))  # who measures shall not be taken down by it
 
 def status(name):
     return int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024
 
-def run(words, write):
-    resource.setrlimit(resource.RLIMIT_CPU, (90, 90))  # so that who measures is not taken down by what is measured
-    resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))
-    Path("/proc/self/clear_refs").write_text("5")  # the peak is that of the command alone
-    idle, out, code = status("VmRSS"), io.StringIO(), 0
-    sys.argv = words
+def cpu_seconds():
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+for line in sys.stdin:
+    place = Path(tempfile.mkdtemp())
+    sys.argv = ["groundsbot-offline", *(word.replace("OUT", str(place / "new")) for word in json.loads(line))]
+    Path("/proc/self/clear_refs").write_text("5")
+    idle, out, start, code = status("VmRSS"), io.StringIO(), cpu_seconds(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         try:
             cli.main()
@@ -82,48 +86,26 @@ def run(words, write):
         except BaseException as error:
             code = 99
             print("TRACEBACK", type(error).__name__, error)
-    os.write(write, json.dumps([code, status("VmHWM") - idle, out.getvalue()[-300:]]).encode())
-
-for line in sys.stdin:
-    place = Path(tempfile.mkdtemp())
-    words = ["groundsbot-offline", *(word.replace("OUT", str(place / "new")) for word in json.loads(line))]
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        run(words, write)
-        os._exit(0)
-    os.close(write)
-    _, _, used = os.wait4(child, 0)
-    code, extra_bytes, said = json.loads(os.read(read, 1 << 16) or b'[99, 0, "killed"]')
-    os.close(read)
+    taken = cpu_seconds() - start, status("VmHWM") - idle
     shutil.rmtree(place)
-    print(json.dumps([code, used.ru_utime + used.ru_stime, extra_bytes, said]), flush=True)
+    print(json.dumps([code, *taken, out.getvalue()[-300:]]), flush=True)
 """
 
 
 def measure(form: Form, files: Mapping[str, Path], beside: Mapping[str, Path] | None = None) -> dict[str, Taken]:
-    """What a command takes of each file; `beside`: the other files that its words name."""
-    return dict(measured(form, files, beside))
-
-
-def measured(
-    form: Form, files: Mapping[str, Path], beside: Mapping[str, Path] | None = None
-) -> Iterator[tuple[str, Taken]]:
-    """As `measure`, each as it ends."""
-    with subprocess.Popen(
+    """What a command takes of each file, one after the other; `beside`: the other files that its words name."""
+    asked = "".join(json.dumps(_words(form, {"FILE": path, **(beside or {})})) + "\n" for path in files.values())
+    ended = subprocess.run(
         [sys.executable, "-c", _MEASURE, form.modules],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
+        input=asked,
+        capture_output=True,
         text=True,
+        check=False,
         cwd=Path(__file__).parents[1],
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        for name, path in files.items():
-            process.stdin.write(json.dumps(_words(form, {"FILE": path, **(beside or {})})) + "\n")
-            process.stdin.flush()
-            yield name, Taken(*json.loads(process.stdout.readline()))
-        process.stdin.close()
+    )
+    lines = ended.stdout.splitlines()
+    assert len(lines) == len(files), ended.stderr
+    return {name: Taken(*json.loads(line)) for name, line in zip(files, lines, strict=True)}
 
 
 def _words(form: Form, files: Mapping[str, Path]) -> list[str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from offline.map_command import MapOptions, make_map
 from tests.hostile_files import FILES, LOGS, truth_and_survey
 from tests.hostile_logs import LIMIT_BYTES, honest
-from tests.taken_by_commands import LOG_FORMS, MAP_FORMS, OTHER_FORMS, Form, measured
+from tests.taken_by_commands import LOG_FORMS, MAP_FORMS, OTHER_FORMS, Form, measure
 
 _SECONDS = 10.0
 _EXTRA_BYTES = 256 << 20
@@ -34,7 +34,8 @@ def main() -> int:
         folder = Path(name)
         beside = _beside(folder)
         for command, form, files in _cases(folder, [*dict.fromkeys(options.commands)], options.only):
-            for case, taken in measured(form, files, beside):
+            for case, path in files.items():
+                taken = measure(form, {case: path}, beside)[case]
                 bad = taken.seconds > _SECONDS or taken.extra_bytes > _EXTRA_BYTES or taken.code not in (0, 1, 3)
                 over += bad
                 figures = f"{taken.seconds:6.2f} s {taken.extra_bytes / 2**20:6.1f} MiB"
