@@ -53,6 +53,8 @@ bench: $(READY)
 	$(BIN)/python -m tests.benchmarks.solver_bench
 	$(BIN)/python -m tests.benchmarks.solver_scaling
 	$(BIN)/python -m tests.benchmarks.stages_bench
+	$(BIN)/python -m tests.benchmarks.corners_bench
+	$(BIN)/python -m tests.benchmarks.thinning_bench
 
 # Writes requirements.lock anew: exact versions and hashes for every platform.
 lock: $(READY)

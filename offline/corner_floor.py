@@ -17,7 +17,7 @@ from offline.corner_factors import SpatialState, spatial_values
 from offline.corner_kernels import N_LOOK, add_wobble
 from offline.corner_problem import CORNER_LOSS, LOOKS, CornerProblem
 from offline.front_kernels import add_vectors
-from offline.fronts import NotPositiveError
+from offline.fronts import FrontFactor, NotPositiveError
 
 LEVEL: Final = np.zeros(3)
 # rad and m: a floor between a hall's and a lawn's; first looked for about here, and ten times nearer to level.
@@ -33,14 +33,15 @@ _UNLIKELINESS_TOLERANCE: Final = 0.1  # chance moves it by more
 _MOST_LOOKS: Final = 40
 
 
-def guessed_wobble(problem: CornerProblem, state: SpatialState) -> FloatArray:
+def guessed_wobble(problem: CornerProblem, state: SpatialState, factor: FrontFactor | None = None) -> FloatArray:
     """(3,) sigmas in WOBBLE to begin with, zeros where a level floor explains the corners as well.
 
     Args:
         problem: of a level floor.
         state: its solution.
+        factor: of H there, if it is at hand.
     """
-    if not _shows(problem, state):
+    if not _shows(problem, state, factor or problem.factor(state)):
         return LEVEL
     guesses = [scale * _USUAL for scale in (1.0, _NEARER)]
     unlikely = [_unlikeliness(with_wobble(problem, sigma), state) for sigma in (LEVEL, *guesses)]
@@ -48,7 +49,7 @@ def guessed_wobble(problem: CornerProblem, state: SpatialState) -> FloatArray:
     return guesses[best] if unlikely[1 + best] < unlikely[0] - _BETTER else LEVEL
 
 
-def _shows(problem: CornerProblem, state: SpatialState) -> bool:
+def _shows(problem: CornerProblem, state: SpatialState, factor: FrontFactor) -> bool:
     """Whether a level floor leaves over more than chance in how pictures stand, by the slope of the likelihood there.
 
     By the square of a sigma that is half of sum f^2 - tr(B^T P B) over pictures, with f = B^T W r what pulls at a
@@ -61,7 +62,7 @@ def _shows(problem: CornerProblem, state: SpatialState) -> bool:
     own, force = np.zeros((n, 3, 3)), np.zeros((n, 3))
     coupled = np.empty((len(looks.looks), 3, N_LOOK))
     add_wobble(looks.arrays, looks.lenses, CORNER_LOSS, spatial_values(state), picture, own, force, coupled)
-    factor, kind, random = problem.factor(state), problem.order.kinds[LOOKS], np.random.default_rng(0)
+    kind, random = problem.order.kinds[LOOKS], np.random.default_rng(0)
     for of in (slice(0, 2), slice(2, 3)):
         whole = float(np.trace(own[:, of, of], axis1=1, axis2=2).sum())
         taken = []

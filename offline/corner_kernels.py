@@ -93,7 +93,7 @@ def add_looks(
     r, J, B, normal = np.empty(8), np.empty((8, N_LOOK)), np.empty((8, 3)), np.empty((N_LOOK, N_LOOK))
     eye = _Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     total, is_whole = 0.0, len(system.entries) > 0
-    free, place = np.empty(N_LOOK, dtype=np.int64), np.empty(N_LOOK, dtype=np.int64)
+    free, place = np.empty(N_LOOK, dtype=np.uint64), np.empty(N_LOOK, dtype=np.uint64)
     for m in range(len(looks.pose)):
         _face(looks, m, values.calibration, eye)
         look_factor(looks, lenses, m, values, eye, r, J, B)
@@ -187,7 +187,7 @@ def add_motions(odometry: Odometry, loss: Loss, values: Values, kind: Kind, syst
     odometry, values, kind, system = borrowed(odometry), borrowed(values), borrowed(kind), borrowed(system)
     C, product, J, heavy = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, N_MOTION)), np.empty((3, N_MOTION))
     normal, vector = np.empty((N_MOTION, N_MOTION)), np.empty(N_MOTION)
-    free, place = np.empty(N_MOTION, dtype=np.int64), np.empty(N_MOTION, dtype=np.int64)
+    free, place = np.empty(N_MOTION, dtype=np.uint64), np.empty(N_MOTION, dtype=np.uint64)
     total, is_whole = 0.0, len(system.entries) > 0
     for m in range(len(odometry.first)):
         i = odometry.first[m]

@@ -74,7 +74,7 @@ def refine(
         return None, []  # the map says so already
     corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
     found = solve_corners(corners.problem, start)
-    sigma = guessed_wobble(found.problem, found.state)
+    sigma = guessed_wobble(found.problem, found.state, found.factor)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
         sigma = fitted_wobble(found.problem, found.state)
