@@ -132,7 +132,7 @@ def weighed(residual: FloatArray, spread: FloatArray, threshold: float) -> float
 
 @jitted
 def substituted(
-    left: FloatArray, points: FloatArray, after: FloatArray, border: FloatArray, out: FloatArray
+    left: FloatArray, points: FloatArray, after: FloatArray, border: FloatArray, twist: FloatArray, out: FloatArray
 ) -> FloatArray:
     """Poses from the rows that they left.
 
@@ -141,6 +141,7 @@ def substituted(
         points: (M, 3) about which they are.
         after: (3,) step of the pose after them.
         border: (>= n,) step of the border.
+        twist: (5,) of `move`.
         out: (M, 3) takes the poses.
 
     Returns:
@@ -160,18 +161,25 @@ def substituted(
                 total -= row[c] * step[c]
             step[i] = total / row[i]
         following[:] = step
-        move(points[m], step, out[m])
+        move(points[m], step, twist, out[m])
     return following
 
 
 @jitted
-def move(point: FloatArray, step: FloatArray, out: FloatArray) -> None:
-    """Sets a pose (3,) to point o exp(step)."""
-    along, even, _ = series(step[2])
-    across = step[2] * even
-    x, y = along * step[0] - across * step[1], across * step[0] + along * step[1]
+def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray) -> None:
+    """Sets a pose (3,) to where a step (3,) takes it of which a twist (5,) is common to all, see `online_turn`."""
+    turn, dx, dy, cx, cy = twist[0], twist[1], twist[2], twist[3], twist[4]
     cos, sin = np.cos(point[2]), np.sin(point[2])
-    out[0], out[1] = point[0] + cos * x - sin * y, point[1] + sin * x + cos * y
+    vx, vy = dx - turn * (point[1] - cy), dy + turn * (point[0] - cx)
+    own = step[2] - turn
+    along, even, _ = series(own)
+    u, v = step[0] - cos * vx - sin * vy, step[1] + sin * vx - cos * vy
+    x, y = along * u - own * even * v, own * even * u + along * v
+    x, y = point[0] + cos * x - sin * y - cx, point[1] + sin * x + cos * y - cy
+    along, even, _ = series(turn)
+    cos, sin = np.cos(turn), np.sin(turn)
+    out[0] = cx + along * dx - turn * even * dy + cos * x - sin * y
+    out[1] = cy + turn * even * dx + along * dy + sin * x + cos * y
     out[2] = wrapped(point[2] + step[2])
 
 

@@ -10,7 +10,7 @@ from offline.online_root import SLICE, Lifted, OnlineRoot
 from offline.run import TagKey
 from offline.suspects_search import FALSE_ALARM
 
-CALLED: Final = 50_000  # what calling many small functions costs, in multiplications
+CALLED: Final = 150_000  # what calling many small functions costs, in multiplications
 # A tag that was judged otherwise is not judged again before so many more readings have come.
 _LEAST_MORE: Final = 20
 _LEAST_HELD: Final = 3

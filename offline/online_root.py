@@ -20,16 +20,16 @@ from offline.online_answers import carried, foretold, move, moved_on, snooped, t
 from offline.online_drive import Drive
 from offline.online_kernels import BY_POINTS, Border, Motions, Sights, sweep
 from offline.online_prior import OnlinePrior, padded
-from offline.online_turn import Known, pose_among, relaxed, turned
+from offline.online_turn import Known, pose_among, relaxed, turned, twist_of
 from offline.run import TagKey
 from offline.solver import HUBER_THRESHOLD
 
 _DIAGONAL: Final = np.arange(3), np.arange(3)
 # Of a start that is the frame: far below what anything is known to, and far above rounding.
 _HELD_SIGMA: Final = 1e-6
-_MOST_MOTIONS: Final = 64  # in one slice
-# Multiplications in one slice: some 0.2 ms.
-SLICE: Final = 300_000
+_MOST_MOTIONS: Final = 128  # in one slice
+# Multiplications in one slice: some 0.4 ms.
+SLICE: Final = 600_000
 # Costs that are worked out for one step: warm, most steps take one or two.
 _LEAST_COSTS: Final = 2
 _MOST_COSTS: Final = 24
@@ -100,6 +100,11 @@ class OnlineRoot:
         return turned(self._known, self.step[3:], self.prior.first_tag)
 
     @property
+    def twist(self) -> FloatArray:
+        """(5,) of the tags' mean motion in the step: turn, motion, and their middle."""
+        return twist_of(self._known, self.step[3:], self.prior.first_tag)
+
+    @property
     def is_determined(self) -> bool:
         """Whether anything tells where the pose is."""
         return bool((self._pose[_DIAGONAL] != 0.0).all())
@@ -108,7 +113,7 @@ class OnlineRoot:
     def pose(self) -> FloatArray:
         """(3,) x_m, y_m, theta_rad."""
         found = np.empty(3)
-        move(self.point, self.step, found)
+        move(self.point, self.step, self.twist, found)
         return found
 
     @property

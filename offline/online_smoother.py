@@ -160,13 +160,13 @@ class Smoother:
 
     def _substitute_back(self, root: OnlineRoot) -> Iterator[None]:
         """Has the points be where the root puts them."""
-        following, border = root.step[:3], root.step[3:]
+        following, border, twist = root.step[:3], root.step[3:], root.twist
         self._calibration, self._places[: root.prior.n_tags] = root.calibration, list(root.places_m)
-        move(root.point, following, self.drive.poses[root.keyframe])
+        move(root.point, following, twist, self.drive.poses[root.keyframe])
         n = 0
         for first, rows, points in root.left_behind():
             poses = self.drive.poses[first : first + len(rows)]
-            following, n = substituted(rows, points, following, border, poses), n + len(rows)
+            following, n = substituted(rows, points, following, border, twist, poses), n + len(rows)
             if n >= _POSES_A_SLICE:
                 n = 0
                 yield

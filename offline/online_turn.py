@@ -44,59 +44,68 @@ def turned(known: Known, step: FloatArray, first: int) -> FloatArray:
     return moved
 
 
-@inner
-def _turn(known: Known, step: FloatArray, first: int, moved: FloatArray) -> tuple[float, float, FloatArray]:
-    """The turn that all tags make in the mean, its lever (m^2), and their mean place and motion.
+@jitted
+def twist_of(known: Known, step: FloatArray, first: int) -> FloatArray:
+    """(5,) what is common to the steps of all tags: a twist (turn and motion, as of a pose), and their middle."""
+    return _twist(known, step, first)[0]
 
-    Both together are a twist about the mean place, as in the step of a pose: the motion turns on its way.
-    """
-    mean, m = np.zeros(4), (len(step) - first) // 2
+
+@inner
+def _twist(known: Known, step: FloatArray, first: int) -> tuple[FloatArray, float]:
+    """And the tags' lever (m^2) about their middle."""
+    twist, lever, m = np.zeros(5), 0.0, (len(step) - first) // 2
     for t in range(m):
         for a in range(2):
-            mean[a] += known.places_m[t, a] / m
-            mean[2 + a] += step[first + 2 * t + a] / m
-    lever, turn = 0.0, 0.0
+            twist[1 + a] += step[first + 2 * t + a] / m
+            twist[3 + a] += known.places_m[t, a] / m
     for t in range(m):
-        x, y = known.places_m[t, 0] - mean[0], known.places_m[t, 1] - mean[1]
+        x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
         lever += x * x + y * y
-        turn += x * step[first + 2 * t + 1] - y * step[first + 2 * t]
-    turn = turn / lever if lever > 0.0 else 0.0
-    cos, sin = np.cos(turn), np.sin(turn)
-    along, even, _ = series(turn)
-    dx, dy = along * mean[2] - turn * even * mean[3], turn * even * mean[2] + along * mean[3]
-    for t in range(m):
-        at = first + 2 * t
-        x, y = known.places_m[t, 0] - mean[0], known.places_m[t, 1] - mean[1]
-        u, v = x + step[at] - mean[2] + turn * y, y + step[at + 1] - mean[3] - turn * x
-        moved[at], moved[at + 1] = dx + cos * u - sin * v - x, dy + sin * u + cos * v - y
-    return turn, lever, mean
+        twist[0] += x * step[first + 2 * t + 1] - y * step[first + 2 * t]
+    twist[0] = twist[0] / lever if lever > 0.0 else 0.0
+    return twist, lever
 
 
 @inner
-def _turn_back(
-    known: Known, step: FloatArray, first: int, told: tuple[float, float, FloatArray], slope: FloatArray
-) -> None:
+def _turn(known: Known, step: FloatArray, first: int, moved: FloatArray) -> tuple[FloatArray, float]:
+    """Has all tags move by the exponential of their twist, and what is left of each step turn with them."""
+    twist, lever = _twist(known, step, first)
+    turn = twist[0]
+    cos, sin = np.cos(turn), np.sin(turn)
+    along, even, _ = series(turn)
+    dx, dy = along * twist[1] - turn * even * twist[2], turn * even * twist[1] + along * twist[2]
+    for t in range((len(step) - first) // 2):
+        at = first + 2 * t
+        x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
+        u, v = x + step[at] - twist[1] + turn * y, y + step[at + 1] - twist[2] - turn * x
+        moved[at], moved[at + 1] = dx + cos * u - sin * v - x, dy + sin * u + cos * v - y
+    return twist, lever
+
+
+@inner
+def _turn_back(known: Known, step: FloatArray, first: int, told: tuple[FloatArray, float], slope: FloatArray) -> None:
     """Makes a slope (n,) by where the border is one by the step."""
-    turn, lever, mean = told
+    twist, lever = told
+    turn = twist[0]
     cos, sin, m = np.cos(turn), np.sin(turn), (len(step) - first) // 2
     along, even, odd = series(turn)
     by_turn, by_x, by_y = 0.0, 0.0, 0.0
     for t in range(m):
         at = first + 2 * t
-        x, y = known.places_m[t, 0] - mean[0], known.places_m[t, 1] - mean[1]
-        u, v = step[at] - mean[2] + turn * y, step[at + 1] - mean[3] - turn * x
+        x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
+        u, v = step[at] - twist[1] + turn * y, step[at + 1] - twist[2] - turn * x
         p, q = cos * slope[at] + sin * slope[at + 1], cos * slope[at + 1] - sin * slope[at]
         by_x += along * slope[at] + turn * even * slope[at + 1] - p
         by_y += along * slope[at + 1] - turn * even * slope[at] - q
         by_turn += q * u - p * v
-        by_turn += slope[at] * ((odd - turn * even) * mean[2] - (along - even) * mean[3])
-        by_turn += slope[at + 1] * ((along - even) * mean[2] + (odd - turn * even) * mean[3])
+        by_turn += slope[at] * ((odd - turn * even) * twist[1] - (along - even) * twist[2])
+        by_turn += slope[at + 1] * ((along - even) * twist[1] + (odd - turn * even) * twist[2])
         slope[at], slope[at + 1] = p, q
     if lever == 0.0:
         by_turn, lever = 0.0, 1.0
     for t in range(m):
         at = first + 2 * t
-        x, y = known.places_m[t, 0] - mean[0], known.places_m[t, 1] - mean[1]
+        x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
         slope[at] += by_x / m - by_turn * y / lever
         slope[at + 1] += by_y / m + by_turn * x / lever
 

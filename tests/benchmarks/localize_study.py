@@ -66,6 +66,10 @@ _EXTENDED_EVERY: Final = 10
 _SEEDS_A_TOWN: Final = 10
 
 
+# Of one keyframe: the motion that leads to it, if any, and what was read there.
+Taken = tuple[tuple[FloatArray, FloatArray, FloatArray] | None, list[TagReading]]
+
+
 @dataclass(frozen=True)
 class Scene:
     """A map, a run in it, and the truth in the map's frame."""
@@ -212,9 +216,7 @@ def filtered(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
     return online, milliseconds
 
 
-def taken_one_by_one(
-    chain: Chain,
-) -> Iterator[tuple[tuple[FloatArray, FloatArray, FloatArray] | None, list[TagReading]]]:
+def taken_one_by_one(chain: Chain) -> Iterator[Taken]:
     """Of each keyframe the motion that leads to it, if any, and what was read there."""
     odometry, readings = chain.odometry, chain.readings
     begin = np.searchsorted(readings.keyframe, np.arange(len(chain.stamps_ns) + 1))
