@@ -13,7 +13,8 @@ from offline.corner_graph import CornerGraph, corner_graph
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.factors import State
 from offline.graph import Graph, Parameter
-from offline.result import TagPose
+from offline.level_stretches import stretches_off_level
+from offline.result import FloorSigmas, TagPose
 from offline.solver import Solution
 
 # Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
@@ -31,6 +32,12 @@ class Refined:
     def parameters(self) -> tuple[Parameter, ...]:
         """Calibration numbers, in order."""
         return self.corners.parameters
+
+    @property
+    def floor(self) -> FloorSigmas:
+        """How uneven the floor is; a floor rolls and pitches alike."""
+        tilt_rad, _, height_m = self.solution.problem.wobble_sigma.tolist()
+        return FloorSigmas(tilt_rad, height_m)
 
     @property
     def tag_poses(self) -> Sequence[TagPose | None]:
@@ -68,7 +75,8 @@ def refine(
         upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
 
     Returns:
-        What came of it, or None, and sentences that say why the map stays as it was, or which tags lean.
+        What came of it, or None, and sentences that say why the map stays as it was, or which tags
+        and stretches of drives are not as they were taken to be.
     """
     if not solution.converged:
         return None, []  # the map says so already
@@ -79,11 +87,15 @@ def refine(
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
         sigma = fitted_wobble(found.problem, found.state)
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
+    off_level = stretches_off_level(graph, found)
     reason = "" if found.converged else found.reason
     if not reason and (share := found.problem.outliers(found.state)) > _MOST_OUTLIERS:
         reason = (
             f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
         )
     if reason:
-        return None, [f"not refined on tag corners: {reason}; the map is that of tag positions on the floor"]
-    return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags)
+        return None, [
+            *off_level,
+            f"not refined on tag corners: {reason}; the map is that of tag positions on the floor",
+        ]
+    return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags) + off_level

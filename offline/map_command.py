@@ -152,6 +152,7 @@ def summary(result: MapResult, output: Path) -> list[str]:
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     if result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
+    lines += _floor_lines(result)
     lines += _advice_lines(result)
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
@@ -236,6 +237,20 @@ def _noise_lines(fit: FittedNoise) -> list[str]:
         if each.kept not in ("", NOT_NEEDED):
             kept.setdefault(each.kept, []).append(f"{each.name} {each.value:.3g}")
     lines += [f"noise left as it was, since {why}: " + ", ".join(names) for why, names in kept.items()]
+    return lines
+
+
+def _floor_lines(result: MapResult) -> list[str]:
+    """How uneven the floor is, where corners tell."""
+    several = len(result.components) > 1
+    lines = []
+    for i, floor in enumerate(component.floor for component in result.components):
+        if floor is not None and (floor.sigma_tilt_rad or floor.sigma_height_m):
+            lines.append(
+                f"floor{f' of component {i}' if several else ''}: pictures roll and pitch by "
+                f"{degrees(floor.sigma_tilt_rad):.2f} deg and stand off by {1000.0 * floor.sigma_height_m:.1f} mm "
+                "(standard deviations)"
+            )
     return lines
 
 

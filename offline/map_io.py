@@ -16,7 +16,6 @@ import numpy as np
 from calib.arrays import FloatArray
 from calib.errors import CalibError
 from calib.files import written_whole
-from calib.noise import NoiseParameters
 from offline.array_file import open_arrays
 from offline.errors import OfflineError
 from offline.kept import KeptChain, arrays_of, calibration_from, chain_from
@@ -26,9 +25,11 @@ from offline.map_json import (
     alignment_from,
     array_from,
     check_from,
+    floor_from,
     map_as_json,
     measurement_from,
     noise_fit_from,
+    noise_from,
     number_from,
     tag_from,
 )
@@ -106,7 +107,7 @@ def read_map(folder: Path) -> MapResult:
         return MapResult(
             components=components,
             alignments=tuple(alignment_from(entry) for entry in data["alignments"]),
-            noise=NoiseParameters.model_validate(data["noise"]),
+            noise=noise_from(data["noise"]),
             noise_fit=noise_fit_from(data.get("noise_fit")),
             calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
             choices=tuple(CalibrationChoice(**entry) for entry in data.get("choices", ())),
@@ -191,6 +192,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         edges=_edges(f"{key}edges_", arrays),
         model=MapModel(entry.get("model", MapModel.FLOOR)),
         calibration=calibration_from(arrays, f"{key}calibration_"),
+        floor=floor_from(entry.get("floor")),
     )
 
 

@@ -4,12 +4,13 @@ docs/formats.md describes every key.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any, Final
 
 import numpy as np
 
 from calib.arrays import FloatArray
+from calib.noise import NoiseParameters
 from offline.result import (
     AdviceResult,
     AlignmentResult,
@@ -17,6 +18,7 @@ from offline.result import (
     Component,
     FittedNoise,
     FittedParameter,
+    FloorSigmas,
     MapResult,
     MeasurementResult,
     RivalResult,
@@ -50,7 +52,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
             for component in result.components
             for pair in component.start_to_start
         ],
-        "noise": result.noise.model_dump(),
+        "noise": result.noise.model_dump() | _floor_json(result.components[0].floor if result.components else None),
         "noise_fit": None if result.noise_fit is None else _plain(asdict(result.noise_fit)),
         "calibration": [_plain(vars(entry)) for entry in result.calibration],
         "choices": [_plain(vars(entry)) for entry in result.choices],
@@ -72,7 +74,23 @@ def _component_json(component: Component) -> dict[str, Any]:
         "model": component.model,
         "cost": _plain(component.cost),
         "n_residuals": component.n_residuals,
+        "floor": _floor_json(component.floor) or None,
     }
+
+
+def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:
+    return {} if floor is None else asdict(floor)
+
+
+def noise_from(entry: dict[str, Any]) -> NoiseParameters:
+    """Of `noise`; what it holds of the floor is each component's."""
+    floor = {each.name for each in fields(FloorSigmas)}
+    return NoiseParameters.model_validate({name: value for name, value in entry.items() if name not in floor})
+
+
+def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
+    """Of `floor` of a component."""
+    return None if entry is None else FloorSigmas(**entry)
 
 
 def _run_json(run: RunResult, component: int) -> dict[str, Any]:

@@ -292,7 +292,12 @@ def _noise(document: dict[str, Any]) -> Table:
         interval = ""
         if entry is not None and entry["low"] is not None and entry["high"] is not None:
             interval = f"{entry['low']:.3g} to {entry['high']:.3g}"
-        told = "given" if fit is None else "fitted" if interval else (entry or {}).get("kept") or "not needed"
+        if name in ("sigma_tilt_rad", "sigma_height_m"):
+            told = "of the floor, by corners"
+        elif fit is None:
+            told = "given"
+        else:
+            told = "fitted" if interval else (entry or {}).get("kept") or "not needed"
         rows.append((name, f"{value:.4g}", interval, told))
     note = (
         f"Fitted to what the readings of {', '.join(fit['runs'])} leave over."

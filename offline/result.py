@@ -166,6 +166,14 @@ class GraphEdges:
 
 
 @dataclass(frozen=True)
+class FloorSigmas:
+    """How far off level the base stands in each picture, as fitted to its corners; zeros on a level floor."""
+
+    sigma_tilt_rad: float  # roll and pitch
+    sigma_height_m: float
+
+
+@dataclass(frozen=True)
 class Component:
     """Runs and tags in one frame: the start of `frame_run`, which has no uncertainty."""
 
@@ -180,6 +188,7 @@ class Component:
     edges: GraphEdges | None = None
     model: MapModel = MapModel.FLOOR
     calibration: KeptCalibration | None = None  # with its covariance, and that with the tags
+    floor: FloorSigmas | None = None  # None where nobody looked at corners
 
     @property
     def tag_covariance(self) -> FloatArray:

@@ -26,7 +26,7 @@ from offline.global_map import component_of
 from offline.map_io import read_map, write_map
 from offline.map_model import MapModel
 from offline.pipeline import build_map, read_runs
-from offline.result import MapResult
+from offline.result import FloorSigmas, MapResult
 from offline.run import Detections, Run, load_run
 from offline.truth import read_truth
 from offline.workings import Workings
@@ -86,6 +86,8 @@ def test_a_refined_map_is_read_back_as_it_was_written(exact: MapResult, tmp_path
     write_map(exact, tmp_path)
     again = read_map(tmp_path)
     assert again.components[0].model is MapModel.CORNERS
+    assert again.components[0].floor == exact.components[0].floor == FloorSigmas(0.0, 0.0)
+    assert again.noise == exact.noise
     rows = list(csv.DictReader((tmp_path / "tags.csv").open()))
     for tag, found, made, row in zip(exact.components[0].tags, again.components[0].tags, TAGS, rows, strict=True):
         assert tag.pose is not None

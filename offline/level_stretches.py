@@ -1,0 +1,182 @@
+"""Stretches of a drive that are not level with the rest, a ramp or another floor: found and said, not modelled.
+
+All drives are taken to be on one floor, off level anew in each picture by the floor's sigmas. Let all pictures of a
+stretch stand off by the same roll, pitch and height m besides. At the solution the slope of the cost by m is
+g = B^T V^-1 r, with V the corners' covariance, how single pictures stand included, and what all else leaves of the
+information about m is L = B^T V^-1 B - C H^-1 C^T, with C = B^T V^-1 J: a score test, exact to first order, and without
+another solve (Rao, "Large sample tests of statistical hypotheses", 1948). A stretch whose tags nobody sees from
+elsewhere has L = 0: they took the slope for their own.
+"""
+
+from math import degrees
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.arrays import FloatArray, IntArray
+from offline.chain import Chain
+from offline.corner_solver import CornerSolution
+from offline.graph import Graph
+from offline.joint_fit import UNMODELLED_SIGMA_M
+
+# Of way, or of turning; a ramp is longer, and a bump is none.
+_STRETCH_M: Final = 2.0
+_STRETCH_RAD: Final = 1.0
+# One false word in a hundred maps (Bonferroni over all stretches).
+_FALSE_ALARM: Final = 0.01
+# Squared sigmas: of level stretches, whose poses and tags are estimated, less than a tenth look so much off.
+_MAY_BE: Final = float(chi2.isf(0.1, 3))
+# rad, rad and m: what is known no better than this is not known.
+_COARSE: Final = np.array([0.1, 0.1, 0.5])
+
+
+class _Pictures(NamedTuple):
+    """What the looks of each of P pictures say of how it stands, single pictures' standing eliminated.
+
+    Attributes:
+        pose: (P,) keyframe; slope: (P, 3) of the cost; information: (P, 3, 3).
+        look_picture: (M,) of each look; coupled: (M, 3, 18) with its columns (M, 18).
+        range_m: (P,) to the tags, in the mean.
+    """
+
+    pose: IntArray
+    slope: FloatArray
+    information: FloatArray
+    look_picture: IntArray
+    coupled: FloatArray
+    columns: IntArray
+    range_m: FloatArray
+
+
+class _OffLevel(NamedTuple):
+    """How far a stretch is off in roll, pitch and height, with sigmas; in squared sigmas, and their freedom."""
+
+    off: FloatArray
+    sigma: FloatArray
+    square: float
+    freedom: int
+
+
+def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
+    """A sentence for each stretch of a chain that stands otherwise than the rest, beyond the floor's own sigmas.
+
+    The worst is taken first and the others judged given it: what a ramp bends looks off level too.
+    """
+    if solution.factor is None:
+        return []
+    pictures = _pictures(solution)
+    firsts = graph.first_pose.tolist()
+    cut = [each for chain, first in zip(graph.chains, firsts, strict=True) for each in _cut(chain, first, pictures)]
+    asked = [each for each in cut if _shows(pictures, each)]
+    couplings = [_coupled(pictures, each, solution.problem.columns.n) for each in asked]
+    taken = [np.stack([solution.factor.solve(row) for row in each]) for each in couplings]
+    cross = np.array([[one @ other.T for other in taken] for one in couplings]).reshape(len(asked), len(asked), 3, 3)
+    slope = np.array([pictures.slope[each].sum(axis=0) for each in asked]).reshape(-1, 3)
+    left = -cross
+    for k, each in enumerate(asked):
+        left[k, k] += pictures.information[each].sum(axis=0)
+    found: dict[int, _OffLevel] = {}
+    while len(found) < len(asked):
+        judged = {
+            k: _off_level(slope[k], left[k, k], float(pictures.range_m[asked[k]].mean()))
+            for k in range(len(asked))
+            if k not in found
+        }
+        counting = {k: each for k, each in judged.items() if each is not None and _counts(each, solution, len(cut))}
+        if not counting:
+            break
+        worst = max(counting, key=lambda k: counting[k].square)
+        found[worst] = counting[worst]
+        gain = left[:, worst] @ np.linalg.pinv(left[worst, worst], hermitian=True)
+        slope, left = slope - gain @ slope[worst], left - np.einsum("kab,jcb->kjac", gain, left[:, worst])
+    return [
+        _sentence(graph, asked[k], found[k], pictures, solution) for k in sorted(found, key=lambda k: -found[k].square)
+    ]
+
+
+def _pictures(solution: CornerSolution) -> _Pictures:
+    problem, state = solution.problem, solution.state
+    linearised, wobble = problem.corners.linearise(state, problem.columns)
+    ((columns, jacobian),) = linearised.blocks
+    weight = problem.weighed(linearised.residual, wobble).weight
+    picture, n = problem.pictures
+    heavy = (weight[:, None, None] * wobble).swapaxes(-1, -2)
+    own, slope, range_m = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+    np.add.at(own, picture, heavy @ wobble)
+    np.add.at(slope, picture, (heavy @ linearised.residual[..., None])[..., 0])
+    looks = problem.corners.looks
+    far_m = np.linalg.norm(state.tags[looks.tag] - state.poses[looks.pose, :2], axis=1)
+    np.add.at(range_m, picture, far_m)
+    pose = np.zeros(n, dtype=np.int64)
+    pose[picture] = looks.pose
+    spread = np.linalg.inv(np.eye(3) + own * problem.wobble_sigma**2)
+    return _Pictures(
+        pose=pose,
+        slope=(spread @ slope[..., None])[..., 0],
+        information=spread @ own,
+        look_picture=picture,
+        coupled=spread[picture] @ heavy @ jacobian,
+        columns=columns,
+        range_m=range_m / np.bincount(picture, minlength=n),
+    )
+
+
+def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[IntArray]:
+    """Pictures of a chain, cut by the way driven and by what was turned."""
+    steps = np.maximum(chain.odometry.distance_m / _STRETCH_M, np.abs(chain.odometry.motion[:, 2]) / _STRETCH_RAD)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    own = np.flatnonzero((pictures.pose >= first) & (pictures.pose < first + len(along)))
+    cell = along[pictures.pose[own] - first].astype(np.int64)
+    return [own[cell == c] for c in np.unique(cell)]
+
+
+def _shows(pictures: _Pictures, which: IntArray) -> bool:
+    """Whether a stretch might be off: as good as certain poses and tags are not, it can only look less so."""
+    slope, information = pictures.slope[which].sum(axis=0), pictures.information[which].sum(axis=0)
+    return float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) > _MAY_BE
+
+
+def _coupled(pictures: _Pictures, which: IntArray, n: int) -> FloatArray:
+    """C (3, n) of a stretch."""
+    looks = np.flatnonzero(np.isin(pictures.look_picture, which))
+    coupled = np.zeros((3, n + 1))  # the last takes what is held
+    for k in range(3):
+        np.add.at(coupled[k], pictures.columns[looks], pictures.coupled[looks, k])
+    return coupled[:, :n]
+
+
+def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel | None:
+    """None where nothing is known of how the stretch lies to the rest."""
+    unit = np.diag(_COARSE)
+    values, ways = np.linalg.eigh(unit @ (0.5 * (left + left.T)) @ unit)
+    known = values > 1.0
+    if not known.any():
+        return None
+    ways, values = unit @ ways[:, known], values[known]
+    off = -(ways.T @ slope) / values
+    turned = UNMODELLED_SIGMA_M / range_m
+    back = np.linalg.pinv(ways)
+    covariance = np.diag(1.0 / values) + back @ np.diag([turned, turned, UNMODELLED_SIGMA_M]) ** 2 @ back.T
+    sigma = np.sqrt(np.diag(ways @ covariance @ ways.T))
+    return _OffLevel(ways @ off, sigma, float(off @ np.linalg.solve(covariance, off)), int(known.sum()))
+
+
+def _counts(stretch: _OffLevel, solution: CornerSolution, n: int) -> bool:
+    """Whether chance does not explain it, and it is more than the floor is uneven by from picture to picture."""
+    beyond = bool((np.abs(stretch.off) > solution.problem.wobble_sigma).any())
+    return beyond and stretch.square > float(chi2.isf(_FALSE_ALARM / n, stretch.freedom))
+
+
+def _sentence(graph: Graph, which: IntArray, stretch: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:
+    index = int(np.searchsorted(graph.first_pose, pictures.pose[which[0]], side="right")) - 1
+    chain, first = graph.chains[index], int(graph.first_pose[index])
+    begin_s, end_s = ((chain.stamps_ns[pictures.pose[k] - first] - chain.stamps_ns[0]) * 1e-9 for k in which[[0, -1]])
+    x_m, y_m = solution.state.poses[pictures.pose[which], :2].mean(axis=0)
+    (roll, pitch, height_m), (d_roll, d_pitch, d_height_m) = stretch.off, stretch.sigma
+    return (
+        f"{chain.name} is not level with the rest from {begin_s:.0f} to {end_s:.0f} s, about ({x_m:.1f}, {y_m:.1f}) m: "
+        f"pitch {degrees(pitch):+.1f} deg (sigma {degrees(d_pitch):.1f}), roll {degrees(roll):+.1f} deg "
+        f"({degrees(d_roll):.1f}), height {height_m:+.2f} m ({d_height_m:.2f}): a ramp or another floor? The map takes "
+        "all for one level floor, and is bent there; leave that part of the drive out"
+    )
