@@ -17,7 +17,10 @@ from offline.arrowhead_blocks import Rows, System
 from offline.arrowhead_tree import Tree
 
 _AT_ONCE: Final = 1024
-_FEW: Final = 2**22  # numbers, which are better kept with their zeros
+# Numbers are kept with their zeros, which makes products ten times quicker, where there are few, and where what is
+# not zero would take half as much memory.
+_FEW: Final = 2**22
+_SPARSE: Final = 3
 
 
 class SquareRoot(NamedTuple):
@@ -43,7 +46,11 @@ class SquareRoot(NamedTuple):
     def summed(self, columns: sparse.csc_array) -> "SquareRoot":
         """Of sums of the columns, as a sparse matrix (k, n) has them."""
         below = sparse.csc_array(self.below @ columns) if self.below.shape[0] else self.below
-        return SquareRoot(np.asarray((columns.T @ self.top.T).T), below)
+        top = np.empty((len(self.top), columns.shape[1]))
+        for begin in range(0, len(top), _AT_ONCE):  # each time the rows are copied
+            some = slice(begin, begin + _AT_ONCE)
+            top[some] = (columns.T @ self.top[some].T).T
+        return SquareRoot(top, below)
 
     def against(self, other: "SquareRoot") -> FloatArray:
         """Z^T Z' between these columns and another's."""
@@ -90,15 +97,18 @@ def square_root(tree: Tree, rows: Rows, top: FloatArray, wanted: IntArray) -> Sq
     """
     sent = [_Sent(node, who, _on_front(tree, node, wanted[who])) for node, who in _by_node(tree, wanted)]
     passed = list(_to_the_top(tree, rows, top, sent))
-    n_rows = sum(len(each.values) for each in passed)
-    kept = [each for each in passed if each.node == len(tree.level) - 1 or n_rows * len(wanted) < _FEW]
-    in_top = np.zeros((sum(len(each.values) for each in kept), len(wanted)))
-    n = 0
-    for _, who, Z in kept:
+    n_all = sum(len(each.values) for each in passed) * len(wanted)
+    is_dense = n_all < max(_FEW, _SPARSE * sum(each.values.size for each in passed))
+    kept = [each for each in passed if is_dense or each.node == len(tree.level) - 1]
+    below = [] if is_dense else [(each.who, each.values) for each in passed if each.node != len(tree.level) - 1]
+    del passed
+    n = sum(len(each.values) for each in kept)
+    in_top = np.zeros((n, len(wanted)))
+    while kept:  # they are many: let go of as soon as they are copied
+        _, who, Z = kept.pop()
+        n -= len(Z)
         in_top[n : n + len(Z), who] = Z
-        n += len(Z)
-    below = [each for each in passed if each.node != len(tree.level) - 1] if len(kept) < len(passed) else []
-    return SquareRoot(in_top, _sparse([(who, Z) for _, who, Z in below], len(wanted)))
+    return SquareRoot(in_top, _sparse(below, len(wanted)))
 
 
 def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.csc_array:

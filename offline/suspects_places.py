@@ -1,5 +1,6 @@
 """Sightings gathered into places: where these lie, and what every split of one would bring, all else giving way."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -13,6 +14,7 @@ from offline.suspects_information import Gathered, Information, rows_of
 
 # A place is somewhere within a kilometre: ties down what no reading does.
 NOWHERE: Final = 1e-6
+_AT_ONCE: Final = 256  # sightings
 
 
 @dataclass(frozen=True)
@@ -29,15 +31,20 @@ class Stiffness:
     gathered: Gathered
     covariance: FloatArray
 
-    def among(self, members: IntArray) -> FloatArray:
-        """(2 m, 2 m) between some sightings."""
-        rows = rows_of(members)
-        across = self.gathered.across(rows)
-        return self.information.among(rows) - across @ self.covariance @ across.T
+    def among_each(self, parts: Sequence[IntArray]) -> Iterator[FloatArray]:
+        """(2 m, 2 m) between the sightings of each part."""
+        for batch in _batches(parts):
+            across = self.gathered.across(rows_of(np.concatenate(batch)))
+            give_way = across @ self.covariance
+            end = 0
+            for members in batch:
+                begin, end = end, end + 2 * len(members)
+                yield self.information.among(rows_of(members)) - give_way[begin:end] @ across[begin:end].T
 
     def together(self, members: IntArray) -> FloatArray:
         """(2, 2) of some sightings moved as one."""
-        return np.asarray(self.among(members).reshape(len(members), 2, -1, 2).sum(axis=(0, 2)))
+        (among,) = self.among_each([members])
+        return np.asarray(among.reshape(len(members), 2, -1, 2).sum(axis=(0, 2)))
 
     def against(self, members: IntArray) -> FloatArray:
         """(2 K, 2) what all feel of some sightings moved as one."""
@@ -100,7 +107,10 @@ class Places:
         """Of each place its sightings."""
         order = np.argsort(self.place, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.place))[:-1]) if len(order) else []
-        return [Held(each, self.stiffness.among(each), self.pull[each]) for each in parts]
+        return [
+            Held(each, among, self.pull[each])
+            for each, among in zip(parts, self.stiffness.among_each(parts), strict=True)
+        ]
 
     def apart(self, evidence: Evidence, p: int, q: int) -> tuple[FloatArray, FloatArray]:
         """Place q as seen from place p (2,), and its covariance (2, 2)."""
@@ -131,6 +141,18 @@ def settled(evidence: Evidence, place: IntArray) -> Places:
     offset: FloatArray = -covariance @ gathered.summed(score[:, None])[:, 0]
     pull = score + information.times(offset[gathered.column, None])[:, 0]
     return Places(place, offset, covariance, pull.reshape(-1, 2), Stiffness(information, gathered, covariance))
+
+
+def _batches(parts: Sequence[IntArray]) -> Iterator[list[IntArray]]:
+    """Several parts at a time: what lies between them and all places goes through the whole root each time."""
+    batch: list[IntArray] = []
+    for each in parts:
+        batch.append(each)
+        if sum(map(len, batch)) >= _AT_ONCE:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:

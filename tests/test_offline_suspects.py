@@ -177,7 +177,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
         assert_allclose(parts.whole(), gather @ across, rtol=0.0, atol=1e-6 * whole.max())
         assert_allclose(parts.across(rows), across[rows], rtol=0.0, atol=1e-6 * whole.max())
     found = seen.places.stiffness
-    assert_allclose(found.among(members), stiffness[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
+    assert_allclose(next(found.among_each([members])), stiffness[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
     together = stiffness.reshape(n, -1, 2)[:, members].sum(axis=1)
     assert_allclose(found.against(members), together, rtol=0.0, atol=1e-6 * whole.max())
 
