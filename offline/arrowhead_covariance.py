@@ -96,19 +96,33 @@ def square_root(tree: Tree, rows: Rows, top: FloatArray, wanted: IntArray) -> Sq
         wanted: (k,) columns in the arrowhead's order, of tags or calibration.
     """
     sent = [_Sent(node, who, _on_front(tree, node, wanted[who])) for node, who in _by_node(tree, wanted)]
-    passed = list(_to_the_top(tree, rows, top, sent))
-    n_all = sum(len(each.values) for each in passed) * len(wanted)
-    is_dense = n_all < max(_FEW, _SPARSE * sum(each.values.size for each in passed))
-    kept = [each for each in passed if is_dense or each.node == len(tree.level) - 1]
-    below = [] if is_dense else [(each.who, each.values) for each in passed if each.node != len(tree.level) - 1]
-    del passed
-    n = sum(len(each.values) for each in kept)
-    in_top = np.zeros((n, len(wanted)))
-    while kept:  # they are many: let go of as soon as they are copied
-        _, who, Z = kept.pop()
-        n -= len(Z)
-        in_top[n : n + len(Z), who] = Z
+    last = len(tree.level) - 1
+    passing = _passing(tree, sent)
+    n_rows = {node: len(top) if node == last else int(tree.n_eliminated[node]) for node in passing}
+    n_values = sum(n_rows[node] * n for node, n in passing.items())
+    is_dense = sum(n_rows.values()) * len(wanted) < max(_FEW, _SPARSE * n_values)
+    in_top = np.zeros((sum(n_rows.values()) if is_dense else len(top), len(wanted)))
+    below: list[tuple[IntArray, FloatArray]] = []
+    n = 0
+    for node, who, Z in _to_the_top(tree, rows, top, sent):
+        if is_dense or node == last:
+            in_top[n : n + len(Z), who] = Z
+            n += len(Z)
+        else:
+            below.append((who, Z))
     return SquareRoot(in_top, _sparse(below, len(wanted)))
+
+
+def _passing(tree: Tree, sent: list["_Sent"]) -> dict[int, int]:
+    """How many columns come through each node on their way to the top, that included."""
+    found: dict[int, int] = {}
+    for each in sent:
+        node = each.node
+        found[node] = found.get(node, 0) + len(each.who)
+        while node != len(tree.level) - 1:
+            node = int(tree.parent[node])
+            found[node] = found.get(node, 0) + len(each.who)
+    return found
 
 
 def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.csc_array:

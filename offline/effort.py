@@ -29,7 +29,7 @@ _LEAST_OF_A_SOLVE: Final = 6
 # What map takes of memory for each keyframe and reading, fronts aside, as measured.
 _BYTES_A_KEYFRAME: Final = 3300.0
 _BYTES_A_READING: Final = 2900.0
-_FREE_BYTES: Final = 64 << 20
+_FREE_BYTES: Final = 56 << 20
 _BYTES_PER_BYTE: Final = 160.0
 # Stretches are laid over each other by the joint covariances of their tags. One stretch may see all tags that there
 # are; that others see them again takes a recorder some 26 readings of 200 bytes for each.

@@ -65,6 +65,10 @@ class LocalMap:
         """What the chain says of the calibration."""
         return self.graph.calibration_of(self.solution.state)
 
+    def without_factors(self) -> "LocalMap":
+        """The same, less the factorisation that its solution keeps for whoever asks again: it may be most of a map."""
+        return replace(self, solution=replace(self.solution))
+
 
 class _BuiltUp(NamedTuple):
     """What is known of a chain as far as it has been built up."""

@@ -218,7 +218,7 @@ def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) 
     with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps)
     with stages.stage("tags that do not belong"):
-        return [alone.split(each) for each in maps], broken
+        return [alone.split(each).without_factors() for each in maps], broken
 
 
 def _warnings(

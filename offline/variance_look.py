@@ -4,7 +4,7 @@ The problem is solved under them from where it was before, and what the estimate
 once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -93,6 +93,7 @@ class Looker:
         """Solves under variances (K,); `good` are no faults, where that is settled."""
         weights = self._odometry.whitening(variances), self._readings.whitening(variances)
         problem = self.solution.problem.reweighed(*weights)
+        self.solution = replace(self.solution, problem=problem)  # lets go of the factorisation of the look before
         self.solution = solve(
             problem,
             self.solution.state,
