@@ -206,7 +206,7 @@ class _Judge(Rivalry):
         their order, so this is that of the tags.
         """
         near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
-        worth = [its + self.of_group(each, [explanation, *groups]) for its, each in near]
+        worth = [its + self.of_groups(each, [explanation, *groups], 0.0) for its, each in near]
         covering = self.covariance(explanation)
         for its, (_, each) in sorted(zip(worth, near, strict=True), key=lambda w: w[1][1].members.tobytes()):
             if its > max(worth) - _DOUBT_NATS:

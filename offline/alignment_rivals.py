@@ -1,8 +1,8 @@
 """Which explanations of some shared tags leave it open which of them is true: a comparison of models by evidence.
 
 A shared tag is where it was, or it is of one group that moved as one (a shelf), or it was moved on its own. An
-explanation names the tags that are where they were; what it is worth is its evidence, and that of the best group among
-the rest, where these rather moved as one than each alone. Whether a group moved or all the others did, no likelihood
+explanation names the tags that are where they were; what it is worth is its evidence, and that of groups among the
+rest, where these rather moved as one than each alone. Whether a group moved or all the others did, no likelihood
 tells: both say the same of every tag. There the larger group stayed, if it is so many times larger.
 
 Evidence is held against chance: that one tag is where it was at most, and the others are wrong, each where it happens
@@ -83,8 +83,8 @@ class Rivalry:
         return rivals
 
     def _worth(self, explanation: Explanation, groups: Sequence[Explanation]) -> float:
-        """Its evidence, with that of a group among the rest where this is more than such a group is rare."""
-        return self.evidence(explanation) + max(0.0, self.of_group(explanation, groups) - _GROUP_PRIOR_NATS)
+        """Its evidence, with that of groups among the rest where this is more than such a group is rare."""
+        return self.evidence(explanation) + self.of_groups(explanation, groups, _GROUP_PRIOR_NATS)
 
     def _has_group_of_its_own(self, other: Explanation, best: Explanation) -> bool:
         """Whether tags that do not fit the best rather moved as one than each alone: they may be what stayed."""
@@ -93,12 +93,25 @@ class Rivalry:
             return False
         return self._as_group(best, other.linear, own, self.n_shared) > 0.0
 
-    def of_group(self, explanation: Explanation, groups: Sequence[Explanation]) -> float:
-        """Evidence that some tags that it does not explain moved as one, over that each did alone; 0 if less."""
-        rest = ~explanation.members
-        moved = ((each.linear, each.members & rest) for each in groups)
-        worth = (self._as_group(explanation, linear, tags, int(rest.sum())) for linear, tags in moved if tags.sum() > 1)
-        return max([0.0, *worth])
+    def of_groups(self, explanation: Explanation, groups: Sequence[Explanation], rare_nats: float) -> float:
+        """Evidence that tags that it does not explain moved in groups, over that each did alone; 0 if less.
+
+        One group after the other, the most telling first, less how rare a group is: taken for so many tags on their
+        own, a second group would count by how far off it is as often as it has tags.
+        """
+        rest, evidence = ~explanation.members, 0.0
+        while True:
+            moved = [(each.linear, each.members & rest) for each in groups]
+            worth = [
+                (self._as_group(explanation, linear, tags, int(rest.sum())), i)
+                for i, (linear, tags) in enumerate(moved)
+                if tags.sum() > 1
+            ]
+            most, i = max(worth, default=(0.0, 0))
+            if most <= rare_nats:
+                return evidence
+            evidence += most - rare_nats
+            rest = rest & ~moved[i][1]
 
     def _as_group(self, explanation: Explanation, linear: Linear, tags: BoolArray, n: int) -> float:
         """Evidence that these tags, of n that may have moved, did so as one, over that each did alone.

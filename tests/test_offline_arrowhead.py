@@ -199,7 +199,8 @@ def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
     H, g = dense(problem, truth, SQUARES, SQUARES)
     arrowhead = arrowhead_of(problem)
     system, cost = arrowhead.linearise(truth)
-    assert cost == pytest.approx(problem.cost(truth, PLAIN_SQUARES), rel=1e-12)
+    # Places of 50 m are rounded to 1e-14 m, which a tape of millimetres weighs a thousandfold.
+    assert cost == pytest.approx(problem.cost(truth, PLAIN_SQUARES), rel=1e-10)
     assert np.linalg.norm(system.gradient[arrowhead.tangent] - g) <= 1e-9 * np.linalg.norm(g)
     x = np.random.default_rng(seed).standard_normal(len(g))
     product = arrowhead.product(system, arrowhead.in_order(x))[arrowhead.tangent]
