@@ -19,8 +19,9 @@ import numpy as np
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
-from offline.corner_kernels import LookArrays, SpatialValues, lenses_of
+from offline.corner_kernels import LookArrays, SpatialValues
 from offline.factors import Columns, Linearised, State
+from offline.lens_kernels import lenses_of
 from offline.tag_pose import UNIT_CORNERS
 
 # By how much camera.yaml's focal lengths are off, as a share: both alike, about the principal point, which is held.
