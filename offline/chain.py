@@ -13,8 +13,8 @@ from offline.readings import Readings, joined
 from offline.run import Detections, Positions, Run, TagKey
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
-KEYFRAME_DISTANCE_M: Final = 0.04
-KEYFRAME_TURN_RAD: Final = np.radians(2.0)
+KEYFRAME_DISTANCE_M: Final = 0.02
+KEYFRAME_TURN_RAD: Final = np.radians(1.0)
 # it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
 # look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
 _STANDING_TICKS: Final = 1.5

@@ -247,6 +247,7 @@ class CalibrationChoice:
         held_out_gain: log likelihood of each stretch by what the other stretches tell, over that by robot.yaml; summed.
             None where no two stretches tell anything of it.
         reason: why it stays as robot.yaml has it; empty where it is freed.
+        is_asked: it was asked for by its name.
     """
 
     owner: str
@@ -258,6 +259,7 @@ class CalibrationChoice:
     off_sigmas: float
     held_out_gain: float | None
     reason: str
+    is_asked: bool = False
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,7 @@ def _look(told: Told, sigmas: FloatArray, index: int, *, is_asked: bool) -> Cali
         off_sigmas=abs(whole.value) / (prior**2 + whole.variance) ** 0.5,
         held_out_gain=gain,
         reason=reason,
+        is_asked=is_asked,
     )
 
 

@@ -13,8 +13,8 @@ from tests.made_drives import HALL, made_drive, made_robot, write_drive
 
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Past tags at 0.1 m/s, where pictures are four times as dense as keyframes."""
-    drive = made_drive([1.0, 1.5, 0.3], [(0.1, 0.1, 6.0), (0.1, 0.06, 3.0)])
+    """Past tags at 0.05 m/s, where pictures are four times as dense as keyframes."""
+    drive = made_drive([1.0, 1.5, 0.3], [(0.05, 0.05, 12.0), (0.05, 0.03, 6.0)])
     return load_run(write_drive(tmp_path_factory.mktemp("slow"), drive, HALL[:3], made_robot("a"), corner_sigma_px=0.2))
 
 
@@ -23,7 +23,7 @@ def test_what_thinning_loses_is_what_fewer_pictures_tell_less(slow: Run) -> None
     assert found["pictures"] > 3 * found["keyframes"]
     # With n times the looks of a tag nearly as much more is known, but for what the wheels add between keyframes.
     assert 0.2 < found["lost"] < 1.0 - found["keyframes"] / found["pictures"]
-    assert np.degrees(chain.KEYFRAME_TURN_RAD) == pytest.approx(2.0)  # as before
+    assert np.degrees(chain.KEYFRAME_TURN_RAD) == pytest.approx(1.0)  # as before
 
 
 def test_the_bench_of_corners_counts_solves_on_the_floor(slow: Run, tmp_path: Path) -> None:

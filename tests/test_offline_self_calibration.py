@@ -22,7 +22,7 @@ from offline.run import RobotFile, read_robot_file
 from offline.self_calibration_gate import TELLS_LESS, Told, choose
 from offline.self_calibration_option import NAMES, Calibrate, parse_calibrate
 from offline.self_calibration_robot import LIMITS, Learnt, Owned, all_open, corrected, opened
-from offline.self_calibration_words import DRIVES
+from offline.self_calibration_words import DRIVES, freed_lines
 from tests.made_drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
 from tests.programs import Run as Program
 
@@ -124,6 +124,10 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     assert freed(result) == {"wheel_ratio"}
     reasons = {each.name: each.reason for each in result.choices}
     assert reasons["wheel_scale"] == TELLS_LESS
+    freed_line, refused_line = freed_lines(result)
+    assert freed_line.startswith("freed: wheel_ratio of a")
+    assert refused_line.startswith("not freed: wheel_scale of a: held by robot.yaml's sigma")
+    assert "--distance" in refused_line
     assert reasons["track_scale"] == "it was not asked for"
 
 

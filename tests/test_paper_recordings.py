@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from offline.cli import app
+from onboard.log_reader import find_logs, read_run_info
 from tests.recordings import RECORDINGS, needs_recordings
 
 ROOT = Path(__file__).parents[1]
@@ -18,12 +19,18 @@ pytestmark = needs_recordings
 
 
 @pytest.fixture(scope="module")
-def merged(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    folder = tmp_path_factory.mktemp("paper")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper") / "logs"
     for run in ("hallway", "loop"):
-        _succeeds("import", RECORDINGS / run, "-o", folder / "logs", "--state-rate-hz", 4.2, "--track-width-m", 0.508)
-    _succeeds("map", folder / "logs", "-o", folder / "map")
-    found: dict[str, object] = json.loads((folder / "map" / "map.json").read_text())
+        _succeeds("import", RECORDINGS / run, "-o", folder, "--state-rate-hz", 4.2, "--track-width-m", 0.508)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def merged(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("merged") / "map"
+    _succeeds("map", logs, "-o", folder)
+    found: dict[str, object] = json.loads((folder / "map.json").read_text())
     return found
 
 
@@ -59,6 +66,27 @@ def test_that_wheels_and_tags_disagree_about_the_metre_is_said_with_its_sigma(
         figures = f"{100.0 * check['value']:.2f} % (sigma {100.0 * check['sigma']:.2f} %) longer by the wheels of"
         (said,) = [warning for warning in merged["warnings"] if f"{figures} {check['robot_id']}" in warning]
         assert "outer edge of the black border" in said
+
+
+def test_readme_quotes_the_distance_with_the_size_of_tags_open_too(logs: Path, tmp_path: Path) -> None:
+    """Wheels then carry the metre, as the robots' files have them."""
+    given: list[object] = []
+    for log in find_logs([logs]):
+        robot = tmp_path / f"{log.name}.yaml"
+        robot.write_text(read_run_info(log).robot_yaml + "imported_tag_scale_sigma: 0.3\n")
+        given += ["--robot", robot]
+    _succeeds("map", logs, "-o", tmp_path / "map", *given)
+    found: dict[str, Any] = json.loads((tmp_path / "map" / "map.json").read_text())
+    (pair,), (scale,) = found["start_to_start"], [each for each in found["calibration"] if each["name"] == "tag_scale"]
+    quoted = re.search(
+        r"it is ([\d.]+) m \(sigma ([\d.]+) m\), tags ([\d.]+) % \(([\d.]+) %\) larger",
+        (ROOT / "README.md").read_text(),
+    )
+    assert quoted is not None
+    assert float(quoted[1]) == pytest.approx(pair["distance_m"], abs=0.005)
+    assert float(quoted[2]) == pytest.approx(pair["sigma_m"], abs=0.005)
+    assert float(quoted[3]) == pytest.approx(100.0 * scale["value"], abs=0.05)
+    assert float(quoted[4]) == pytest.approx(100.0 * scale["sigma"], abs=0.05)
 
 
 def _succeeds(*words: object) -> None:
