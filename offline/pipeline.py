@@ -2,35 +2,24 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
-from offline.checks import COMPARED, check_warnings
 from offline.components import Found, solved_component
 from offline.effort import Effort
 from offline.errors import OfflineError
-from offline.graph import TAG_SCALE
-from offline.kept_maps import (
-    kept_of,
-    local_map_of,
-    tags_of,
-    tape_of,
-)
+from offline.kept_maps import kept_of, local_map_of, tags_of, tape_of
 from offline.local_map import LocalMap, solve_local_map
+from offline.map_warnings import map_warnings
 from offline.measured import Measurements, TapeOptions, parse_measurements
-from offline.measured_map import measurement_warnings, unused
-from offline.merge import Merge, merge
-from offline.merge_report import alignment_results, merge_warnings
+from offline.measured_map import unused
+from offline.merge import merge
+from offline.merge_report import alignment_results
 from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
-from offline.result import (
-    MAX_SIGMAS,
-    CalibrationChoice,
-    CalibrationResult,
-    CheckResult,
-    MapResult,
-)
+from offline.result import CalibrationChoice, MapResult
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
 from offline.runs_refused import check_distinct, check_new
@@ -140,18 +129,8 @@ def build_map(
         merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
     workings.maps += maps
-    components = [
-        solved_component(
-            maps,
-            members,
-            measurements,
-            stages,
-            keep_suspects=keep_suspects,
-            corners=corners,
-            upright_sigma_rad=upright_sigma_rad,
-        )
-        for members in merged.groups
-    ]
+    solve = partial(solved_component, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
+    components = [solve(maps, members, measurements, stages) for members in merged.groups]
     joins: list[TagJoin] = []
     if corners and len(components) > 1:
         components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
@@ -170,7 +149,7 @@ def build_map(
         measurements=tuple(found.measured),
         checks=tuple(found.checks),
         metres=tuple(found.metres),
-        warnings=_warnings(
+        warnings=map_warnings(
             runs, maps, broken, merged, found, [each for each in joins if each.reason] if corners else None
         ),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
@@ -221,23 +200,6 @@ def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) 
         return [alone.split(each).without_factors() for each in maps], broken
 
 
-def _warnings(
-    runs: Sequence[Run],
-    maps: Sequence[LocalMap],
-    broken: Sequence[str],
-    merged: Merge,
-    found: Found,
-    not_joined: Sequence[TagJoin] | None,
-) -> tuple[str, ...]:
-    """All that a person must be told, in the order in which it came up, each sentence once."""
-    chains = [each.chain for each in maps]
-    warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
-    warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
-    warnings += _calibration_warnings(found.calibration, found.checks)
-    named = {(each.family, each.tag_id) for each in found.suspects}
-    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
-
-
 def _measurements(
     tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain], extending: MapResult | None
 ) -> Measurements:
@@ -246,33 +208,3 @@ def _measurements(
         names = [*dict.fromkeys(each.run for each in extending.kept), *names]
         tags |= {tag for each in extending.kept for tag in tags_of(each)}
     return parse_measurements(tape, names, sorted(tags))
-
-
-def _calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
-    """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
-    told = {
-        (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)
-        for check in checks
-        if check.contradicts
-        for name in COMPARED[check.name]
-    }
-    return [
-        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
-        "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
-        for entry in calibration
-        if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.owner, entry.name) not in told
-    ]
-
-
-def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
-    warnings = []
-    for chain in chains:
-        if chain.along_m[-1] < 0.05:
-            warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
-        if not chain.tags and len(chains) == 1:
-            warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
-        if len(chain.tags) == 1:
-            warnings.append(
-                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two would make sure how it lies to other runs"
-            )
-    return warnings

@@ -8,8 +8,9 @@ from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline.checks import check_warnings
 from offline.graph import TAG_SCALE
+from offline.map_warnings import calibration_warnings
 from offline.measured import TapeOptions
-from offline.pipeline import _calibration_warnings, build_map
+from offline.pipeline import build_map
 from offline.result import CalibrationResult, CheckResult, MapResult
 from offline.run import TagKey
 from offline.stages import Stages
@@ -112,5 +113,5 @@ def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
             ("new", TAG_SCALE),
         )
     ]
-    warnings = _calibration_warnings(corrections, [told])
+    warnings = calibration_warnings(corrections, [told])
     assert [warning.partition(" came out")[0] for warning in warnings] == ["wheel_scale of dora", "tag_scale of new"]
