@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.noise import NoiseParameters
 from fixtures.calibration import nominal_robot
 from fixtures.simulate import simulate
 from fixtures.world import Noise, load_world
+from offline.pipeline import build_map
 from offline.result import MapResult
 from tests.benchmarks.accuracy import (
     METHODS,
@@ -17,6 +19,7 @@ from tests.benchmarks.accuracy import (
     Method,
     Tally,
     held,
+    missed_in_pairs,
     rough,
     run_study,
     study_worlds,
@@ -24,6 +27,7 @@ from tests.benchmarks.accuracy import (
 )
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.cramer_rao_world import bound_of
+from tests.benchmarks.from_truth import most_likely_from_truth
 
 COLUMNS = [
     "world", "method", "seeds", "start_to_start_rmse_m", "tags_rmse_m", "trajectory_rmse_m", "bound_start_to_start_m",
@@ -74,6 +78,29 @@ def test_what_is_promised_is_held_against_the_bound(monkeypatch: pytest.MonkeyPa
         assert len(missed) == len(expected)
         assert all(text in sentence for text, sentence in zip(expected, missed, strict=True))
     assert Tally("room", "2D", in_parts=[3]).missed() == ["room, 2D, seed 3: the map is in parts"]
+
+
+def test_what_is_found_is_held_against_the_most_likely_map_of_the_same_seeds() -> None:
+    bound = bound_of(load_world("room"), 0, exact_calibration=False)
+    good = _figures_at(0.03, 0.02)
+    worse = replace(good, start_rmse_m=1.03 * good.start_rmse_m)
+    elsewhere = replace(good, seed=1, tags_rmse_m=0.5)  # of a seed that the other was not given
+    likeliest = Tally("room", "corners from the truth", [good], [bound])
+    found = Tally("room", "corners", [worse, elsewhere], [bound, bound])
+    (sentence,) = missed_in_pairs([found, likeliest])
+    assert sentence.startswith("room: start_rmse_m is 1.030 times that of the most likely map")
+    assert missed_in_pairs([found]) == missed_in_pairs([replace(found, figures=[good]), likeliest]) == []
+
+
+def test_the_most_likely_map_is_where_a_solve_from_the_wheels_ends_too(tmp_path: Path) -> None:
+    simulate("room", 1000, tmp_path / "drives", render=False)
+    drives = Drives(load_world("room"), 1000, tmp_path / "drives")
+    found = build_map(drives.runs, NoiseParameters(), corners=True).components[0]
+    likeliest = most_likely_from_truth(drives.runs, drives.truth).components[0]
+    assert likeliest.cost == pytest.approx(found.cost, rel=1e-6)
+    np.testing.assert_allclose(
+        [tag.position_m for tag in likeliest.tags], [tag.position_m for tag in found.tags], atol=1e-4
+    )
 
 
 def test_wide_methods_get_drives_of_robots_that_nobody_knows_and_their_bound(

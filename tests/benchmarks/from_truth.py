@@ -1,0 +1,49 @@
+"""The most likely map by the true noise, looked for from the truth: what no way of starting a solve could better."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib import se2
+from calib.noise import NoiseParameters
+from offline.corner_map import refine
+from offline.factors import State
+from offline.global_map import component_of
+from offline.graph import Graph
+from offline.pipeline import build_map
+from offline.result import MapResult
+from offline.run import Run
+from offline.truth import Truth
+from offline.workings import Workings
+
+
+def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParameters = NoiseParameters()) -> MapResult:
+    """The map on corners of all factors of a map, solved from true poses and places, calibration as the files have it.
+
+    Args:
+        runs: simulated.
+        truth: of them.
+        noise: under which they were simulated.
+
+    Raises:
+        ValueError: the map is in several parts, or the solve from the truth comes to no end.
+    """
+    workings = Workings()
+    result = build_map(runs, noise, workings=workings)
+    if len(result.components) > 1:
+        raise ValueError(f"{len(result.components)} components; {'; '.join(result.warnings)}")
+    (solved,) = workings.solved
+    start = replace(solved.solution, state=_true_state(solved.graph, truth))
+    refined, told = refine(solved.graph, start)
+    if refined is None:
+        raise ValueError("; ".join(told))
+    return replace(result, components=(component_of(solved.graph, solved.solution, refined),))
+
+
+def _true_state(graph: Graph, truth: Truth) -> State:
+    """Poses and tags as they were, in the frame of the first chain's start; no correction of any calibration."""
+    T_world_base = [truth.runs[chain.run.name].at(chain.stamps_ns)[0] for chain in graph.chains]
+    T_map_world = se2.inverse(T_world_base[0][0])
+    tags = {tag: se2.apply(T_map_world, truth.tags_m[tag.family, tag.tag_id, ""]) for tag in graph.tags}
+    return graph.start(se2.compose(T_map_world, np.concatenate(T_world_base)), tags, {})
