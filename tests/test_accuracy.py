@@ -35,14 +35,14 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-def test_a_seed_of_the_room_by_every_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_some_seeds_of_the_room_by_every_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "build" / "accuracy.jsonl"
-    methods = ["dead reckoning", "paper", "2D"]
-    tallies = run_study({"room": load_world("room")}, methods, [0], output)
+    methods, seeds = ["dead reckoning", "paper", "2D"], range(4)
+    tallies = run_study({"room": load_world("room")}, methods, seeds, output)
     rows = {row["method"]: row for row in map(json.loads, output.read_text().splitlines())}
     assert [list(row) for row in rows.values()] == [COLUMNS] * len(methods)
-    assert all(row["world"] == "room" and row["seeds"] == 1 for row in rows.values())
-    assert len(capsys.readouterr().out.splitlines()) == 1 + len(methods)
+    assert all(row["world"] == "room" and row["seeds"] == len(seeds) for row in rows.values())
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(methods) * len(seeds)
     two_d, wheels, paper = rows["2D"], rows["dead reckoning"], rows["paper"]
     for what in ("start_to_start", "tags"):
         assert 0.4 < two_d[f"{what}_rmse_m"] / two_d[f"bound_{what}_m"] < 2.5

@@ -8,6 +8,7 @@ import pytest
 from calib import se2
 from calib.wheels import advance
 from fixtures.drive import Drive, drive, longest_drive_s
+from fixtures.driver import DEAD_TIME_S
 from fixtures.errors import FixturesError
 from fixtures.route import pieces_of
 from fixtures.world import World, WorldRobot
@@ -91,6 +92,22 @@ def test_the_floor_errs_as_its_sigmas_say() -> None:
     assert len(scaled) > 20_000
     np.testing.assert_allclose(scaled[rolling].std(axis=0), 1.0, atol=0.03)
     np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=0.03)
+
+
+def test_what_the_floor_does_is_answered_after_the_dead_time_and_not_before() -> None:
+    waypoints = [{"x_m": 4.0, "y_m": 0.0, "corner_radius_m": 0.5}, {"x_m": 4.0, "y_m": 3.0}]
+    firm, erring = driven(made_world(waypoints)), driven(made_world(waypoints, noise={}))
+    first_err = np.flatnonzero((firm.T_world_base[: len(erring.stamps_ns)] != erring.T_world_base).any(axis=1))[0]
+    told = [np.diff([each.left_m, each.right_m], axis=1)[:, : 2 * first_err] for each in (firm, erring)]
+    unlike = np.abs(told[0] - told[1]).max(axis=0) > 1e-9
+    # The step that begins when the pose after the first err has been seen is the first that can be another one.
+    assert np.flatnonzero(unlike)[0] == first_err + round(DEAD_TIME_S / 0.01)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.3, 3.0])
+def test_eyes_that_are_late_make_no_robot_swing(speed_m_s: float) -> None:
+    world = made_world([{"x_m": 60.0, "y_m": 0.0}], noise={}, route={"speed_m_s": speed_m_s})
+    assert np.abs(driven(world).T_world_base[:, 1]).max() < 0.05
 
 
 def test_a_slipping_wheel_turns_further_than_it_rolls() -> None:
