@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import IO
 
@@ -56,6 +56,24 @@ def wait_for(output: IO[str] | None, *words: str) -> list[str]:
 
 def feed_wheels(port: PtyPort, seconds: float) -> list[int | None]:
     return [send(port, index) for index in islice(paced(100.0), round(100.0 * seconds))]
+
+
+@contextmanager
+def wheels_fed(port: PtyPort) -> Iterator[None]:
+    """100 lines a second, however long it takes: a program may start late on a busy machine."""
+    enough = threading.Event()
+
+    def feed() -> None:
+        for index in takewhile(lambda _: not enough.is_set(), paced(100.0)):
+            send(port, index)
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    try:
+        yield
+    finally:
+        enough.set()
+        feeder.join()
 
 
 def feed_pictures(folder: Path, seconds: float) -> list[tuple[int, int]]:
@@ -188,11 +206,8 @@ def test_check_tells_of_each_device(tmp_path: Path, plug_in: Callable[..., PtyPo
     cv2.imwrite(str(pictures / f"{time.time_ns()}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
     port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
-    with program("check", "--robot", robot) as process:
-        feeder = threading.Thread(target=feed_wheels, args=(port, 5.0))
-        feeder.start()
+    with wheels_fed(port), program("check", "--robot", robot) as process:
         said, _ = process.communicate(timeout=PATIENCE_S)
-        feeder.join()
     lines = said.splitlines()
     assert process.returncode == 0, said
     assert [line.split(":")[0] for line in lines] == [
