@@ -3,7 +3,8 @@
     python -m tests.benchmarks.rendered_study --seeds 0-23 --jobs 2
 
 Drives of `nsh` with rendered pictures, calibration drawn from the priors of robot.yaml. Two rows a seed, then what is
-promised, figure by figure; exit 1 where one is missed.
+promised, figure by figure; exit 1 where one is missed. A seed takes minutes to render: with `--drives` they are kept,
+and those that are there are taken.
 """
 
 import argparse
@@ -32,6 +33,7 @@ _TAGS_NEARER: Final = 0.75  # of seeds, at least
 _DISTANCE_PERCENT: Final = 0.3  # in the median, at most
 _OUTSIDE: Final = 0.001  # of honest maps lie outside the interval,
 _WIDENED: Final = 1.3  # which is wider by this where it is held against rendered pictures
+_COLUMNS: Final = ("distance %", "vector m", "tags m", "NEES tags")
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,16 @@ class Promise:
     is_kept: bool
 
 
-def study_seed(seed: int, world: World | str) -> Pair:
-    """Renders one seed's drives and maps them on the floor and on corners.
+def study_seed(seed: int, world: World | str, kept: Path | None = None) -> Pair:
+    """Renders one seed's drives, where they are not among those kept, and maps them on the floor and on corners.
 
     Raises:
         ValueError: a map is in several parts.
     """
     with tempfile.TemporaryDirectory() as folder:
-        drives = Path(folder) / "drives"
-        simulate(world, seed, drives, render=True)
+        drives = (kept or Path(folder)) / f"seed_{seed}"
+        if not drives.exists():
+            simulate(world, seed, drives, render=True)
         runs, truth = read_runs(find_logs([drives])), read_truth(drives / TRUTH_FILE)
         floor, corners = build_map(runs), build_map(runs, corners=True)
     return Pair(figures_of(seed, floor, truth), figures_of(seed, corners, truth), len(corners.components[0].tags))
@@ -109,15 +112,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--world", default="nsh", help="name or file of a world [nsh]")
     parser.add_argument("--seeds", default="0-23", help="FIRST-LAST or one seed [0-23]")
     parser.add_argument("--jobs", type=int, default=1, help="seeds at a time [1]")
+    parser.add_argument("--drives", type=Path, help="folder that keeps the drives [they are not kept]")
     given = parser.parse_args(arguments)
     first, _, last = given.seeds.partition("-")
     pairs: list[Pair] = []
-    _tell(
-        f"{'seed':>4} {'model':8}"
-        + "".join(f"{name:>14}" for name in ("distance %", "vector m", "tags m", "NEES tags"))
-    )
+    _tell(f"{'seed':>4} {'model':8}" + "".join(f"{name:>14}" for name in _COLUMNS))
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
-        for pair in pool.map(partial(study_seed, world=given.world), range(int(first), int(last or first) + 1)):
+        one = partial(study_seed, world=given.world, kept=given.drives)
+        for pair in pool.map(one, range(int(first), int(last or first) + 1)):
             pairs.append(pair)
             _tell(_row("floor", pair.floor))
             _tell(_row("corners", pair.corners))
