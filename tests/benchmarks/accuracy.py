@@ -35,6 +35,7 @@ from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.baselines import dead_reckoning, paper_scheme
+from tests.benchmarks.command_line import say, seeds_of
 from tests.benchmarks.cramer_rao import Bound
 from tests.benchmarks.cramer_rao_world import bound_of
 from tests.benchmarks.from_truth import most_likely_from_truth
@@ -223,17 +224,17 @@ def study_seed(name: str, world: World, seed: int, tallies: Sequence[Tally]) -> 
                     figures = figures_of(seed, METHODS[tally.method].estimate(drives), drives.truth)
                 except ValueError as error:
                     tally.in_parts.append(seed)
-                    _tell(f"{name}, {tally.method}: {error}")
+                    say(f"{name}, {tally.method}: {error}")
                     continue
                 tally.figures.append(figures)
                 tally.bounds.append(drives.bound)
-                _tell(_line(name, tally.method, seed, _numbers(figures, drives.bound)))
+                say(_line(name, tally.method, seed, _numbers(figures, drives.bound)))
 
 
 def run_study(worlds: dict[str, World], methods: Sequence[str], seeds: Sequence[int], output: Path) -> list[Tally]:
     """All seeds of all worlds; the table in `output` is as far as the study."""
     tallies = [Tally(name, method) for name in worlds for method in methods]
-    _tell(_line("world", "method", "seed", _COLUMNS))
+    say(_line("world", "method", "seed", _COLUMNS))
     for seed in seeds:
         for name, world in worlds.items():
             study_seed(name, world, seed, [each for each in tallies if each.world == name])
@@ -248,21 +249,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default="nsh,nsh_flat,room,nsh_rough", help="[nsh,nsh_flat,room,nsh_rough]")
     parser.add_argument("--methods", default=",".join(METHODS), help=f"[{','.join(METHODS)}]")
-    parser.add_argument("--seeds", default="0-199", help="FIRST-LAST or one seed [0-199]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-199", help="FIRST-LAST or one seed [0-199]")
     parser.add_argument("--output", type=Path, default=OUTPUT, help=f"[{OUTPUT}]")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
     known = study_worlds()
     worlds = {name: known[name] for name in given.worlds.split(",")}
-    tallies = run_study(worlds, given.methods.split(","), range(int(first), int(last or first) + 1), given.output)
-    _tell("")
-    _tell(_line("world", "method", "seeds", _COLUMNS))
+    tallies = run_study(worlds, given.methods.split(","), given.seeds, given.output)
+    say("")
+    say(_line("world", "method", "seeds", _COLUMNS))
     for each in tallies:
         row = each.row()
-        _tell(_line(each.world, each.method, row["seeds"], list(row.values())[3:]))
+        say(_line(each.world, each.method, row["seeds"], list(row.values())[3:]))
     missed = [sentence for each in tallies for sentence in each.missed()] + missed_in_pairs(tallies)
     for sentence in missed:
-        _tell(f"missed: {sentence}")
+        say(f"missed: {sentence}")
     return 1 if missed else 0
 
 
@@ -286,11 +286,6 @@ def _rms(values: Sequence[float]) -> float | None:
 def _mean(values: Sequence[float]) -> float | None:
     """None where nothing is stated."""
     return float(np.mean(values)) if values and np.isfinite(values).all() else None
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
+from tests.benchmarks.command_line import say, seeds_of
 
 # Medians over seeds. With the calibration drawn the paper's own figure is 1.8 %.
 START_PERCENT_DRAWN = 1.0
@@ -115,17 +116,17 @@ def run_study(
 ) -> list[Figures]:
     """All seeds, several at a time where asked for; rows go to the standard output as they come."""
     one = partial(study_seed, world=world, exact_calibration=exact_calibration, render=render)
-    _tell(" ".join(f"{f.name:>20}" for f in fields(Figures)))
+    say(" ".join(f"{f.name:>20}" for f in fields(Figures)))
     found = []
     if jobs == 1:
         for seed in seeds:
             found.append(one(seed))
-            _tell(_row(found[-1]))
+            say(_row(found[-1]))
         return found
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for each in pool.map(one, seeds):
             found.append(each)
-            _tell(_row(each))
+            say(_row(each))
     return found
 
 
@@ -133,23 +134,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where every bound holds, else 1."""
     parser = argparse.ArgumentParser(description="Accuracy of maps over simulated seeds, against the bounds.")
     parser.add_argument("--world", default="nsh", help="name or file of a world [nsh]")
-    parser.add_argument("--seeds", type=_seeds, default=range(20), help="FIRST-LAST or one seed [0-19]")
+    parser.add_argument("--seeds", type=seeds_of, default=range(20), help="FIRST-LAST or one seed [0-19]")
     parser.add_argument("--exact-calibration", action="store_true", help="robots are what robot.yaml says")
     parser.add_argument("--render", action=argparse.BooleanOptionalAction, default=False, help="real pictures")
     parser.add_argument("--jobs", type=int, default=1, help="seeds at a time [1]")
     given = parser.parse_args(arguments)
     how = {"exact_calibration": given.exact_calibration, "render": given.render}
     found = run_study(given.world, given.seeds, **how, jobs=given.jobs)
-    _tell("medians: " + ", ".join(f"{name} {value:.4g}" for name, value in medians(found).items()))
+    say("medians: " + ", ".join(f"{name} {value:.4g}" for name, value in medians(found).items()))
     missed = missed_bounds(found, **how)
     for sentence in missed:
-        _tell(f"missed: {sentence}")
+        say(f"missed: {sentence}")
     return 1 if missed else 0
-
-
-def _seeds(text: str) -> range:
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
 
 
 def _known(value: float | None) -> float:
@@ -159,11 +155,6 @@ def _known(value: float | None) -> float:
 def _row(figures: Figures) -> str:
     seed, *values = astuple(figures)
     return " ".join([f"{seed:>20}", *(f"{value:>20.4f}" for value in values)])
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from offline.readings import joined
 from offline.run import TagKey
 from offline.solver import Solution
 from offline.stages import Stages
+from tests.benchmarks.command_line import say, seeds_of
 from tests.made_drives import FAMILY
 from tests.made_long_drives import READ_SHARE, SIGMA_READING, LongDrive, made_long_drive, made_town
 
@@ -236,15 +237,14 @@ def line(seed: int, outcome: Outcome) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0-29", help="first-last")
+    parser.add_argument("--seeds", type=seeds_of, default="0-29", help="first-last")
     parser.add_argument("--draws", type=int, default=5, help="random passes, and as many random tags, a map")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
     outcomes = []
     began_s = time.process_time()
-    for seed in range(int(first), int(last or first) + 1):
+    for seed in given.seeds:
         outcomes.append(trial(made_scene(seed), seed, given.draws))
-        _tell(line(seed, outcomes[-1]))
+        say(line(seed, outcomes[-1]))
     share = float(np.mean([each.n_beaten(0, ["pass", "tag"]) / (2 * given.draws) for each in outcomes]))
     n_maps = sum(each.n_beaten(0, ["pass", "tag"]) >= ASKED_SHARE * 2 * given.draws for each in outcomes)
     for kind in ("pass", "tag"):
@@ -252,20 +252,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         beaten = np.mean([each.n_beaten(i, [kind]) / given.draws for each, i in own])
         found = np.median([each.found_m[i] / each.sigma_m for each, i in own])
         off = np.median([each.found_m[i] / each.foretold_m[i] for each, i in own])
-        _tell(
+        say(
             f"best {kind}: {100.0 * beaten:.0f} % of random ones beaten; sigma {found:.2f} of what it was, {off:.2f} "
             "of what was foretold (medians)"
         )
-    _tell(
+    say(
         f"best advice: {100.0 * share:.0f} % of all random ones beaten (asked: more than {100.0 * ASKED_SHARE:.0f} %); "
         f"nine of ten or more on {n_maps} of {len(outcomes)} maps; {time.process_time() - began_s:.0f} s"
     )
     return 0 if share > ASKED_SHARE else 1
-
-
-def _tell(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

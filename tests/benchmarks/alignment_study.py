@@ -30,6 +30,7 @@ from offline.alignment_rivals import GROUP_MARGIN
 from offline.condensed import CondensedMap, condense
 from offline.local_map import solve_local_map
 from offline.run import TagKey
+from tests.benchmarks.command_line import say
 from tests.made_long_drives import N_CROSSINGS, ROAD_M, Town, made_long_drive, made_town
 
 N_SHARED: Final = (6, 20)
@@ -245,20 +246,20 @@ def study(n_trials: int, n_groups: int, n_drives: int, seed: int) -> int:
     """Prints the counts; 1 where a bound is missed."""
     began_s = time.perf_counter()
     pool = Pool(n_drives, seed)
-    _tell(f"{3 * n_drives} drives solved in {time.perf_counter() - began_s:.0f} s")
+    say(f"{3 * n_drives} drives solved in {time.perf_counter() - began_s:.0f} s")
     rng = np.random.default_rng(seed)
     missed = False
     for share, bound in BOUNDS.items():
         began_s = time.perf_counter()
         counts = Counter(trial(pool.before, pool.each, rng, share).outcome() for _ in range(n_trials // len(BOUNDS)))
-        _tell(_row(f"{share[0]:.0%} to {share[1]:.0%} wrong, each on its own", counts, began_s))
+        say(_row(f"{share[0]:.0%} to {share[1]:.0%} wrong, each on its own", counts, began_s))
         missed |= counts[WRONG] > 0 or counts[RIGHT] < bound * counts.total()
     for share in GROUPS:
         began_s = time.perf_counter()
         counts = Counter(
             trial(pool.before, pool.shelf, rng, share, as_one=True).group_outcome() for _ in range(n_groups // 2)
         )
-        _tell(_row(f"{share[0]:.0%} to {share[1]:.0%} moved as one", counts, began_s))
+        say(_row(f"{share[0]:.0%} to {share[1]:.0%} moved as one", counts, began_s))
         missed |= counts[WRONG] > 0
     return int(missed)
 
@@ -277,11 +278,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of everything [1]")
     given = parser.parse_args(arguments)
     return study(given.trials, given.groups, given.drives, given.seed)
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

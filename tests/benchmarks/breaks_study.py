@@ -31,6 +31,7 @@ from offline.merge import merge
 from offline.odometry_breaks import split_where_broken
 from offline.solver import solve
 from offline.stages import Stages
+from tests.benchmarks.command_line import seeds_of
 from tests.made_breaks import BrokenDrive, carried, made_clean_drive, slipped
 
 _FREED: Final = 1e-4  # of a motion's whitening
@@ -131,13 +132,12 @@ def summary(outcomes: Sequence[Outcome]) -> str:
 def main() -> int:
     """Runs what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0-19")
+    parser.add_argument("--seeds", type=seeds_of, default="0-19")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     arguments = parser.parse_args()
-    first, last = map(int, arguments.seeds.split("-"))
     for kind in arguments.kinds:
         outcomes = []
-        for seed in range(first, last + 1):
+        for seed in arguments.seeds:
             outcomes.append(outcome_of(kind, seed))
             sys.stdout.write(f"{outcomes[-1]}\n")
             sys.stdout.flush()

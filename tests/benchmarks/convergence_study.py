@@ -23,6 +23,7 @@ from offline.goodness import fitted_windows
 from offline.graph import build_graph
 from offline.local_map import solve_local_map
 from offline.solver import Solution, solve
+from tests.benchmarks.command_line import say, seeds_of
 from tests.made_long_drives import made_long_drive
 
 COST_TOLERANCE: Final = 1e-6  # relative
@@ -142,19 +143,19 @@ def summary(found: Sequence[Figures]) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where every promise is kept, else 1."""
     parser = argparse.ArgumentParser(description="Convergence of long drives past few tags, over simulated seeds.")
-    parser.add_argument("--seeds", type=_seeds, default=range(100), help="FIRST-LAST or one seed [0-99]")
+    parser.add_argument("--seeds", type=seeds_of, default=range(100), help="FIRST-LAST or one seed [0-99]")
     parser.add_argument("--jobs", type=int, default=1, help="seeds at a time [1]")
     given = parser.parse_args(arguments)
     found = []
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
         for each in pool.map(study_seed, given.seeds):
             found.append(each)
-            _tell(_row(each))
+            say(_row(each))
     for line in summary(found):
-        _tell(line)
+        say(line)
     missed = missed_bounds(found)
     for sentence in missed:
-        _tell(f"missed: {sentence}")
+        say(f"missed: {sentence}")
     return 1 if missed else 0
 
 
@@ -168,16 +169,6 @@ def _row(each: Figures) -> str:
         f"seed {each.seed:3d}: dead reckoning off by {each.error_m:5.0f} m {each.error_deg:5.0f} deg; cost "
         f"{each.cost:7.1f}; plain {plain:28}; ours {ours} in {each.seconds:.2f} s"
     )
-
-
-def _seeds(text: str) -> range:
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ from fixtures.visibility import Eye
 from fixtures.world import Pictures, Wall, World, WorldTag, load_world
 from onboard.corner_refinement import refined_corners
 from onboard.tag_detector import TagDetector
+from tests.benchmarks.command_line import say
 
 Grey = NDArray[np.uint8]
 Detect = Callable[[Grey], FloatArray | None]
@@ -295,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=20, help="one of so many of these, none for 0 [20]")
     given = parser.parse_args(arguments)
     ways = list(refinements(_camera(CASES[0])))
-    _tell(f"{'case':24s} {'detector':20s} {'found':>6s} " + " ".join(f"{way:>14s}" for way in ways))
+    say(f"{'case':24s} {'detector':20s} {'found':>6s} " + " ".join(f"{way:>14s}" for way in ways))
     for case in CASES:
         if not case.name.startswith(given.cases):
             continue
@@ -304,23 +305,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             of_detector = [errors[detector, way] for way in ways]
             found = len(of_detector[0].found) / of_detector[0].n_pictures
             cells = " ".join(each.cell() for each in of_detector)
-            _tell(f"{case.name:24s} {detector:20s} {found:6.0%} {cells}")
+            say(f"{case.name:24s} {detector:20s} {found:6.0%} {cells}")
     if given.every:
         of_drives = study_drives(load_world(given.world), 0, given.every)
         n = len(of_drives[ways[0]].found)
-        _tell(
+        say(
             f"{given.world + ', seed 0':24s} {f'{n} tags':20s} {'':6s} "
             + " ".join(of_drives[way].cell() for way in ways)
         )
     for n_tags in (1, 6):
         told = ", ".join(f"{name} {ms:.2f} ms" for name, ms in refinement_ms(n_tags).items())
-        _tell(f"processor time a picture of {n_tags} tags of 60 px: {told}")
+        say(f"processor time a picture of {n_tags} tags of 60 px: {told}")
     return 0
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -28,7 +28,8 @@ from offline.run import Run
 from offline.stages import Stages
 from offline.workings import Workings
 from onboard.log_reader import find_logs
-from tests.benchmarks.fleet import ROOT, say
+from tests.benchmarks.command_line import say
+from tests.benchmarks.fleet import ROOT
 from tests.benchmarks.stages_bench import SOLVE
 
 REPORT: Final = ROOT / "build" / "benchmarks" / "corners.jsonl"

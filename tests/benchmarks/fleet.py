@@ -26,6 +26,7 @@ from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from calib.files import written_whole
 from offline.map_command import stage_lines
 from offline.stages import StageCost
+from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet_world import MOST_TAGS, fleet_world
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -137,12 +138,6 @@ def table(line: dict[str, Any]) -> list[str]:
         f"reading: {line['us_a_message']:.1f} microseconds a message (at most {MOST_US_A_MESSAGE:g})",
         f"building the graph: {line['graph_share_of_solve']:.2f} of the solve (at most {MOST_GRAPH_SHARE:g})",
     ]
-
-
-def say(text: str) -> None:
-    """To standard output."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from offline.self_calibration_option import Calibrate
 from offline.truth import read_truth
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import figures_of
+from tests.benchmarks.command_line import say, seeds_of
 
 MOST_RMSE: Final = 1.05
 MOST_SINGLE: Final = 3.0
@@ -86,25 +87,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where every bound holds, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default="room,nsh", help="[room,nsh]")
-    parser.add_argument("--seeds", default="0-99", help="FIRST-LAST or one seed [0-99]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-99", help="FIRST-LAST or one seed [0-99]")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
     pairs, failed = [], False
     for world in given.worlds.split(","):
-        for seed in range(int(first), int(last or first) + 1):
+        for seed in given.seeds:
             for row in study_seed(world, seed):
-                _tell(str(row))
+                say(str(row))
                 failed |= isinstance(row, str)
                 pairs += [row] if isinstance(row, Pair) else []
     lines, good = summary(pairs)
     for line in lines:
-        _tell(line)
+        say(line)
     return 0 if good and not failed else 1
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

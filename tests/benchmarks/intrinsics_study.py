@@ -35,6 +35,7 @@ from calib.projection_uncertainty import (
     projection_covariance,
     rms_px,
 )
+from tests.benchmarks.command_line import seeds_of
 from tests.board_cases import CASES, taken_views, taken_with_and_without
 
 REGION: Final = 0.99
@@ -182,14 +183,13 @@ def _sum_up(case: str, outcomes: Sequence[Outcome]) -> None:
 def main() -> None:
     """Runs the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0-49", help="FIRST-LAST")
+    parser.add_argument("--seeds", type=seeds_of, default="0-49", help="FIRST-LAST")
     parser.add_argument("--cases", default=",".join(CASES), help="comma-separated, of " + ", ".join(CASES))
     parser.add_argument("--parts", default="given,plain", help="given, plain or both, comma-separated")
     arguments = parser.parse_args()
-    first, last = (int(number) for number in arguments.seeds.split("-"))
     cv2.setNumThreads(1)
     for case in arguments.cases.split(","):
-        study(case, range(first, last + 1), arguments.parts.split(","))
+        study(case, arguments.seeds, arguments.parts.split(","))
 
 
 if __name__ == "__main__":

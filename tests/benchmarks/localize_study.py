@@ -46,6 +46,7 @@ from offline.online_drive import TagReading
 from offline.online_localizer import OnlineLocalizer
 from offline.result import Component, MapResult
 from offline.stages import Stages
+from tests.benchmarks.command_line import say, seeds_of
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 
 NEES: Final = (0.85, 1.15)
@@ -271,7 +272,7 @@ def missed(rows: Sequence[Told]) -> list[str]:
     slowest = calls_ms[:, 2]
     single = [row.single_ms for row in found if row.single_ms is not None]
     named, unnamed, false = (sum(getattr(row, name) for row in found) for name in _OF_MOVED)
-    _tell(
+    say(
         f"{len(rows)} runs, {len(found)} located; position NEES {nees:.3f}; seeds with {_ENOUGH} tags or more not "
         f"located: {lost}; wrong and sure: {wrong}\n"
         f"moved tags: {named} named, {unnamed} not, {false} falsely named\n"
@@ -304,32 +305,26 @@ def study(seeds: Sequence[int]) -> list[Told]:
     for seed in seeds:
         scene = made_scene(seed)
         if scene is None:
-            _tell(f"seed {seed}: no map, its drives share too little")
+            say(f"seed {seed}: no map, its drives share too little")
             continue
         rows.append(judged(seed, scene))
-        _tell(json.dumps(asdict(rows[-1])))
+        say(json.dumps(asdict(rows[-1])))
     return rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0-399")
+    parser.add_argument("--seeds", type=seeds_of, default="0-399")
     parser.add_argument("--output", type=Path, help="a JSON line for each seed")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
-    rows = study(range(int(first), int(last or first) + 1))
+    rows = study(given.seeds)
     if given.output is not None:
         given.output.write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows), encoding="utf-8")
     sentences = missed(rows)
     for sentence in sentences:
-        _tell(f"missed: {sentence}")
+        say(f"missed: {sentence}")
     return 1 if sentences else 0
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

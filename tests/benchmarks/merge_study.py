@@ -26,6 +26,7 @@ from offline.merge import merge
 from offline.merge_report import merge_warnings
 from offline.run import TagKey
 from offline.stages import Stages
+from tests.benchmarks.command_line import say
 from tests.made_long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town
 
 SAME_M: Final = 1e-6
@@ -111,21 +112,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     maps = [solve_local_map(drive.chain) for drive in drives]
     began_s = time.perf_counter()
     merged = merge(maps)
-    _tell(f"{len(merged.pairs)} pairs of {given.runs} runs aligned in {time.perf_counter() - began_s:.1f} s")
+    say(f"{len(merged.pairs)} pairs of {given.runs} runs aligned in {time.perf_counter() - began_s:.1f} s")
     spread_m = spread_over_orders(maps, given.orders, given.seed)
-    _tell(f"{given.orders} orders: the maps agree to {spread_m:.1e} m (at most {SAME_M:g})")
+    say(f"{given.orders} orders: the maps agree to {spread_m:.1e} m (at most {SAME_M:g})")
     half = given.runs // 2
     two = apart([*maps[:half], *(in_other_building(drive) for drive in drives[half:])])
-    _tell("two buildings: " + "; ".join(two))
+    say("two buildings: " + "; ".join(two))
     repeated = apart(corridor(given.seed))
-    _tell("corridor: " + "; ".join(repeated))
+    say("corridor: " + "; ".join(repeated))
     good = spread_m <= SAME_M and len(two) == 1 and len(repeated) == 1 and "ambiguous, because" in repeated[0]
     return 0 if good else 1
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

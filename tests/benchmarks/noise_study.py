@@ -25,6 +25,7 @@ from offline.result import FittedParameter
 from offline.run_noise import NOT_NEEDED
 from offline.truth import read_truth
 from onboard.log_reader import find_logs
+from tests.benchmarks.command_line import say, seeds_of
 
 ENOUGH_REDUNDANCY = 100.0
 CLOSE = 0.2
@@ -124,41 +125,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where all bounds hold, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default="nsh,nsh_flat", help="names of worlds [nsh,nsh_flat]")
-    parser.add_argument("--seeds", default="0-9", help="FIRST-LAST [0-9]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-9", help="FIRST-LAST [0-9]")
     parser.add_argument("--factors", default="0.1,10", help="the fit begins at so many times the truth [0.1,10]")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
     worlds, factors = given.worlds.split(","), [float(each) for each in given.factors.split(",")]
     rows: list[Mapped] = []
     apart: list[str] = []
-    for seed in range(int(first), int(last or first) + 1):
+    for seed in given.seeds:
         for world in worlds:
             for row in study_seed(world, seed, factors):
                 if isinstance(row, str):
                     apart.append(row)
-                    _tell(f"not joined: {row}")
+                    say(f"not joined: {row}")
                     continue
                 rows.append(row)
                 ratios = " ".join(f"{each.ratio:7.3f}{each.mark}" for each in row.parameters)
-                _tell(f"{world:9s} {seed:4d} {row.factor:5g}  {ratios}  {row.nees_tags:6.2f} {row.nees_start:6.2f}")
+                say(f"{world:9s} {seed:4d} {row.factor:5g}  {ratios}  {row.nees_tags:6.2f} {row.nees_start:6.2f}")
     all_good = not apart
     for world in worlds:
         for factor in factors:
             lines, good = summary([row for row in rows if (row.world, row.factor) == (world, factor)])
             all_good &= good
-            _tell(f"{world}, from {factor:g} times the truth (* not fitted, ! truth outside):")
+            say(f"{world}, from {factor:g} times the truth (* not fitted, ! truth outside):")
             for line in lines:
-                _tell("  " + line)
+                say("  " + line)
     return 0 if all_good else 1
 
 
 def _known(value: float | None) -> float:
     return float("nan") if value is None else value
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from offline.pipeline import build_map, read_runs
 from offline.truth import read_truth
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
+from tests.benchmarks.command_line import say, seeds_of
 
 _VECTOR_TIMES: Final = 0.8  # of the floor's, in the median
 _TAGS_NEARER: Final = 0.75  # of seeds, at least
@@ -110,33 +111,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where every promise is kept, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--world", default="nsh", help="name or file of a world [nsh]")
-    parser.add_argument("--seeds", default="0-23", help="FIRST-LAST or one seed [0-23]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-23", help="FIRST-LAST or one seed [0-23]")
     parser.add_argument("--jobs", type=int, default=1, help="seeds at a time [1]")
     parser.add_argument("--drives", type=Path, help="folder that keeps the drives [they are not kept]")
     given = parser.parse_args(arguments)
-    first, _, last = given.seeds.partition("-")
     pairs: list[Pair] = []
-    _tell(f"{'seed':>4} {'model':8}" + "".join(f"{name:>14}" for name in _COLUMNS))
+    say(f"{'seed':>4} {'model':8}" + "".join(f"{name:>14}" for name in _COLUMNS))
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
         one = partial(study_seed, world=given.world, kept=given.drives)
-        for pair in pool.map(one, range(int(first), int(last or first) + 1)):
+        for pair in pool.map(one, given.seeds):
             pairs.append(pair)
-            _tell(_row("floor", pair.floor))
-            _tell(_row("corners", pair.corners))
+            say(_row("floor", pair.floor))
+            say(_row("corners", pair.corners))
     found = promises(pairs)
     for each in found:
-        _tell(f"{'kept' if each.is_kept else 'missed'}: {each.words}")
+        say(f"{'kept' if each.is_kept else 'missed'}: {each.words}")
     return 0 if all(each.is_kept for each in found) else 1
 
 
 def _row(model: str, figures: Figures) -> str:
     values = (figures.start_percent, figures.vector_error_m, figures.tags_rmse_m, figures.nees_tags)
     return f"{figures.seed:4d} {model:8}" + "".join(f"{value:14.3f}" for value in values)
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

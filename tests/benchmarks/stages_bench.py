@@ -19,7 +19,8 @@ from offline.pipeline import build_map, read_runs
 from offline.run import Run
 from offline.stages import Stages
 from onboard.log_reader import find_logs
-from tests.benchmarks.fleet import ROOT, say, simulated_fleet
+from tests.benchmarks.command_line import say
+from tests.benchmarks.fleet import ROOT, simulated_fleet
 
 REPORT: Final = ROOT / "build" / "benchmarks" / "stages.jsonl"
 NSH: Final = ROOT / "build" / "stages" / "nsh-seed0"

@@ -34,6 +34,7 @@ from offline.stages import Stages
 from offline.suspects import Searched, split_alone, split_together, with_outliers_apart
 from offline.suspects_places import gain_of, settled
 from offline.suspects_report import suspect_tags
+from tests.benchmarks.command_line import say
 from tests.benchmarks.suspects_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
 from tests.made_moves import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, made_scene, without
 
@@ -201,14 +202,14 @@ def study(cases: Sequence[Case], n_trials: int, seed: int, compare_every: int) -
                 n_told, n_false = len(counts.told), counts.n_false
                 suspects = trial(made_case(case, number, seed), counts, compare=number % compare_every == 0)
                 clear = [each for each in counts.told[n_told:] if each.sigmas > CLEAR_SIGMAS]
-                _tell(
+                say(
                     f"{title(case)} {number}: {sum(each.right for each in clear)} of {len(clear)} right, "
                     f"{counts.n_false - n_false} false ({', '.join(f'{s.tag_id} {s.kind}' for s in suspects)}); so far "
                     f"{sum(each.right for each in counts.clear)} of {len(counts.clear)}, {counts.n_false} false in "
                     f"{counts.n_maps} maps, rest {counts.map_factor:.3f}"
                 )
     for case, counts in table.items():
-        _tell(row(case, counts))
+        say(row(case, counts))
     return table
 
 
@@ -262,7 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     table = study(cases, given.trials, given.seed, given.compare_every)
     told = [each for counts in table.values() for each in counts.told]
     for low, high, n, named, right in detection_curve(told):
-        _tell(f"{low:5.0f} to {high:3.0f} sigma: {n:5d} tags, {named:6.1%} named, {right:6.1%} right")
+        say(f"{low:5.0f} to {high:3.0f} sigma: {n:5d} tags, {named:6.1%} named, {right:6.1%} right")
     given.output.mkdir(parents=True, exist_ok=True)
     by_kind: dict[str, list[Told]] = {}
     for (kind, _), counts in table.items():
@@ -270,13 +271,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     draw_curve(by_kind, given.output / "suspects_detection.png")
     missed = missed_bounds(table)
     for sentence in missed:
-        _tell(f"missed: {sentence}")
+        say(f"missed: {sentence}")
     return 1 if missed else 0
-
-
-def _tell(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from offline.result import MapResult
 from offline.run import Detections, Run, load_run
 from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
+from tests.benchmarks.command_line import seeds_of
 
 _LEAST_LOOKS = 5
 
@@ -87,10 +88,9 @@ def study_seed(seed: int) -> Iterator[Joined]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where the transform is honest and nothing is joined wrongly."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0-29", help="[0-29]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-29", help="[0-29]")
     nees = []
-    first, last = map(int, parser.parse_args(arguments).seeds.split("-"))
-    for seed in range(first, last + 1):
+    for seed in parser.parse_args(arguments).seeds:
         for each in study_seed(seed):
             told = each.reason or f"NEES {each.nees:.2f}, heading {np.degrees(each.sigma_rad):.2f} deg"
             sys.stdout.write(f"seed {seed}, tag {each.tag_id}: {told}\n")

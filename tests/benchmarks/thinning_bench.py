@@ -27,7 +27,8 @@ from offline.pipeline import build_map, read_runs
 from offline.result import Component
 from offline.run import Run
 from onboard.log_reader import find_logs
-from tests.benchmarks.fleet import ROOT, say
+from tests.benchmarks.command_line import say
+from tests.benchmarks.fleet import ROOT
 
 REPORT: Final = ROOT / "build" / "benchmarks" / "thinning.jsonl"
 MOST_LOST: Final = 0.05
