@@ -26,6 +26,7 @@ COEFFICIENTS: Final = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 
 _WIDEST_RAD: Final = np.radians(89.0)  # off the optical axis; z > 0 in any case
 _NEWTON_STEPS: Final = 60  # bisection alone halves the bracket to the last bit in these
 _POLISH_STEPS: Final = 12
+_POLISHED: Final = 1e-9  # Newton's error is about its step squared
 _RESIDUAL: Final = 1e-12  # normalised: 1e-9 px at a focal length of 1000 px
 
 
@@ -99,7 +100,10 @@ class Distortion:
             if self.p1 or self.p2:
                 for _ in range(_POLISH_STEPS):
                     image, jacobian = self._apply(points)
-                    points = points - _solved(jacobian, image - distorted)
+                    step = _solved(jacobian, image - distorted)
+                    points = points - step
+                    if not np.any(np.abs(step) > _POLISHED):
+                        break
             error = np.abs(self._apply(points)[0] - distorted).max(axis=-1, initial=0.0)
             scale = 1.0 + np.abs(distorted).max(axis=-1, initial=0.0)
             found = (error < _RESIDUAL * scale) & (np.hypot(points[..., 0], points[..., 1]) < self.limit)
