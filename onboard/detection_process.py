@@ -6,6 +6,7 @@ import os
 import queue
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ _START_LIMIT_S: Final = 30.0
 _JOB_LIMIT_S: Final = 5.0
 _END_LIMIT_S: Final = 0.5
 _PR_SET_PDEATHSIG: Final = 1
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+_KEPT_BYTES: Final = 64 << 20  # free memory that stays with the child: more than pictures of 1920x1080 px take
+_MAPPED_BYTES: Final = 32 << 20  # buffers from here on go back in any case; the most that glibc lets one ask for
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,13 @@ class DetectionResult(NamedTuple):
     size_px: tuple[int, int]  # width, height
     jpeg: bytes | None  # where it was asked for
     error: str | None  # why the picture was of no use; then the rest is empty
+
+
+class _Job(NamedTuple):
+    """One picture at the child."""
+
+    begun_s: float  # monotonic
+    process: BaseProcess
 
 
 class ChildDetector:
@@ -89,11 +100,15 @@ class ChildDetector:
         self._closing = threading.Event()
         self._lock = threading.Lock()  # whoever holds it starts or ends a child
         self._n_jobs = 0
+        self._busy: _Job | None = None
+        self._overdue: _Job | None = None
         self._jobs: queue.SimpleQueue[tuple[Picture, bool, Callable[[DetectionResult], None]] | None]
         self._jobs = queue.SimpleQueue()
         self._start_child()
         self._thread = threading.Thread(target=self._serve, name="detection", daemon=True)
         self._thread.start()
+        self._watchdog = threading.Thread(target=self._watch, name="detection watchdog", daemon=True)
+        self._watchdog.start()
 
     def submit(self, picture: Picture, want_jpeg: bool, on_result: Callable[[DetectionResult], None]) -> None:
         """Queues a picture; `on_result` is called from another thread. The caller bounds the queue."""
@@ -113,6 +128,7 @@ class ChildDetector:
             self._closing.set()  # from here on nobody starts another
             _kill(self._process)
         self._thread.join()
+        self._watchdog.join()
         self._stop_child()
 
     def _serve(self) -> None:
@@ -125,28 +141,30 @@ class ChildDetector:
             on_result(result)
 
     def _run(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
-        overdue = threading.Event()
-        process = self._process
-
-        def end_child() -> None:
-            overdue.set()
-            _kill(process)
-
-        # A child that has stopped takes no picture either: `send` would wait for it for ever.
-        limit = threading.Timer(self._job_limit_s, end_child)
-        limit.daemon = True
-        limit.start()
+        self._busy = job = _Job(time.monotonic(), self._process)
         try:
             return self._answer(picture, want_jpeg)
         except (OSError, EOFError):
             reason = (
-                f"detection gave no answer for {self._job_limit_s:g} s" if overdue.is_set() else "detection crashed"
+                f"detection gave no answer for {self._job_limit_s:g} s" if self._overdue is job else "detection crashed"
             )
         except Exception as error:  # a fault of ours or of a library's costs this picture, not all that come after it
             reason = f"detection failed: {error!r}"
         finally:
-            limit.cancel()
+            self._busy = None
         return DetectionResult([], (0, 0), None, self._replace_child(reason))
+
+    def _watch(self) -> None:
+        """Ends a child that takes too long, be it to take a picture: one that has stopped would hold up `send`."""
+        wait_s = self._job_limit_s
+        while not self._closing.wait(wait_s):
+            job, wait_s = self._busy, self._job_limit_s
+            if job is None or job is self._overdue:
+                continue
+            wait_s -= time.monotonic() - job.begun_s
+            if wait_s <= 0.0:
+                self._overdue, wait_s = job, self._job_limit_s
+                _kill(job.process)
 
     def _answer(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
         self._n_jobs += 1
@@ -237,6 +255,7 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, 0)  # the recorder goes first, also where it is allowed to be in a hurry
     # A detection that hangs would not notice that its parent was killed.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+    _keep_memory()
     import cv2
 
     cv2.setNumThreads(1)
@@ -252,6 +271,14 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
             connection.send((number, _detect(detector, picture, want_jpeg, settings.jpeg_quality)))
         except (EOFError, OSError):
             return
+
+
+def _keep_memory() -> None:
+    """What one picture's detection gives back stays for the next: the kernel would clear a thousand pages for each."""
+    with suppress(AttributeError):  # a C library without it
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES)
+        libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 def _detect(detector: TagDetector, picture: Picture, want_jpeg: bool, quality: int) -> DetectionResult:

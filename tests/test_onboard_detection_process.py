@@ -1,6 +1,7 @@
 """A detection's process that starts late, answers wrongly, takes nothing, or is started as the recording ends."""
 
 import gc
+import multiprocessing
 import os
 import signal
 import threading
@@ -166,3 +167,20 @@ def test_what_a_child_had_open_is_closed_when_it_is_ended() -> None:
         assert sorted(Path("/proc/self/fd").iterdir()) == before
     finally:
         gc.enable()
+
+
+def test_a_picture_takes_the_memory_that_the_one_before_gave_back() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (720, 1280)).astype(np.uint8)
+    jpeg = cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 3.0))[1].tobytes()
+    with child_detector(DetectorSettings()) as child:
+        (pid,) = {each.pid for each in multiprocessing.active_children()}
+
+        def page_faults() -> int:
+            return int(Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()[7])
+
+        for _ in range(3):
+            child.detect(jpeg)
+        before = page_faults()
+        for _ in range(10):
+            child.detect(jpeg)
+        assert page_faults() - before < 10 * 100  # about a thousand a picture else
