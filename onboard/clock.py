@@ -1,6 +1,7 @@
 """Time: the only place that reads a clock, and the mapping of the wheel controller's clock onto the host's."""
 
 import ctypes
+import functools
 import itertools
 import time
 from collections import deque
@@ -79,10 +80,16 @@ def read_clocks() -> ClockReading:
     return ClockReading(*min(tries)[1:])
 
 
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    """Asked several times a second, and looking the library up takes longer than the call."""
+    return ctypes.CDLL(None)
+
+
 def wall_clock_synchronised() -> bool:
     """Whether the kernel says that something disciplines its wall clock; False where it does not say."""
     try:
-        state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: read only
+        state: int = _libc().adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: read only
     except (AttributeError, OSError):
         return False
     return 0 <= state < _TIME_ERROR

@@ -1,6 +1,7 @@
 """The serial port of the wheel controller: open, read what is there, close. Whatever goes wrong is a PortLostError."""
 
 import errno
+import os
 import select
 import termios
 from typing import Final
@@ -45,7 +46,13 @@ class EncoderPort:
             if self._serial is None:
                 raise PortLostError(f"port {self.path} is not open")
             ready, _, _ = select.select([self._serial], [], [], timeout_s)
-            return bytes(self._serial.read(_READ_BYTES)) if ready else b""
+            # pyserial's own `read` would first ask again whether there is something.
+            data = os.read(self._serial.fileno(), _READ_BYTES) if ready else b""
+            if ready and not data:
+                raise PortLostError(f"port {self.path} was lost: it has ended")
+            return data
+        except BlockingIOError:  # it was ready, and is so no more
+            return b""
         # An unplugged port raises the first, then the others; TypeError when it was closed meanwhile.
         except (serial.SerialException, OSError, termios.error, TypeError, ValueError) as error:
             raise PortLostError(f"port {self.path} was lost: {_reason(error)}") from error
