@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -94,7 +95,7 @@ def pictures(load: Load) -> list[bytes]:
     return made
 
 
-def _speak(load: Load, folder: Path, go: Any, measured: Any) -> None:
+def _speak(load: Load, folder: Path, go: Any, measured: Any, over: Any) -> None:
     port = PtyPort(folder / "wheels", patient=True)  # held up itself, it would send more at once than a wire can
     times: list[int] = []
 
@@ -106,15 +107,17 @@ def _speak(load: Load, folder: Path, go: Any, measured: Any) -> None:
     go.wait()
     at_rate(load.lines_hz, load.seconds, act)
     measured.put((times, port.refused))
+    over.wait()  # a port that goes before the recording ends is a loss
 
 
-def _show(load: Load, folder: Path, go: Any, shown: Any) -> None:
+def _show(load: Load, folder: Path, go: Any, shown: Any, over: Any) -> None:
     ready = pictures(load)
     camera = PictureFolder(folder / "pictures", keep=60)
     go.wait()
     stamps: list[int] = []
     at_rate(load.fps, load.seconds, lambda index: stamps.append(camera.show(ready[index % len(ready)])))
     shown.put(len(stamps))
+    over.wait()
 
 
 def _robot(load: Load, folder: Path) -> Path:
@@ -134,7 +137,10 @@ recorder: {{picture_rate_hz: {load.fps if load.keep else 0.0}, detector: {load.d
 def _processes(pid: int) -> Iterator[int]:
     yield pid
     for task in Path(f"/proc/{pid}/task").iterdir():
-        for child in (task / "children").read_text().split():
+        children = ""
+        with suppress(OSError):  # a thread that has just ended
+            children = (task / "children").read_text()
+        for child in children.split():
             yield from _processes(int(child))
 
 
@@ -159,29 +165,35 @@ def _memory_mb(pid: int) -> float:
 def run(load: Load, folder: Path) -> dict[str, Any]:
     """Records once; returns what came of it."""
     context = multiprocessing.get_context("spawn")
-    go, answers = context.Event(), (context.Queue(), context.Queue())
+    go, over, answers = context.Event(), context.Event(), (context.Queue(), context.Queue())
     devices = [
-        context.Process(target=target, args=(load, folder, go, answer), daemon=True)
+        context.Process(target=target, args=(load, folder, go, answer, over), daemon=True)
         for target, answer in zip((_speak, _show), answers, strict=True)
     ]
     for each in devices:
         each.start()
     command = [sys.executable, "-m", "onboard.cli", "record", "--robot", str(_robot(load, folder))]
     with subprocess.Popen([*command, "--output", str(folder / "logs")], stdout=subprocess.PIPE, text=True) as recorder:
-        assert recorder.stdout is not None
-        waited_for = {"port_connected", "camera_connected"}
-        while waited_for:
-            line = recorder.stdout.readline()
-            waited_for -= {word for word in waited_for if word in line}
-        before, start_s = _cpu_s(recorder.pid), time.monotonic()
-        go.set()
-        time.sleep(load.seconds)
-        after, end_s = _cpu_s(recorder.pid), time.monotonic()
-        memory_mb = _memory_mb(recorder.pid)
-        (measured_ns, refused), n_shown = (answer.get() for answer in answers)
-        time.sleep(0.5)
-        recorder.send_signal(signal.SIGTERM)
-        said = recorder.communicate()[0]
+        try:
+            assert recorder.stdout is not None
+            waited_for = {"port_connected", "camera_connected"}
+            while waited_for:
+                line = recorder.stdout.readline()
+                waited_for -= {word for word in waited_for if word in line}
+            before, start_s = _cpu_s(recorder.pid), time.monotonic()
+            go.set()
+            time.sleep(load.seconds)
+            after, end_s = _cpu_s(recorder.pid), time.monotonic()
+            memory_mb = _memory_mb(recorder.pid)
+            (measured_ns, refused), n_shown = (answer.get() for answer in answers)
+            time.sleep(0.5)
+            recorder.send_signal(signal.SIGTERM)
+            said = recorder.communicate()[0]
+        except BaseException:
+            recorder.kill()  # else nobody would tell it to end
+            raise
+        finally:
+            over.set()
     shares = {pid: (after[pid] - before.get(pid, 0.0)) / (end_s - start_s) for pid in after}
     own = shares.pop(recorder.pid)
     found = {
