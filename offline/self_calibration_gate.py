@@ -20,12 +20,6 @@ from offline.self_calibration_robot import LIMITS
 # Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.
 _FALSE_ALARM: Final = 0.01
 _NOTHING: Final = 1e-9  # information, as a share of what the limits hold: rounding
-# What drives say of these is wrong where the driver steers back what the floor turned: then the wheels turn after the
-# noise, as if the camera were late, by 30 ms on simulated halls. Who drives for it (turns on the spot) may ask.
-STEERED: Final = frozenset({"time_offset_s"})
-_STEERED_BACK: Final = (
-    "steering back what the floor turned looks like a late camera; turn on the spot in view of tags, and ask for it"
-)
 TELLS_LESS: Final = "the drives tell less of it than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
 _NOT_ASKED: Final = "it was not asked for"
@@ -91,9 +85,7 @@ def _look(told: Told, sigmas: FloatArray, index: int, *, is_asked: bool) -> Cali
     whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
     gain = _held_out_gain(told, sigmas, index)
     reason = ""
-    if parameter.name in STEERED and not is_asked:
-        reason = _STEERED_BACK
-    elif whole.variance >= prior**2:
+    if whole.variance >= prior**2:
         reason = TELLS_LESS
     elif gain is None:
         reason = "a single stretch tells of it, and nothing bears that out"

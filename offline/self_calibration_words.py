@@ -19,7 +19,7 @@ DRIVES: Final[Mapping[str, str]] = MappingProxyType(
         "mount_yaw_rad": "drive straight towards tags and past them",
         "mount_roll_rad": "pass tags that hang at different heights, near, and far to either side; add --model corners",
         "mount_pitch_rad": "drive towards tags from afar until they are near; add --model corners",
-        "time_offset_s": "turn on the spot to and fro, fast, in view of tags, and ask for it by name",
+        "time_offset_s": "turn on the spot to and fro, fast, in view of tags",
         "focal_scale": "drive straight towards tags from afar until they are near; only --model corners tells it",
     }
 )
