@@ -195,16 +195,6 @@ class CornerFactors:
             axis=-1,
         )
 
-    def T_map_camera(self, state: SpatialState) -> tuple[FloatArray, FloatArray]:
-        """Rotation (M, 3, 3) and place (M, 3) of the camera at each look's keyframe."""
-        looks = self.looks
-        mount, rotation = self._mount(state)
-        pose = state.poses[looks.pose]
-        turn = _about_up(pose[:, 2])
-        place = np.einsum("mij,mj->mi", turn, mount[:, :3])
-        place[:, :2] += pose[:, :2]
-        return turn @ rotation, place
-
     def _residual(self, seen: Seen) -> FloatArray:
         looks = self.looks
         off: FloatArray = (seen.pixels - looks.corners_px) / looks.sigma_px[:, None, None]

@@ -13,9 +13,9 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from calib.arrays import FloatArray
-from offline.corner_factors import SpatialState, spatial_values
-from offline.corner_kernels import N_LOOK, add_wobble
-from offline.corner_problem import CORNER_LOSS, LOOKS, CornerProblem
+from offline.corner_factors import SpatialState
+from offline.corner_pictures import Pictures, pictures_at
+from offline.corner_problem import LOOKS, CornerProblem
 from offline.front_kernels import add_vectors
 from offline.fronts import FrontFactor, NotPositiveError
 
@@ -33,15 +33,18 @@ _UNLIKELINESS_TOLERANCE: Final = 0.1  # chance moves it by more
 _MOST_LOOKS: Final = 40
 
 
-def guessed_wobble(problem: CornerProblem, state: SpatialState, factor: FrontFactor | None = None) -> FloatArray:
+def guessed_wobble(
+    problem: CornerProblem, state: SpatialState, factor: FrontFactor | None = None, pictures: Pictures | None = None
+) -> FloatArray:
     """(3,) sigmas in WOBBLE to begin with, zeros where a level floor explains the corners as well.
 
     Args:
         problem: of a level floor.
         state: its solution.
         factor: of H there, if it is at hand.
+        pictures: as they stand there, if they are at hand.
     """
-    if not _shows(problem, state, factor or problem.factor(state)):
+    if not _shows(problem, pictures or pictures_at(problem, state), factor or problem.factor(state)):
         return LEVEL
     guesses = [scale * _USUAL for scale in (1.0, _NEARER)]
     unlikely = [_unlikeliness(with_wobble(problem, sigma), state) for sigma in (LEVEL, *guesses)]
@@ -49,7 +52,7 @@ def guessed_wobble(problem: CornerProblem, state: SpatialState, factor: FrontFac
     return guesses[best] if unlikely[1 + best] < unlikely[0] - _BETTER else LEVEL
 
 
-def _shows(problem: CornerProblem, state: SpatialState, factor: FrontFactor) -> bool:
+def _shows(problem: CornerProblem, pictures: Pictures, factor: FrontFactor) -> bool:
     """Whether a level floor leaves over more than chance in how pictures stand, by the slope of the likelihood there.
 
     By the square of a sigma that is half of sum f^2 - tr(B^T P B) over pictures, with f = B^T W r what pulls at a
@@ -57,11 +60,7 @@ def _shows(problem: CornerProblem, state: SpatialState, factor: FrontFactor) -> 
     (Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1990). A quarter of the work of one look
     at the likelihood, of which three would be needed.
     """
-    picture, n = problem.pictures
-    looks = problem.corners
-    own, force = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    coupled = np.empty((len(looks.looks), 3, N_LOOK))
-    add_wobble(looks.arrays, looks.lenses, CORNER_LOSS, spatial_values(state), picture, own, force, coupled)
+    picture, _, own, force, coupled = pictures
     kind, random = problem.order.kinds[LOOKS], np.random.default_rng(0)
     for of in (slice(0, 2), slice(2, 3)):
         whole = float(np.trace(own[:, of, of], axis1=1, axis2=2).sum())

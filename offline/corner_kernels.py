@@ -48,7 +48,7 @@ class SpatialValues(NamedTuple):
     turns: FloatArray
 
 
-class _Eye(NamedTuple):
+class Eye(NamedTuple):
     """A camera on its base: its place, the rotation from its axes, and the axes about which its mount turns."""
 
     mount: FloatArray  # (6,)
@@ -64,67 +64,40 @@ def add_looks(
     values: SpatialValues,
     kind: Kind,
     system: System,
-    weight: FloatArray,
 ) -> float:
-    """Adds J^T W J and J^T W r of all looks, and sets their weights (M,); returns the sum of their losses.
+    """Adds J^T W J and J^T W r of all looks; returns the sum of their losses.
 
     Where the system has no room for matrices only gradients are added.
     """
     looks, values, kind, system = borrowed(looks), borrowed(values), borrowed(kind), borrowed(system)
     r, J, B, normal = np.empty(8), np.empty((8, N_LOOK)), np.empty((8, 3)), np.empty((N_LOOK, N_LOOK))
-    eye = _Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     total, is_whole = 0.0, len(system.entries) > 0
     free, place = np.empty(N_LOOK, dtype=np.uint64), np.empty(N_LOOK, dtype=np.uint64)
     for m in range(len(looks.pose)):
-        _face(looks, m, values.calibration, eye)
+        face(looks, m, values.calibration, eye)
         look_factor(looks, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
         rho, w = loss_and_weight(loss, square)
         total += rho
-        weight[m] = w
         f0, f1, f2, f3 = w * r[0], w * r[1], w * r[2], w * r[3]
         f4, f5, f6, f7 = w * r[4], w * r[5], w * r[6], w * r[7]
-        _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, normal[0])
+        _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 0, normal[0])
         add_vector(kind, m, normal[0], system.gradient)
         if is_whole:
-            for a in range(N_LOOK):
+            for a in range(N_LOOK):  # above the diagonal, and in what blocks of six have below
                 f0, f1, f2, f3 = w * J[0, a], w * J[1, a], w * J[2, a], w * J[3, a]
                 f4, f5, f6, f7 = w * J[4, a], w * J[5, a], w * J[6, a], w * J[7, a]
-                _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, normal[a])
+                if a < 6:
+                    _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 0, normal[a])
+                elif a < 12:
+                    _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 6, normal[a])
+                else:
+                    _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 12, normal[a])
             add_matrix(kind, m, normal, system, free, place)
     return total
-
-
-@jitted
-def add_to_tags(
-    looks: LookArrays,
-    lenses: FloatArray,
-    loss: Loss,
-    values: SpatialValues,
-    losses: FloatArray,
-    normal: FloatArray,
-    gradient: FloatArray,
-) -> None:
-    """Adds what looks lose (T,) to their tags, and J^T W J (T, 6, 6) and J^T W r (T, 6) by place and turn alone."""
-    looks, values = borrowed(looks), borrowed(values)
-    r, J, B = np.empty(8), np.empty((8, N_LOOK)), np.empty((8, 3))
-    eye = _Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
-    for m in range(len(looks.pose)):
-        _face(looks, m, values.calibration, eye)
-        look_factor(looks, lenses, m, values, eye, r, J, B)
-        tag, square = looks.tag[m], 0.0
-        for i in range(8):
-            square += r[i] * r[i]
-        rho, w = loss_and_weight(loss, square)
-        losses[tag] += rho
-        for i in range(8):
-            for a in range(6):
-                f = w * J[i, 3 + a]
-                gradient[tag, a] += f * r[i]
-                for b in range(6):
-                    normal[tag, a, b] += f * J[i, 3 + b]
 
 
 @jitted
@@ -133,26 +106,32 @@ def add_wobble(
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
+    given: FloatArray,
     picture: IntArray,
+    weight: FloatArray,
     own: FloatArray,
     force: FloatArray,
     coupled: FloatArray,
 ) -> None:
-    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 18); B as in `look_factor`."""
+    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 18); B as in `look_factor`.
+
+    Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
+    """
     looks, values = borrowed(looks), borrowed(values)
     r, J, B = np.empty(8), np.empty((8, N_LOOK)), np.empty((8, 3))
-    eye = _Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for m in range(len(looks.pose)):
-        _face(looks, m, values.calibration, eye)
+        face(looks, m, values.calibration, eye)
         look_factor(looks, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
-        _, w = loss_and_weight(loss, square)
+        w = given[m] if len(given) else loss_and_weight(loss, square)[1]
+        weight[m] = w
         for k in range(3):
             f0, f1, f2, f3 = w * B[0, k], w * B[1, k], w * B[2, k], w * B[3, k]
             f4, f5, f6, f7 = w * B[4, k], w * B[5, k], w * B[6, k], w * B[7, k]
-            _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, coupled[m, k])
+            _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 0, coupled[m, k])
             for i in range(8):
                 force[picture[m], k] += w * B[i, k] * r[i]
                 for j in range(3):
@@ -206,7 +185,7 @@ def add_motions(odometry: Odometry, loss: Loss, values: Values, kind: Kind, syst
                 heavy[2, k] = w * (l2 * J[0, k] + l4 * J[1, k] + l5 * J[2, k])
             for k in range(N_MOTION):
                 c0, c1, c2 = J[0, k], J[1, k], J[2, k]
-                for j in range(N_MOTION):
+                for j in range(k, N_MOTION):
                     normal[k, j] = c0 * heavy[0, j] + c1 * heavy[1, j] + c2 * heavy[2, j]
             add_matrix(kind, m, normal, system, free, place)
     return total
@@ -223,17 +202,18 @@ def _combine(
     f5: float,
     f6: float,
     f7: float,
+    first: int,
     out: FloatArray,
 ) -> None:
-    """The rows of J (8, 18), so many times each."""
-    for b in range(N_LOOK):
+    """The rows of J (8, 18), so many times each, from some column on."""
+    for b in range(first, N_LOOK):
         out[b] = (f0 * J[0, b] + f1 * J[1, b] + f2 * J[2, b] + f3 * J[3, b]) + (
             f4 * J[4, b] + f5 * J[5, b] + f6 * J[6, b] + f7 * J[7, b]
         )
 
 
 @inner
-def _face(looks: LookArrays, m: int, calibration: FloatArray, eye: _Eye) -> None:
+def face(looks: LookArrays, m: int, calibration: FloatArray, eye: Eye) -> None:
     """Sets the eye as the calibration has it, unless it is so already: most looks are by the same one."""
     is_same = True
     for k in range(6):
@@ -265,7 +245,7 @@ def look_factor(
     lenses: FloatArray,
     m: int,
     values: SpatialValues,
-    eye: _Eye,
+    eye: Eye,
     r: FloatArray,
     J: FloatArray,
     B: FloatArray,
@@ -286,7 +266,9 @@ def look_factor(
     along, even, _ = series(-late * omega)
     across = -late * omega * even
     back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
-    by_pixel = 1.0 / looks.sigma_px[m]
+    cos_l, sin_l = 1.0 + late * omega * across, -late * omega * along
+    cos_m, sin_m, cos_t, sin_t, last = 1.0, 0.0, cos_l, sin_l, 0.0
+    by_pixel, by_scale = 1.0 / looks.sigma_px[m], 1.0 / scale
     for k in range(4):
         u = -half if k == 0 or k == 3 else half
         v = half if k < 2 else -half
@@ -295,11 +277,12 @@ def look_factor(
         up = values.heights_m[tag] + T[2, 0] * u + T[2, 1] * v
         key_x, key_y = cos_h * dx + sin_h * dy, cos_h * dy - sin_h * dx
         moved = looks.moved[m, k]
-        cos_m, sin_m = np.cos(moved[2]), np.sin(moved[2])
+        if moved[2] != last:  # all corners were seen at once, but by a rolling shutter
+            last = moved[2]
+            cos_m, sin_m = np.cos(last), np.sin(last)
+            cos_t, sin_t = cos_m * cos_l - sin_m * sin_l, sin_m * cos_l + cos_m * sin_l
         rest_x = key_x - (moved[0] + cos_m * back_x - sin_m * back_y)
         rest_y = key_y - (moved[1] + sin_m * back_x + cos_m * back_y)
-        turn = moved[2] - late * omega
-        cos_t, sin_t = np.cos(turn), np.sin(turn)
         base_x, base_y = cos_t * rest_x + sin_t * rest_y, cos_t * rest_y - sin_t * rest_x
         x, y, z = base_x - mount[0], base_y - mount[1], up - mount[2]
         c0 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
@@ -334,6 +317,6 @@ def look_factor(
             row[13] = w0 * eye.axes[1, 0] + w1 * eye.axes[1, 1]
             row[14] = w2
             row[15] = b0 * v0 + b1 * v1 - (b0 * base_y - b1 * base_x) * omega
-            row[16] = (t0 * u + t1 * v) / scale
+            row[16] = (t0 * u + t1 * v) * by_scale
             row[17] = by_pixel * off
             B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2

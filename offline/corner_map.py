@@ -82,14 +82,14 @@ def refine(
         return None, []  # the map says so already
     corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
     found = solve_corners(corners.problem, start)
-    sigma = guessed_wobble(found.problem, found.state, found.factor)
+    sigma = guessed_wobble(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
         sigma = fitted_wobble(found.problem, found.state)
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
     off_level = stretches_off_level(graph, found)
     reason = "" if found.converged else found.reason
-    if not reason and (share := found.problem.outliers(found.state)) > _MOST_OUTLIERS:
+    if not reason and (share := found.pictures.outliers) > _MOST_OUTLIERS:
         reason = (
             f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
         )

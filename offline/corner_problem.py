@@ -5,15 +5,14 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_build import compiled_motions
 from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
 from offline.corner_kernels import N_LOOK, add_looks, add_motions
 from offline.corner_order import corner_order
+from offline.corner_step_kernels import move
 from offline.factors import CalibrationPrior, Linearised, OdometryFactors, ReadingFactors
 from offline.front_kernels import System
 from offline.fronts import FrontFactor, Fronts, Normal
@@ -161,7 +160,7 @@ class CornerProblem:
         total = add_motions(self.motions, DEFAULT_LOSSES.odometry, values, odometry, system)
         few = self._few(state)
         self.order.add(system, 1, [normal for normal, _ in few])
-        total += sum(each for _, each in few) + self._level_looks(state, system)[1]
+        total += sum(each for _, each in few) + self._level_looks(state, system)
         return system, 0.5 * total
 
     def factor(self, state: SpatialState) -> FrontFactor:
@@ -173,20 +172,23 @@ class CornerProblem:
         return self.order.factorise(self.system(state)[0])
 
     def _few(self, state: SpatialState) -> list[tuple[Normal, float]]:
-        """Of all kinds between odometry and looks, with the sum of their losses."""
+        """Of all kinds between odometry and looks, with the sum of their losses; most floors have but the prior."""
+        columns, starts, distances = self.columns, self.measured.starts, self.measured.distances
         return [
-            _normal(self.readings.linearise(state, self.columns), DEFAULT_LOSSES.readings),
-            _normal(self.prior.linearise(state, self.columns), None),
-            *(_normal(kind, None) for kind in self.measured.linearise(state, self.columns)),
-            _normal(self.upright.linearise(state, self.columns), None),
+            _normal(self.readings.linearise(state, columns), DEFAULT_LOSSES.readings)
+            if len(self.readings.pose)
+            else _NONE,
+            _normal(self.prior.linearise(state, columns), None),
+            _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,
+            _normal(distances.linearise(state, columns), None) if len(distances.distance_m) else _NONE,
+            _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
         ]
 
-    def _level_looks(self, state: SpatialState, system: System) -> tuple[FloatArray, float]:
-        """Adds looks at level pictures; their weights (M,) and twice their cost."""
-        corners, weight = self.corners, np.empty(len(self.corners.looks))
-        values = spatial_values(state)
-        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, self.order.kinds[LOOKS], system, weight)
-        return weight, cost if np.isfinite(cost) else np.inf
+    def _level_looks(self, state: SpatialState, system: System) -> float:
+        """Adds looks at level pictures; twice their cost."""
+        corners, values = self.corners, spatial_values(state)
+        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, self.order.kinds[LOOKS], system)
+        return cost if np.isfinite(cost) else np.inf
 
     def weighed(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
         """Weighs looks whose pictures may stand off level.
@@ -218,37 +220,22 @@ class CornerProblem:
         _, logarithms = np.linalg.slogdet(np.eye(3) + self.wobble_sigma**2 * own)
         return float(np.sum(logarithms))
 
-    def outliers(self, state: SpatialState) -> float:
-        """Share of looks beyond where their loss leaves the square."""
-        if not self.wobble_sigma.any():
-            weight, _ = self._level_looks(state, self.order.empty(is_whole=False))
-            return float((weight < 1.0).mean())
-        linearised, wobble = self.corners.linearise(state, self.columns)
-        return float((self.weighed(linearised.residual, wobble).weight < 1.0).mean())
-
     def moved(self, state: SpatialState, step: FloatArray) -> SpatialState:
         """The state after a step (n,): tags move along with their anchors as on a rigid body, see `solver.Problem`."""
-        padded, columns = np.append(step, 0.0), self.columns
-        by_pose = padded[columns.poses]
-        poses = se2.compose(state.poses, se2.exp(by_pose))
-        before, turned = state.poses[self.anchor], by_pose[self.anchor]
-        from_anchor = se2.apply(se2.inverse(before), state.tags)
-        moved_along = turned[:, :2] + turned[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
-        to_anchor_axes = np.column_stack([np.zeros((len(before), 2)), -before[:, 2]])
-        own = se2.apply(to_anchor_axes, padded[columns.tags]) - moved_along
-        up = np.zeros((len(before), 3))
-        up[:, 2] = turned[:, 2]
-        along = np.einsum("tji,tj->ti", state.turns, up)  # the anchor's turn, about the tag's own axes
-        free = columns.heights >= 0
-        rest = np.where(free[:, None], padded[columns.turns] - along, 0.0)
-        about_up = Rotation.from_rotvec(np.where(free[:, None], up, 0.0)).as_matrix()
-        return SpatialState(
-            poses=poses,
-            tags=se2.apply(poses[self.anchor], from_anchor + own),
+        columns = self.columns
+        padded = np.append(step, 0.0)
+        after = SpatialState(
+            poses=np.empty_like(state.poses),
+            tags=np.empty_like(state.tags),
             calibration=state.calibration + padded[columns.calibration],
-            heights_m=state.heights_m + padded[columns.heights],
-            turns=about_up @ state.turns @ Rotation.from_rotvec(rest).as_matrix(),
+            heights_m=np.empty_like(state.heights_m),
+            turns=np.empty_like(state.turns),
         )
+        move(
+            spatial_values(state), padded, columns.poses, columns.tags, columns.heights, columns.turns, self.anchor,
+            spatial_values(after),
+        )  # fmt: skip
+        return after
 
     def _looks(self, state: SpatialState) -> tuple[Normal, Normal, float]:
         """Of looks and of pairs that share a picture, how the pictures stand eliminated; and twice their cost."""
@@ -287,6 +274,7 @@ class CornerProblem:
 
 # rad and m: a floor that is as good as level keeps its information finite.
 _LEVEL: Final = 1e-7
+_NONE: Final = (Normal(np.zeros((0, 1, 1)), np.zeros((0, 1))), 0.0)
 
 
 def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:

@@ -1,12 +1,14 @@
 """Least squares on tag corners: Gauss-Newton steps while they work, damped where one would raise the cost."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from offline.corner_factors import SpatialState
+from offline.corner_pictures import Pictures, pictures_at
 from offline.corner_problem import CornerProblem
 from offline.damping import Damping
 from offline.front_kernels import System
@@ -46,6 +48,11 @@ class CornerSolution:
     def cost(self) -> float:
         """At the end."""
         return self.costs[-1]
+
+    @cached_property
+    def pictures(self) -> Pictures:
+        """What the looks say of how pictures stand at the end."""
+        return pictures_at(self.problem, self.state)
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns of the tangent vector; 0 where held (-1).

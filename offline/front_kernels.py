@@ -133,18 +133,22 @@ def assemble(kind: Kind, normal: FloatArray, system: System) -> None:
 @inner
 def add_matrix(kind: Kind, m: int, normal: FloatArray, system: System, free: Unsigned, place: Unsigned) -> None:
     """Adds one factor's normal matrix (k, k); free and place: (k,) room, unsigned to spare a look at each sign."""
-    front, n = _front(system.nodes, kind.node[m], system.entries), 0
+    node, n = kind.node[m], 0
+    begin, end = system.nodes.offset[node], system.nodes.offset[node + 1]
+    front, size = system.entries[begin:end], np.uint64(system.nodes.start[node + 1] - system.nodes.start[node])
     for a in range(kind.place.shape[1]):
         if kind.place[m, a] >= 0:
             free[n], place[n] = a, kind.place[m, a]
             n += 1
     for i in range(n):
         row, own = place[i], normal[free[i]]
-        front[row, row] += own[free[i]]
+        along = row * size
+        front[along + row] += own[free[i]]
         for j in range(i + 1, n):
             column = place[j]
             # The same column twice: both its mixed terms are on the diagonal.
-            front[min(row, column), max(row, column)] += own[free[j]] * (2.0 if row == column else 1.0)
+            value = own[free[j]] * (2.0 if row == column else 1.0)
+            front[along + column if row < column else column * size + row] += value
 
 
 @inner
@@ -193,20 +197,48 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
 def substitute(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
     """X (n,) <- H^-1 x."""
     nodes = borrowed(nodes)
+    own = np.empty(_largest(nodes))  # of x, what a front has: in a row
     for i in range(len(nodes.parent)):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
+        for k in range(len(columns)):
+            own[k] = x[columns[k]]
         for k in range(nodes.n_own[i]):
-            value = x[columns[k]] / front[k, k]
-            x[columns[k]] = value
-            for j in range(k + 1, len(columns)):
-                x[columns[j]] -= front[k, j] * value
+            own[k] /= front[k, k]
+            value, row, rest = own[k], front[k, k + 1 :], own[k + 1 : len(columns)]
+            for j in range(len(row)):
+                rest[j] -= row[j] * value
+        for k in range(len(columns)):
+            x[columns[k]] = own[k]
     for i in range(len(nodes.parent) - 1, -1, -1):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
+        for k in range(len(columns)):
+            own[k] = x[columns[k]]
         for k in range(nodes.n_own[i] - 1, -1, -1):
-            value = x[columns[k]]
-            for j in range(k + 1, len(columns)):
-                value -= front[k, j] * x[columns[j]]
-            x[columns[k]] = value / front[k, k]
+            own[k] = (own[k] - _product(front[k, k + 1 :], own[k + 1 : len(columns)])) / front[k, k]
+            x[columns[k]] = own[k]
+
+
+@inner
+def _largest(nodes: Nodes) -> int:
+    """Columns of the largest front."""
+    largest = 0
+    for i in range(len(nodes.parent)):
+        largest = max(largest, nodes.start[i + 1] - nodes.start[i])
+    return largest
+
+
+@inner
+def _product(a: FloatArray, b: FloatArray) -> float:
+    """Sum of a times b, four at once: one sum alone waits for each addition."""
+    s0, s1, s2, s3, whole = 0.0, 0.0, 0.0, 0.0, len(a) - len(a) % 4
+    for j in range(0, whole, 4):
+        s0 += a[j] * b[j]
+        s1 += a[j + 1] * b[j + 1]
+        s2 += a[j + 2] * b[j + 2]
+        s3 += a[j + 3] * b[j + 3]
+    for j in range(whole, len(a)):
+        s0 += a[j] * b[j]
+    return (s0 + s1) + (s2 + s3)
 
 
 @jitted

@@ -87,6 +87,8 @@ class Fronts:
     def add(self, system: System, first: int, normals: Sequence[Normal]) -> None:
         """Adds the normal equations of kinds of factors, from the first of these on; no matrices without room."""
         for kind, normal in zip(self.kinds[first:], normals, strict=False):
+            if not len(normal.gradient):
+                continue
             add_vectors(kind, normal.gradient, system.gradient)
             if len(system.entries):
                 assemble(kind, normal.matrix, system)

@@ -1,5 +1,6 @@
 """Compiled lenses: how a camera bends rays, and by how much more for a ray a little further out."""
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ CENTRE, _TANGENTIAL, _LIMIT, _IS_EQUIDISTANT, _NUMERATOR, _DENOMINATOR = 2, 4, 6
 _NEAR_AXIS: Final = 1e-16
 
 
+@lru_cache(maxsize=16)
 def lenses_of(cameras: tuple[CameraModel, ...]) -> FloatArray:
     """(C, 17): focal lengths, centre, p1 and p2, limit, whether equidistant, numerator (5), denominator (4)."""
     rows = np.zeros((len(cameras), _DENOMINATOR + _N_DENOMINATOR))
@@ -36,7 +38,8 @@ def distorted_at(
     """Distorted coordinates, their derivatives (symmetric), and the undistorted ones; NaN where there is no image."""
     if not z > 0.0:
         return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
-    x, y = x / z, y / z
+    inverse = 1.0 / z
+    x, y = x * inverse, y * inverse
     square = x * x + y * y
     if not square < lens[_LIMIT] * lens[_LIMIT]:
         return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
@@ -57,24 +60,25 @@ def distorted_at(
 def _factor(lens: FloatArray, square: float) -> tuple[float, float]:
     """As `Distortion._factor`: g(s) and dg/ds."""
     if lens[_IS_EQUIDISTANT] == 0.0:
-        above, above_slope = _polynomial(lens[_NUMERATOR : _NUMERATOR + _N_NUMERATOR], square)
-        below, below_slope = _polynomial(lens[_DENOMINATOR : _DENOMINATOR + _N_DENOMINATOR], square)
-        factor = above / below
-        return factor, (above_slope - factor * below_slope) / below
+        above, above_slope = _polynomial(lens, _NUMERATOR, _N_NUMERATOR, square)
+        below, below_slope = _polynomial(lens, _DENOMINATOR, _N_DENOMINATOR, square)
+        inverse = 1.0 / below
+        factor = above * inverse
+        return factor, (above_slope - factor * below_slope) * inverse
     if square < _NEAR_AXIS:
         return 1.0, lens[_NUMERATOR + 1] - 1.0 / 3.0
     radius = np.sqrt(square)
     angle = np.arctan(radius)
-    value, by_square = _polynomial(lens[_NUMERATOR : _NUMERATOR + _N_NUMERATOR], angle * angle)
+    value, by_square = _polynomial(lens, _NUMERATOR, _N_NUMERATOR, angle * angle)
     factor = angle * value / radius
     return factor, ((value + 2.0 * angle * angle * by_square) / (1.0 + square) - factor) / (2.0 * square)
 
 
 @inner
-def _polynomial(coefficients: FloatArray, at: float) -> tuple[float, float]:
-    """Value and derivative; the constant comes first."""
+def _polynomial(lens: FloatArray, first: int, count: int, at: float) -> tuple[float, float]:
+    """Value and derivative; the constant comes first. Without slices the loop is written out."""
     value, slope = 0.0, 0.0
-    for i in range(len(coefficients) - 1, -1, -1):
+    for i in range(first + count - 1, first - 1, -1):
         slope = slope * at + value
-        value = value * at + coefficients[i]
+        value = value * at + lens[i]
     return value, slope

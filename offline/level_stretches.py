@@ -8,6 +8,7 @@ another solve (Rao, "Large sample tests of statistical hypotheses", 1948). A str
 elsewhere has L = 0: they took the slope for their own.
 """
 
+from collections.abc import Sequence
 from math import degrees
 from typing import Final, NamedTuple
 
@@ -16,6 +17,7 @@ from scipy.stats import chi2
 
 from calib.arrays import FloatArray, IntArray
 from offline.chain import Chain
+from offline.corner_problem import LOOKS
 from offline.corner_solver import CornerSolution
 from offline.graph import Graph
 from offline.joint_fit import UNMODELLED_SIGMA_M
@@ -68,7 +70,7 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
     pictures = _pictures(solution)
     firsts = graph.first_pose.tolist()
     cut = [each for chain, first in zip(graph.chains, firsts, strict=True) for each in _cut(chain, first, pictures)]
-    asked = [each for each in cut if _shows(pictures, each)]
+    asked = _show(pictures, cut)
     couplings = [_coupled(pictures, each, solution.problem.columns.n) for each in asked]
     taken = [np.stack([solution.factor.solve(row) for row in each]) for each in couplings]
     cross = np.array([[one @ other.T for other in taken] for one in couplings]).reshape(len(asked), len(asked), 3, 3)
@@ -96,45 +98,36 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
 
 
 def _pictures(solution: CornerSolution) -> _Pictures:
-    problem, state = solution.problem, solution.state
-    linearised, wobble = problem.corners.linearise(state, problem.columns)
-    ((columns, jacobian),) = linearised.blocks
-    weight = problem.weighed(linearised.residual, wobble).weight
-    picture, n = problem.pictures
-    heavy = (weight[:, None, None] * wobble).swapaxes(-1, -2)
-    own, slope, range_m = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-    np.add.at(own, picture, heavy @ wobble)
-    np.add.at(slope, picture, (heavy @ linearised.residual[..., None])[..., 0])
-    looks = problem.corners.looks
-    far_m = np.linalg.norm(state.tags[looks.tag] - state.poses[looks.pose, :2], axis=1)
-    np.add.at(range_m, picture, far_m)
+    problem, state, found = solution.problem, solution.state, solution.pictures
+    picture, looks = found.picture, problem.corners.looks
+    n = len(found.own)
     pose = np.zeros(n, dtype=np.int64)
     pose[picture] = looks.pose
-    spread = np.linalg.inv(np.eye(3) + own * problem.wobble_sigma**2)
-    return _Pictures(
-        pose=pose,
-        slope=(spread @ slope[..., None])[..., 0],
-        information=spread @ own,
-        look_picture=picture,
-        coupled=spread[picture] @ heavy @ jacobian,
-        columns=columns,
-        range_m=range_m / np.bincount(picture, minlength=n),
-    )
+    off_m = state.tags[looks.tag] - state.poses[looks.pose, :2]
+    range_m = np.bincount(picture, np.hypot(off_m[:, 0], off_m[:, 1]), n) / np.bincount(picture, minlength=n)
+    columns = problem.order.kinds[LOOKS].columns
+    if not problem.wobble_sigma.any():  # quicker than by what follows
+        return _Pictures(pose, found.force, found.own, picture, found.coupled, columns, range_m)
+    spread = np.linalg.inv(np.eye(3) + found.own * problem.wobble_sigma**2)
+    slope = np.asarray((spread @ found.force[..., None])[..., 0], dtype=np.float64)
+    return _Pictures(pose, slope, spread @ found.own, picture, spread[picture] @ found.coupled, columns, range_m)
 
 
 def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[IntArray]:
     """Pictures of a chain, cut by the way driven and by what was turned."""
     steps = np.maximum(chain.odometry.distance_m / _STRETCH_M, np.abs(chain.odometry.motion[:, 2]) / _STRETCH_RAD)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    own = np.flatnonzero((pictures.pose >= first) & (pictures.pose < first + len(along)))
-    cell = along[pictures.pose[own] - first].astype(np.int64)
-    return [own[cell == c] for c in np.unique(cell)]
+    begin, end = np.searchsorted(pictures.pose, [first, first + len(along)]).tolist()
+    cell = along[pictures.pose[begin:end] - first].astype(np.int64)
+    return np.split(np.arange(begin, end), np.flatnonzero(np.diff(cell)) + 1) if end > begin else []
 
 
-def _shows(pictures: _Pictures, which: IntArray) -> bool:
-    """Whether a stretch might be off: as good as certain poses and tags are not, it can only look less so."""
-    slope, information = pictures.slope[which].sum(axis=0), pictures.information[which].sum(axis=0)
-    return float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) > _MAY_BE
+def _show(pictures: _Pictures, cut: Sequence[IntArray]) -> list[IntArray]:
+    """Stretches that might be off: as good as certain poses and tags are not, they can only look less so."""
+    first = [each[0] for each in cut]  # each picture is of one stretch
+    slope, information = np.add.reduceat(pictures.slope, first), np.add.reduceat(pictures.information, first)
+    square = np.einsum("ci,cij,cj->c", slope, np.linalg.pinv(information, hermitian=True), slope)
+    return [cut[c] for c in np.flatnonzero(square > _MAY_BE).tolist()]
 
 
 def _coupled(pictures: _Pictures, which: IntArray, n: int) -> FloatArray:

@@ -10,6 +10,7 @@ from calib import se2
 from calib.arrays import FloatArray, IntArray
 from calib.camera_model import CameraModel
 from offline.corner_factors import CornerFactors, Looks, SpatialColumns, SpatialState
+from offline.corner_pictures import pictures_at
 from offline.corner_problem import CornerProblem, columns_of
 from offline.factors import CalibrationPrior, OdometryFactors, ReadingFactors
 from offline.front_kernels import System
@@ -224,8 +225,30 @@ def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wob
     assert (same_cost, also_same_cost) == pytest.approx((cost, cost), rel=1e-12)
     linearised, by_standing = problem.corners.linearise(state, problem.columns)
     share = (problem.weighed(linearised.residual, by_standing).weight < 1.0).mean()
-    assert problem.outliers(state) == pytest.approx(share)
+    assert pictures_at(problem, state).outliers == pytest.approx(share)
     assert 0.0 < share < 1.0
+
+
+def test_after_a_step_tags_have_gone_along_with_their_anchors_and_by_their_own_step() -> None:
+    """Written with arrays; one tag is held as nobody saw it."""
+    problem, state = made_problem(8)
+    free = np.arange(N_TAGS) > 0
+    columns = columns_of(N_POSES, free, SIGMAS)
+    problem = replace(problem, columns=columns, anchor=1 + np.arange(N_TAGS))
+    step = 0.3 * np.random.default_rng(9).standard_normal(columns.n)
+    after, padded = problem.moved(state, step), np.append(step, 0.0)
+    np.testing.assert_allclose(after.poses, moved(state, columns, step).poses, atol=1e-14)
+    before, way = state.poses[problem.anchor], padded[columns.poses][problem.anchor]
+    seen = se2.apply(se2.inverse(before), state.tags)
+    own = se2.apply(before * [0.0, 0.0, -1.0], padded[columns.tags])
+    seen += own - way[:, :2] - way[:, 2:] * np.stack([-seen[:, 1], seen[:, 0]], axis=-1)
+    np.testing.assert_allclose(after.tags, se2.apply(after.poses[problem.anchor], seen), atol=1e-14)
+    up = way[:, 2:] * [0.0, 0.0, 1.0]
+    rest = padded[columns.turns] - (state.turns.swapaxes(-1, -2) @ up[..., None])[..., 0]
+    turned = Rotation.from_rotvec(up).as_matrix() @ state.turns @ Rotation.from_rotvec(rest).as_matrix()
+    np.testing.assert_allclose(after.turns, np.where(free[:, None, None], turned, state.turns), atol=1e-14)
+    np.testing.assert_allclose(after.heights_m, state.heights_m + padded[columns.heights], atol=1e-15)
+    np.testing.assert_array_equal(after.calibration, state.calibration + padded[columns.calibration])
 
 
 def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:

@@ -260,7 +260,7 @@ def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapRe
     assert sigma[2] < 0.003
     again = solve_corners(with_wobble(uneven.problem, sigma), uneven.state)
     assert again.converged
-    assert again.problem.outliers(again.state) < 0.05 < level.problem.outliers(level.state)
+    assert again.pictures.outliers < 0.05 < level.pictures.outliers
 
 
 def test_the_command_offers_both_models(run: Program, short: Run, tmp_path: Path) -> None:

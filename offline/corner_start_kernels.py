@@ -1,0 +1,295 @@
+"""Compiled parts of `corner_start`: which looks pose a tag, the poses that they allow, and how well looks fit these."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from offline.arrowhead_kernels import eliminate_columns
+from offline.corner_kernels import Eye, LookArrays, SpatialValues, face
+from offline.corner_step_kernels import turn_by, turned
+from offline.jit import borrowed, inner, jitted
+from offline.lens_kernels import CENTRE, distorted_at
+from offline.linearise_kernels import series
+from offline.planar_kernels import ray_through, square_poses
+from offline.robust import Loss, loss_and_weight
+
+POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
+# Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
+# have no planar pose at all.
+_ASIDE_RAD: Final = 0.6
+POSES: Final = 4  # that a look allows: two planar, two upright
+_JUDGING_LOOKS: Final = 8
+_STEPS: Final = 5
+_DAMPING: Final = 1e-6
+# In squared sigmas: which pose is the right one, and the solve that begins there, ask for no more.
+_ARRIVED: Final = 1e-4
+
+
+class ByTag(NamedTuple):
+    """Looks (M,) by their tags: those of one begin at begin (T + 1,)."""
+
+    order: IntArray
+    begin: IntArray
+
+
+@jitted
+def posed(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
+    """Sets (T, 2) of each tag the largest look, and of those half as large the one whose shape differs most.
+
+    -1 where a tag has no look, or no second one.
+    """
+    for t in range(len(out)):
+        own = by_tag.order[by_tag.begin[t] : by_tag.begin[t + 1]]
+        out[t, :] = -1
+        if not len(own):
+            continue
+        largest, most = own[0], -1.0
+        for m in own:
+            size = _size(corners_px[m])
+            if size > most:
+                largest, most = m, size
+        out[t, 0] = largest
+        if len(own) < POSED_LOOKS:
+            continue
+        out[t, 1], farthest = own[0], 0.0
+        for m in own:
+            apart = _apart(corners_px[m], corners_px[largest]) if _size(corners_px[m]) > 0.5 * most else 0.0
+            if apart > farthest:
+                out[t, 1], farthest = m, apart
+
+
+@inner
+def _size(corners: FloatArray) -> float:
+    """Twice the area of a quadrangle (4, 2)."""
+    across_x, across_y = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
+    up_x, up_y = corners[3, 0] - corners[1, 0], corners[3, 1] - corners[1, 1]
+    return abs(float(across_x * up_y - across_y * up_x))
+
+
+@inner
+def _apart(a: FloatArray, b: FloatArray) -> float:
+    """How much two quadrangles differ in shape, each about its middle and by its size."""
+    by_a, by_b, total = 1.0 / np.sqrt(max(_size(a), 1.0)), 1.0 / np.sqrt(max(_size(b), 1.0)), 0.0
+    for i in range(2):
+        middle_a = 0.25 * (a[0, i] + a[1, i] + a[2, i] + a[3, i])
+        middle_b = 0.25 * (b[0, i] + b[1, i] + b[2, i] + b[3, i])
+        for k in range(4):
+            total += abs((a[k, i] - middle_a) * by_a - (b[k, i] - middle_b) * by_b)
+    return total
+
+
+@jitted
+def rays_of(looks: LookArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
+    """Sets unit rays (C, 4, 3) to the corners of some looks; NaN where none was found."""
+    looks = borrowed(looks)
+    for i in range(len(which)):
+        for k in range(4):
+            ray_through(lenses[looks.camera[which[i]]], looks.corners_px[which[i], k], out[i, k])
+
+
+@jitted
+def allowed(
+    looks: LookArrays, values: SpatialValues, which: IntArray, rays: FloatArray, places: FloatArray, turns: FloatArray
+) -> None:
+    """Sets places (C, 4, 3) and turns (C, 4, 3, 3) in map of the tags that looks with rays (C, 4, 3) may have seen.
+
+    Two planar poses, NaN where there is none, and two upright ones as far off as the tag is on the floor.
+    """
+    looks, values = borrowed(looks), borrowed(values)
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    W, place, in_map = np.empty((3, 3)), np.empty(3), np.empty(3)
+    in_camera, seen = np.empty((2, 3)), np.empty((2, 3, 3))
+    for i in range(len(which)):
+        m = which[i]
+        face(looks, m, values.calibration, eye)
+        pose = values.poses[looks.pose[m]]
+        _camera_at(eye, pose[0], pose[1], pose[2], W, place)
+        if square_poses(rays[i], looks.side_m[m], seen, in_camera):
+            for s in range(2):
+                for a in range(3):
+                    places[i, s, a] = (
+                        W[0, a] * in_camera[s, 0] + W[1, a] * in_camera[s, 1] + W[2, a] * in_camera[s, 2] + place[a]
+                    )
+                    for b in range(3):
+                        turns[i, s, a, b] = W[0, a] * seen[s, 0, b] + W[1, a] * seen[s, 1, b] + W[2, a] * seen[s, 2, b]
+        else:
+            places[i, :2], turns[i, :2] = np.nan, np.nan
+        for a in range(3):
+            in_map[a] = 0.0
+            for k in range(4):
+                in_map[a] += 0.25 * (W[0, a] * rays[i, k, 0] + W[1, a] * rays[i, k, 1] + W[2, a] * rays[i, k, 2])
+        tag = values.tags[looks.tag[m]]
+        away = np.hypot(tag[0] - place[0], tag[1] - place[1]) / np.hypot(in_map[0], in_map[1])
+        for s in range(2):
+            yaw = np.arctan2(-in_map[1], -in_map[0]) + (_ASIDE_RAD if s else -_ASIDE_RAD)
+            cos, sin, R = np.cos(yaw), np.sin(yaw), turns[i, 2 + s]
+            R[0, 0], R[0, 1], R[0, 2] = -sin, 0.0, cos
+            R[1, 0], R[1, 1], R[1, 2] = cos, 0.0, sin
+            R[2, 0], R[2, 1], R[2, 2] = 0.0, 1.0, 0.0
+            for a in range(3):
+                places[i, 2 + s, a] = place[a] + away * in_map[a]
+
+
+@inner
+def _camera_at(eye: Eye, x: float, y: float, heading: float, W: FloatArray, place: FloatArray) -> None:
+    """Sets R_camera_map (3, 3) and the camera's place in map (3,) of a base."""
+    cos, sin, mount = np.cos(heading), np.sin(heading), eye.mount
+    for a in range(3):
+        forward, left = eye.rotation[0, a], eye.rotation[1, a]
+        W[a, 0], W[a, 1], W[a, 2] = cos * forward - sin * left, sin * forward + cos * left, eye.rotation[2, a]
+    place[0], place[1] = x + cos * mount[0] - sin * mount[1], y + sin * mount[0] + cos * mount[1]
+    place[2] = mount[2]
+
+
+@jitted
+def fit(
+    looks: LookArrays,
+    lenses: FloatArray,
+    loss: Loss,
+    values: SpatialValues,
+    by_tag: ByTag,
+    tags: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+) -> FloatArray:
+    """Fits candidates of tags (C,), at places (C, 3) with turns (C, 3, 3), each to looks spread over its tag's.
+
+    Robots' poses and the calibration are held. Returns what the looks lose (C,); infinite where they see no such tag.
+    """
+    looks, values, by_tag = borrowed(looks), borrowed(values), borrowed(by_tag)
+    judges, begin = _judges(by_tag)
+    axes, eyes = _eyes(looks, values, judges)
+    losses, normal = np.full(len(tags), np.inf), np.empty((7, 7))
+    p, R, turn, step = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    for c in range(len(tags)):
+        first, end = begin[tags[c]], begin[tags[c] + 1]
+        p[:], R[:] = places[c], turns[c]
+        for _ in range(_STEPS):
+            total = 0.0
+            normal[:] = 0.0
+            for i in range(first, end):
+                total += _add_look(looks, lenses, loss, values.calibration, judges[i], axes[i], eyes[i], p, R, normal)
+            if not total < losses[c]:
+                break
+            losses[c], places[c], turns[c] = total, p, R
+            for a in range(6):
+                normal[a, a] *= 1.0 + _DAMPING
+            if eliminate_columns(normal, 6) >= 0:
+                break
+            if _back(normal, step) < _ARRIVED:
+                break
+            turn_by(step[3], step[4], step[5], turn)
+            turned(turns[c], turn, R)
+            for a in range(3):
+                p[a] += step[a]
+    return losses
+
+
+@inner
+def _back(R: FloatArray, step: FloatArray) -> float:
+    """Sets the step (6,) by R (6, 7) of normal equations, their right side along; what it promises of the cost."""
+    promised = 0.0
+    for a in range(5, -1, -1):
+        left = R[a, 6]
+        promised += 0.5 * left * left
+        for b in range(a + 1, 6):
+            left += R[a, b] * step[b]
+        step[a] = -left / R[a, a]
+    return promised
+
+
+@inner
+def _judges(by_tag: ByTag) -> tuple[IntArray, IntArray]:
+    """Looks spread over all of each tag's, and where those of each begin."""
+    n_tags = len(by_tag.begin) - 1
+    judges, begin = np.empty(_JUDGING_LOOKS * n_tags, dtype=np.int64), np.zeros(n_tags + 1, dtype=np.int64)
+    end = 0
+    for t in range(n_tags):
+        own, last = by_tag.order[by_tag.begin[t] : by_tag.begin[t + 1]], -1
+        for j in range(_JUDGING_LOOKS if len(own) else 0):
+            at = int(np.rint(j * (len(own) - 1) / (_JUDGING_LOOKS - 1)))
+            if at != last:
+                judges[end] = own[at]
+                end, last = end + 1, at
+        begin[t + 1] = end
+    return judges[:end], begin
+
+
+@inner
+def _eyes(looks: LookArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
+    """R_camera_map (J, 4, 3, 3) and the camera's places (J, 4, 3) when each corner's row was read out."""
+    axes, places = np.empty((len(which), 4, 3, 3)), np.empty((len(which), 4, 3))
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    for i in range(len(which)):
+        m = which[i]
+        face(looks, m, values.calibration, eye)
+        late = values.calibration[looks.time_parameter[m]]
+        v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
+        along, even, _ = series(-late * omega)
+        across = -late * omega * even
+        back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
+        pose = values.poses[looks.pose[m]]
+        cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
+        for k in range(4):
+            moved = looks.moved[m, k]
+            cos_m, sin_m = np.cos(moved[2]), np.sin(moved[2])
+            x, y = moved[0] + cos_m * back_x - sin_m * back_y, moved[1] + sin_m * back_x + cos_m * back_y
+            _camera_at(
+                eye, pose[0] + cos_h * x - sin_h * y, pose[1] + sin_h * x + cos_h * y,
+                pose[2] + moved[2] - late * omega, axes[i, k], places[i, k],
+            )  # fmt: skip
+    return axes, places
+
+
+@inner
+def _add_look(
+    looks: LookArrays,
+    lenses: FloatArray,
+    loss: Loss,
+    calibration: FloatArray,
+    m: int,
+    axes: FloatArray,
+    eyes: FloatArray,
+    p: FloatArray,
+    R: FloatArray,
+    normal: FloatArray,
+) -> float:
+    """Adds J^T W J and J^T W r (6, 7) by a tag's place and turn, above the diagonal; returns the loss."""
+    lens, rows = lenses[looks.camera[m]], np.empty((8, 7))
+    half = 0.5 * looks.side_m[m] * (1.0 + calibration[looks.scale_parameter[m]])
+    focal, by_pixel, square = 1.0 + calibration[looks.focal_parameter[m]], 1.0 / looks.sigma_px[m], 0.0
+    for k in range(4):
+        u = -half if k == 0 or k == 3 else half
+        v = half if k < 2 else -half
+        x = p[0] + R[0, 0] * u + R[0, 1] * v - eyes[k, 0]
+        y = p[1] + R[1, 0] * u + R[1, 1] * v - eyes[k, 1]
+        z = p[2] + R[2, 0] * u + R[2, 1] * v - eyes[k, 2]
+        W = axes[k]
+        c2 = W[2, 0] * x + W[2, 1] * y + W[2, 2] * z
+        px, py, d00, d01, d11, nx, ny = distorted_at(
+            lens, W[0, 0] * x + W[0, 1] * y + W[0, 2] * z, W[1, 0] * x + W[1, 1] * y + W[1, 2] * z, c2
+        )
+        for axis in range(2):
+            row, distorted = rows[2 * k + axis], px if axis == 0 else py
+            scaled = by_pixel * lens[axis] * focal
+            off = scaled * distorted + by_pixel * (lens[CENTRE + axis] - looks.corners_px[m, k, axis])
+            square += off * off
+            gain = scaled / c2
+            j0, j1 = gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11)
+            j2 = -(j0 * nx + j1 * ny)
+            m0 = j0 * W[0, 0] + j1 * W[1, 0] + j2 * W[2, 0]
+            m1 = j0 * W[0, 1] + j1 * W[1, 1] + j2 * W[2, 1]
+            m2 = j0 * W[0, 2] + j1 * W[1, 2] + j2 * W[2, 2]
+            t0 = m0 * R[0, 0] + m1 * R[1, 0] + m2 * R[2, 0]
+            t1 = m0 * R[0, 1] + m1 * R[1, 1] + m2 * R[2, 1]
+            t2 = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
+            row[0], row[1], row[2], row[3], row[4] = m0, m1, m2, t2 * v, -t2 * u
+            row[5], row[6] = t1 * u - t0 * v, off
+    rho, w = loss_and_weight(loss, square)
+    for i in range(8):
+        for a in range(6):
+            f = w * rows[i, a]
+            for b in range(a, 7):
+                normal[a, b] += f * rows[i, b]
+    return rho

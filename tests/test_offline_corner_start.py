@@ -1,0 +1,72 @@
+"""The compiled start of an estimate on corners against OpenCV's planar poses and the camera model's own rays."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import se2
+from calib.bundle import planar_poses
+from offline.corner_factors import spatial_values
+from offline.corner_start_kernels import POSES, ByTag, allowed, posed, rays_of
+from offline.tag_pose import UNIT_CORNERS
+from tests.test_offline_corner_factors import CAMERAS, N_LOOKS, N_TAGS, made_problem
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str) -> None:
+    problem, state = made_problem(11, model=model)
+    looks, which = problem.corners.looks, np.arange(N_LOOKS)
+    rays = np.empty((N_LOOKS, 4, 3))
+    rays_of(problem.corners.arrays, problem.corners.lenses, which, rays)
+    places, turns = np.empty((N_LOOKS, POSES, 3)), np.empty((N_LOOKS, POSES, 3, 3))
+    allowed(problem.corners.arrays, spatial_values(state), which, rays, places, turns)
+    mount = looks.mount + state.calibration[looks.mount_parameters]
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for m in range(N_LOOKS):
+        expected = problem.corners.cameras[looks.camera[m]].unproject(looks.corners_px[m])
+        np.testing.assert_allclose(rays[m], expected, atol=1e-11)
+        pose = state.poses[looks.pose[m]]
+        base = Rotation.from_rotvec([0.0, 0.0, pose[2]])
+        R_map_camera = base.as_matrix() @ Rotation.from_euler("ZYX", mount[m, [5, 4, 3]]).as_matrix() @ level
+        place = base.apply(mount[m, :3]) + np.array([pose[0], pose[1], 0.0])
+        corners_m = np.column_stack([UNIT_CORNERS * looks.side_m[m], np.zeros(4)])
+        found = planar_poses(corners_m, expected)
+        assert len(found) == 2
+        for R_camera_tag, centre_m in found:
+            s = int(np.argmin([np.linalg.norm(each - R_map_camera @ R_camera_tag) for each in turns[m, :2]]))
+            np.testing.assert_allclose(turns[m, s], R_map_camera @ R_camera_tag, atol=1e-6)
+            np.testing.assert_allclose(places[m, s], R_map_camera @ centre_m + place, atol=1e-6)
+        towards = R_map_camera @ expected.mean(axis=0)
+        for s, aside_rad in ((2, -0.6), (3, 0.6)):
+            np.testing.assert_allclose(turns[m, s, 2], [0.0, 1.0, 0.0], atol=1e-15)
+            away = np.arctan2(-towards[1], -towards[0]) + aside_rad - np.arctan2(*turns[m, s, 1::-1, 2])
+            assert se2.wrap_angle(away) == pytest.approx(0.0, abs=1e-12)
+            off_m = places[m, s] - place
+            np.testing.assert_allclose(np.cross(off_m, towards), 0.0, atol=1e-12)
+            far_m = np.linalg.norm(state.tags[looks.tag[m]] - place[:2])
+            assert np.linalg.norm(off_m[:2]) == pytest.approx(far_m)
+
+
+def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_number() -> None:
+    problem, state = made_problem(12)
+    factors, which = problem.corners, np.arange(2)
+    far = factors.looks.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
+    rays = np.empty((2, 4, 3))
+    rays_of(factors.arrays._replace(corners_px=far), factors.lenses, which, rays)
+    assert np.isnan(rays[0]).all()
+    assert np.isfinite(rays[1]).all()
+    rays[1, 2] *= -1.0  # a corner behind the camera
+    places, turns = np.empty((2, POSES, 3)), np.empty((2, POSES, 3, 3))
+    allowed(factors.arrays, spatial_values(state), which, rays, places, turns)
+    assert np.isnan(turns[:, :2]).all()
+    assert np.isnan(places[:, :2]).all()
+
+
+def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_another_shape() -> None:
+    square = 10.0 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+    small, narrow = 0.5 * square, square * [0.8, 1.0]
+    corners_px = np.stack([small, 0.95 * square, square, narrow, small]) + 100.0
+    by_tag = ByTag(np.array([4, 0, 1, 2, 3]), np.array([0, 1, 1, 5]))
+    chosen = np.zeros((N_TAGS, 2), dtype=np.int64)
+    posed(corners_px, by_tag, chosen)
+    assert chosen.tolist() == [[4, -1], [-1, -1], [2, 3]]
