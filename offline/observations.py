@@ -9,13 +9,15 @@ from scipy.special import chdtri
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
 from calib.errors import CalibError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
+from offline.askew import FALSE_ALARM, UPRIGHT_DOF, askew, doubted, level_of, with_common_turn
 from offline.covariance_parts import CovarianceParts
 from offline.errors import OfflineError
+from offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
 from offline.readings import CAMERA_PARAMETERS, Readings, no_readings
+from offline.rolling_shutter import read_at_once
 from offline.run import Detections, Positions, Run
 from offline.standing_corners import averaged
 from offline.tag_pose import TagReadings, general_readings, upright_readings
@@ -34,15 +36,6 @@ _LEAST_VARIANCE: Final = 1e-12
 SAME_SIZE_M: Final = 1e-6
 # More than this share of readings left out is worth a sentence.
 MAX_SHARE_LEFT_OUT: Final = 0.05
-_UPRIGHT_DOF: Final = 2
-_MEDIAN_CHI2: Final = float(2.0 * np.log(2.0))  # of two degrees of freedom
-_FALSE_ALARM: Final = 1e-6
-# By so many the level of a sigma that was given is known to some 15 %; by fewer, a lucky few could make it too small.
-_READINGS_FOR_LEVEL: Final = 100
-# A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its own general
-# pose, which has as many degrees of freedom, is said to hang askew. A camera whose roll is a degree off stays below it;
-# a tag that leans by half a right angle and is seen from a few metres does not.
-_ASKEW_FACTOR: Final = 2.5
 
 
 def read_detections(
@@ -74,7 +67,9 @@ def read_detections(
     )
     if not len(tag):
         return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
-    found, is_askew, level = _upright_or_askew(run, camera, tag, corners_px, noise.sigma_corner_px)
+    sides_m = _sides_m(run, tag)
+    at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
+    found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, noise.sigma_corner_px)
     warnings = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in np.unique(tag[is_askew])
@@ -89,13 +84,15 @@ def read_detections(
         warnings.append(
             f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
         )
+    by_tilt = tilt_rad * reading_by_tilt(found.where(good), run.robot.mount.z_m)
+    by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
     return (
         Readings(
             keyframe=keyframe[good],
             tag=tag[good],
             value=value[good],
-            covariance=found.covariance[good],
-            parts=_corner_parts(found.where(good), noise.sigma_corner_px),
+            covariance=found.covariance[good] + by_floor,
+            parts=_corner_parts(found.where(good), noise.sigma_corner_px, by_floor),
             by_camera=_by_camera(run.robot, found.range_bearing[good], found.by_turn[good], twist[keyframe[good]]),
             polar=np.ones(int(good.sum()), dtype=np.bool_),
             in_camera=np.ones(int(good.sum()), dtype=np.bool_),
@@ -107,25 +104,37 @@ def read_detections(
 
 
 def _upright_or_askew(
-    run: Run, camera: CameraModel, tag: IntArray, corners_px: FloatArray, sigma_corner_px: float
-) -> tuple[TagReadings, BoolArray, float]:
-    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are; level.
+    run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigma_corner_px: float
+) -> tuple[TagReadings, BoolArray, float, float]:
+    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
 
-    The level is how many times the corners' variance is what it is said to be.
+    Besides how many times the corners' variance is what it is said to be, and the sigma by which the floor tilts base.
     """
-    seen, index = np.unique(tag, return_inverse=True)
-    sides_m = np.array([run.robot.tag_size_m(run.tags[t].family, run.tags[t].tag_id)[0] for t in seen])[index]
-    rotation = run.robot.mount.T_base_camera.rotation.as_matrix()
+    camera, mount = run.camera, run.robot.mount
+    assert camera is not None  # it saw them
+    rotation = mount.T_base_camera.rotation.as_matrix()
     upright = upright_readings(corners_px, sides_m, camera, rotation, sigma_corner_px)
-    level = _level(upright.chi2)
-    doubted = np.isin(tag, _doubted(tag, upright.chi2 / min(level, 1.0)))
+    level, camera_m = max(level_of(upright.chi2), 1.0), np.array([mount.x_m, mount.y_m])
+    tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
+    if tilt_rad:
+        upright = spread_by_tilt(upright, tilt_rad)
+    sigma = np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
+    chi2 = with_common_turn(upright, tag, _mount_axes(run.robot), sigma)
+    level = level_of(chi2)
+    is_doubted = np.isin(tag, doubted(tag, chi2 / min(level, 1.0)))
     general = upright.replaced(
-        doubted, general_readings(corners_px[doubted], sides_m[doubted], camera, rotation, sigma_corner_px)
+        is_doubted, general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigma_corner_px)
     )
-    is_askew = np.isin(tag, _askew(tag, upright.chi2, general.chi2, doubted))
-    spoilt = ~is_askew & ~(upright.chi2 < _level(upright.chi2[~is_askew]) * chdtri(_UPRIGHT_DOF, _FALSE_ALARM))
+    is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
+    spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
     found = upright.replaced(is_askew, general.where(is_askew))
-    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, level
+    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, level, tilt_rad
+
+
+def _sides_m(run: Run, tag: IntArray) -> FloatArray:
+    """(M,) of each tag."""
+    seen, index = np.unique(tag, return_inverse=True)
+    return np.array([run.robot.tag_size_m(run.tags[t].family, run.tags[t].tag_id)[0] for t in seen])[index]
 
 
 def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
@@ -187,21 +196,29 @@ def _by_camera(robot: Robot, range_bearing: FloatArray, by_turn: FloatArray, twi
         by_turn: (M, 2, 3) derivative of them by a turn of the camera about these axes.
         twist: (M, 2) speed and turning rate.
     """
-    yaw, pitch = robot.mount.yaw_rad, robot.mount.pitch_rad
-    roll_axis = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
-    pitch_axis = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     range_m, cos, sin = range_bearing[:, 0], np.cos(range_bearing[:, 1]), np.sin(range_bearing[:, 1])
     speed, turning = twist.T
     # How a tag moves as seen from the camera, whose place moves with base: a picture that was taken later shows that.
     x_rate = -speed + turning * (robot.mount.y_m + range_m * sin)
     y_rate = -turning * (robot.mount.x_m + range_m * cos)
     by_time = np.stack([cos * x_rate + sin * y_rate, (cos * y_rate - sin * x_rate) / range_m], axis=-1)
-    return np.stack([by_turn @ roll_axis, by_turn @ pitch_axis, by_time], axis=-1)
+    return np.concatenate([by_turn @ _mount_axes(robot).T, by_time[..., None]], axis=-1)
 
 
-def _corner_parts(found: TagReadings, sigma_corner_px: float) -> CovarianceParts:
+def _mount_axes(robot: Robot) -> FloatArray:
+    """(2, 3) the axes in base about which roll and pitch turn the mount."""
+    yaw, pitch = robot.mount.yaw_rad, robot.mount.pitch_rad
+    return np.array(
+        [
+            [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)],
+            [-np.sin(yaw), np.cos(yaw), 0.0],
+        ]
+    )
+
+
+def _corner_parts(found: TagReadings, sigma_corner_px: float, by_floor: FloatArray) -> CovarianceParts:
     return CovarianceParts(
-        ("sigma_corner_px",), (found.covariance - found.rest)[None] / sigma_corner_px**2, found.rest.copy()
+        ("sigma_corner_px",), (found.covariance - found.rest)[None] / sigma_corner_px**2, found.rest + by_floor
     )
 
 
@@ -234,36 +251,3 @@ def check_tag_sizes(runs: Sequence[Run]) -> None:
                     f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
                     f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"
                 )
-
-
-def _mean_chi2(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, FloatArray]:
-    """(T,) readings of each tag, and their mean per degree of freedom; capped: one spoilt picture counts little."""
-    capped = np.where(np.isfinite(chi2), np.minimum(chi2, 100.0), 100.0)
-    count = np.bincount(tag)
-    return count, np.bincount(tag, capped) / (_UPRIGHT_DOF * np.maximum(count, 1))
-
-
-def _doubted(tag: IntArray, chi2: FloatArray) -> IntArray:
-    """Tags that the upright model does not explain."""
-    count, mean = _mean_chi2(tag, chi2)
-    dof = _UPRIGHT_DOF * np.maximum(count, 1)
-    limit = np.maximum(_ASKEW_FACTOR, chdtri(dof, _FALSE_ALARM) / dof)
-    return np.flatnonzero((count > 0) & (mean > limit))
-
-
-def _askew(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, doubted: BoolArray) -> IntArray:
-    """Those of the doubted tags that hanging askew explains far better: bad corners alone spoil both poses."""
-    if not doubted.any():
-        return np.zeros(0, dtype=np.int64)
-    _, upright = _mean_chi2(tag[doubted], upright_chi2[doubted])
-    _, general = _mean_chi2(tag[doubted], general_chi2[doubted])
-    return np.flatnonzero(upright > _ASKEW_FACTOR * np.maximum(general, 1.0))
-
-
-def _level(chi2: FloatArray) -> float:
-    """How many times residuals of readings, most of them good, are what the corners' sigma makes expect."""
-    finite = chi2[np.isfinite(chi2)]
-    if not len(finite):
-        return 1.0
-    level = float(np.median(finite)) / _MEDIAN_CHI2
-    return level if len(finite) >= _READINGS_FOR_LEVEL else max(1.0, level)

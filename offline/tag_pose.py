@@ -15,7 +15,7 @@ Two residuals of the eight are left to test it: a tag that does not hang upright
 then read by the general pose with a range sigma wide enough to cover that pose's bias.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import fields as dataclass_fields
 from typing import Final
 
@@ -46,9 +46,11 @@ class TagReadings:
         covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part of it that does not come from that.
         by_turn: (M, 2, 3) derivative of range_bearing, for the corners as they are, by a small turn (rad) of the camera
             about the axes of base.
-        height_m: (M,) of the tag's centre above the camera.
+        height_m: (M,) of the tag's centre above the camera; height_variance: (M,) m^2.
         chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
+        misfit: (M, 8) whitened residuals of the upright model; misfit_by_turn: (M, 8, 3) derivative of them by a small
+            turn of the camera as in `by_turn`, the model fitted anew; zero for general poses, which turn along.
     """
 
     range_bearing: FloatArray
@@ -56,8 +58,11 @@ class TagReadings:
     rest: FloatArray
     by_turn: FloatArray
     height_m: FloatArray
+    height_variance: FloatArray
     chi2: FloatArray
     valid: BoolArray
+    misfit: FloatArray
+    misfit_by_turn: FloatArray
 
     def where(self, mask: BoolArray) -> "TagReadings":
         """Those of the mask."""
@@ -101,11 +106,14 @@ def upright_readings(
                 break
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
         normal = jacobian.swapaxes(-1, -2) @ jacobian
-        inverse = _solve(normal, np.broadcast_to(np.eye(_N_PARAMETERS), normal.shape))[:, :3]
-        by_turn = -inverse @ jacobian.swapaxes(-1, -2) @ _residual_by_turn(parameters, sides_m, camera, R_base_camera)
-        covariance = inverse[..., :3] * sigma_corner_px**2
+        inverse = _solve(normal, np.broadcast_to(np.eye(_N_PARAMETERS), normal.shape))
+        held_by_turn = _residual_by_turn(parameters, sides_m, camera, R_base_camera)
+        by_turn = -inverse @ jacobian.swapaxes(-1, -2) @ held_by_turn
+        covariance = inverse[:, :3, :3] * sigma_corner_px**2
         chi2 = (residual**2).sum(-1) / sigma_corner_px**2
-        return _polar(parameters[:, :3], covariance, np.zeros_like(covariance), by_turn, chi2)
+        found = _polar(parameters[:, :3], covariance, np.zeros_like(covariance), by_turn[:, :3], chi2)
+        left = held_by_turn + jacobian @ by_turn
+        return replace(found, misfit=residual / sigma_corner_px, misfit_by_turn=left / sigma_corner_px)
 
 
 def general_readings(
@@ -235,7 +243,18 @@ def _polar(
         & (polar_covariance[:, 1, 1] > 0.0)
         & np.isfinite(chi2)
     )
-    return TagReadings(range_bearing, polar_covariance, polar_rest, jacobian @ by_turn, centre_m[:, 2], chi2, valid)
+    return TagReadings(
+        range_bearing,
+        polar_covariance,
+        polar_rest,
+        jacobian @ by_turn,
+        centre_m[:, 2],
+        covariance[:, 2, 2],
+        chi2,
+        valid,
+        misfit=np.zeros((len(x), 8)),
+        misfit_by_turn=np.zeros((len(x), 8, 3)),
+    )
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:

@@ -105,6 +105,28 @@ def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
     assert (np.sqrt(upright.covariance[:, 0, 0]) < 0.03 * upright.value[:, 0]).all()
 
 
+@pytest.mark.parametrize("turned_rad", [-0.016, 0.016])
+def test_a_camera_that_pitches_by_two_of_its_sigmas_makes_no_tag_askew(turned_rad: float) -> None:
+    """Near tags seen from aside show it plainly; one that leans by 10 degrees besides is named, and it alone."""
+    near = [MadeTag(i, (1.5, 0.25 * i - 0.3, 0.4), np.pi - (0.9 if i % 2 else -0.9)) for i in range(4)]
+    leans = MadeTag(7, (1.7, 0.1, 0.7), np.pi - 0.9, pitch_rad=-np.radians(10.0))
+    mount = ROBOT.mount.model_copy(update={"pitch_rad": ROBOT.mount.pitch_rad + turned_rad})
+    for tags, said in ((near, 0), ([*near, leans], 1)):
+        rng = np.random.default_rng(4)
+        corners_px = np.repeat([corners_of(tag) for tag in tags], 40, axis=0)
+        detections = detections_of(
+            corners_px + 0.2 * rng.standard_normal(corners_px.shape), np.repeat(np.arange(len(tags)), 40).tolist()
+        )
+        run, keyframe = run_of(tags), np.tile(np.arange(40), len(tags))
+        taken_for_exact = mount.model_copy(update={"pitch_rad_sigma": 1e-6, "roll_rad_sigma": 1e-6})
+        for each, n in ((mount, said), (taken_for_exact, len(tags))):
+            robot = run.robot.model_copy(update={"mount": each})
+            _, warnings = read_detections(replace(run, robot=robot), detections, keyframe, NO_TWIST, NOISE)
+            named = [warning for warning in warnings if "does not hang upright" in warning]
+            assert len(named) == n if n < 2 else len(named) > 1, named
+            assert n != 1 or "tag 7" in named[0]
+
+
 def test_where_all_tags_hang_askew_all_are_said() -> None:
     """None of them can serve as an example of how tags hang here: on a ceiling, say."""
     ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]

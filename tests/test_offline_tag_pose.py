@@ -194,3 +194,18 @@ def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Cal
     for axis, turn in enumerate(1e-5 * np.eye(3)):
         by_turn = (turned(turn).range_bearing - turned(-turn).range_bearing) / 2e-5
         np.testing.assert_allclose(found.by_turn[..., axis], by_turn, rtol=1e-3, atol=1e-3)
+
+
+def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
+    rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
+    corners_px = exact_corners(placed(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
+
+    def turned(w: FloatArray) -> TagReadings:
+        R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
+        return upright_readings(corners_px, np.full(1, SIZE_M), CAMERA, R_base_camera, SIGMA_PX)
+
+    by_turn = turned(np.zeros(3)).misfit_by_turn[0]
+    for axis, turn in enumerate(1e-5 * np.eye(3)):
+        expected = (turned(turn).misfit[0] - turned(-turn).misfit[0]) / 2e-5
+        np.testing.assert_allclose(by_turn[:, axis], expected, atol=1e-3 * np.abs(by_turn).max())
+    assert np.abs(by_turn[:, 1]).max() > 50.0
