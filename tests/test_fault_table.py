@@ -1,15 +1,17 @@
 """Every fault of the table in the docs has a test that is named after it."""
 
+import ast
 import re
 from pathlib import Path
 
-from tests.benchmarks.fault_table import PAGE, row_of, rows_of, with_results
+from tests.benchmarks.fault_table import PAGE, ROOT, row_of, rows_of, with_proofs, with_results
+from tests.protections import PROTECTIONS
 
 TABLE = """
-| row | fault | what must happen | test | result |
-|---|---|---|---|---|
-| 1b | power cut | nothing wrong | old | old |
-| 7 | footer gone | every message | | |
+| row | fault | what must happen | test | result | taken out |
+|---|---|---|---|---|---|
+| 1b | power cut | nothing wrong | old | old | a sync: fails |
+| 7 | footer gone | every message | | | |
 """
 
 
@@ -26,5 +28,20 @@ def test_results_are_written_into_their_rows() -> None:
     assert row_of("tests/test_a.py::test_row_01b_cut[3]") == "1b"
     results = {"1b": {"tests/test_a.py::test_row_01b_cut": ["passed", "failed"]}}
     lines = with_results(TABLE, results).splitlines()
-    assert lines[-2] == "| 1b | power cut | nothing wrong | `test_a test_row_01b_cut` | failed (2 forms) |"
-    assert lines[-1] == "| 7 | footer gone | every message | none | missing |"
+    assert (
+        lines[-2] == "| 1b | power cut | nothing wrong | `test_a test_row_01b_cut` | failed (2 forms) | a sync: fails |"
+    )
+    assert lines[-1] == "| 7 | footer gone | every message | none | missing |  |"
+
+
+def test_what_was_taken_out_is_written_into_its_row() -> None:
+    lines = with_proofs(TABLE, {"7": ["an index: fails", "a footer: fails"]}).splitlines()
+    assert lines[-2] == "| 1b | power cut | nothing wrong | old | old | a sync: fails |"
+    assert lines[-1] == "| 7 | footer gone | every message |  |  | an index: fails<br>a footer: fails |"
+
+
+def test_each_row_has_a_protection_that_can_be_taken_out() -> None:
+    assert {each.row for each in PROTECTIONS} == set(rows_of(PAGE.read_text(encoding="utf-8")))
+    for each in PROTECTIONS:
+        source = (ROOT / each.file).read_text(encoding="utf-8")
+        ast.parse(each.taken_out_of(source))

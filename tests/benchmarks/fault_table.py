@@ -2,8 +2,9 @@
 
     python -m tests.benchmarks.fault_table [--long]
 
-A test belongs to row 7 if its name begins with test_row_07. Rows and faults are written by hand, in the page; --long
-runs the full forms of shortened tests too. Ends with exit code 1 if a row has no test or one that does not pass.
+A test belongs to row 7 if its name begins with test_row_07. Rows and faults are written by hand, in the page, and the
+last column by tests.benchmarks.fault_mutations; --long runs the full forms of shortened tests too. Ends with exit code
+1 if a row has no test or one that does not pass.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "faults.md"
-_ROW = re.compile(r"^\| (\d+b?) \| (.*?) \| (.*?) \|.*\|.*\|$")
+_ROW = re.compile(r"^\| (\d+b?) \| (.*?) \| (.*?) \| (.*?) ?\| (.*?) ?\| (.*?) ?\|$")
 _NAME = re.compile(r"test_row_0*(\d+b?)_")
 
 Results = Mapping[str, Mapping[str, Sequence[str]]]  # by row and test: the outcome of each of its forms
@@ -58,7 +59,18 @@ def with_results(page: str, results: Results) -> str:
             tests = results.get(found[1], {})
             names = "<br>".join(f"`{Path(test).name.replace('.py::', ' ')}`" for test in sorted(tests))
             ends = "<br>".join(_told(tests[test]) for test in sorted(tests))
-            line = f"| {found[1]} | {found[2]} | {found[3]} | {names or 'none'} | {ends or 'missing'} |"
+            line = f"| {' | '.join((*found.groups()[:3], names or 'none', ends or 'missing', found[6]))} |"
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def with_proofs(page: str, proofs: Mapping[str, Sequence[str]]) -> str:
+    """The page with what was taken out of the program for some rows, and what their tests said then."""
+    lines = []
+    for line in page.splitlines():
+        found = _ROW.match(line)
+        if found and found[1] in proofs:
+            line = f"| {' | '.join((*found.groups()[:5], '<br>'.join(proofs[found[1]])))} |"
         lines.append(line)
     return "\n".join(lines) + "\n"
 
