@@ -197,12 +197,13 @@ def info(
     import json
 
     from offline.info import describe_log
+    from onboard.allowance import Allowance
     from onboard.log_reader import find_logs
 
-    described, refused = [], []
+    described, refused, allowance = [], [], Allowance()
     for log in find_logs(logs):
         try:
-            described.append(describe_log(log))
+            described.append(describe_log(log, allowance))
         except GroundsbotError as error:
             refused.append(error)
     if json_output:

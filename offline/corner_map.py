@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.robot import Mount
-from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
+from offline.corner_floor import LEVEL, fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import CornerGraph, corner_graph
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.factors import State
@@ -19,6 +19,10 @@ from offline.solver import Solution
 
 # Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
 _MOST_OUTLIERS: Final = 0.5
+# Looks that share a picture which may stand off level, ten kilobytes a pair. A drive that sees ten tags in each of its
+# pictures records twice as much for each pair.
+_FREE_PAIRS: Final = 5000
+_BYTES_A_PAIR: Final = 64
 
 
 @dataclass(frozen=True)
@@ -82,12 +86,13 @@ def refine(
         return None, []  # the map says so already
     corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
     found = solve_corners(corners.problem, start)
-    sigma = guessed_wobble(found.problem, found.state, found.factor, found.pictures)
+    too_many = _too_many_coupled(graph, found)
+    sigma = LEVEL if too_many else guessed_wobble(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
         sigma = fitted_wobble(found.problem, found.state)
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
-    off_level = stretches_off_level(graph, found)
+    off_level = [*too_many, *stretches_off_level(graph, found)]
     reason = "" if found.converged else found.reason
     if not reason and (share := found.pictures.outliers) > _MOST_OUTLIERS:
         reason = (
@@ -99,3 +104,17 @@ def refine(
             f"not refined on tag corners: {reason}; the map is that of tag positions on the floor",
         ]
     return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags) + off_level
+
+
+def _too_many_coupled(graph: Graph, found: CornerSolution) -> list[str]:
+    """Why the floor is taken for level, where its logs are not worth the work of asking; no sentence else."""
+    runs = {chain.run.name: chain.run for chain in graph.chains}.values()
+    n_pairs, n_bytes = found.problem.n_coupled, sum(run.log_bytes for run in runs)
+    most = _FREE_PAIRS + n_bytes // _BYTES_A_PAIR
+    if not n_bytes or n_pairs <= most:
+        return []
+    sentence = (
+        f"the floor is taken for level: {n_pairs} pairs of tags share a picture, limit {most} for logs of {n_bytes} "
+        "bytes; leave out some of the looks"
+    )
+    return [sentence]

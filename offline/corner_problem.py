@@ -88,6 +88,12 @@ class CornerProblem:
         poses, picture = np.unique(self.corners.looks.pose, return_inverse=True)
         return picture, len(poses)
 
+    @property
+    def n_coupled(self) -> int:
+        """How many pairs of looks share a picture."""
+        seen = np.bincount(self.pictures[0])
+        return int((seen * (seen - 1) // 2).sum())
+
     @cached_property
     def pairs(self) -> IntArray:
         """(N, 2) looks that share a picture, which couples them where pictures wobble."""

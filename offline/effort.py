@@ -5,6 +5,7 @@ is allowed grows with the log. A drive needs a small part of it: its logs have a
 reading, since noise cannot be compressed, and recorded ones 200 and more.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,6 +13,8 @@ from typing import Final
 import numpy as np
 
 from offline.errors import OfflineError
+from offline.inputs import ALONE, Inputs
+from offline.run import Run
 from offline.solver import MAX_STEPS, Problem, Solution
 
 # Linearising a factor takes as long as so many multiplications in a leaf; those above run in larger blocks.
@@ -56,13 +59,15 @@ class Effort:
     places: float = np.inf
 
     @staticmethod
-    def of_log(log_bytes: int) -> "Effort":
-        """What a log of this size is worth."""
-        allowed = _FREE_WORK + _WORK_AT_A_MIB * (log_bytes / 2**20) ** 2
+    def of_log(log_bytes: int, inputs: Inputs = ALONE) -> "Effort":
+        """What a log of this size is worth beside the others that are mapped with it."""
+        free = 1.0 / inputs.n_logs
+        size_mib, all_mib = log_bytes / 2**20, max(log_bytes, inputs.n_bytes) / 2**20
+        allowed = free * _FREE_WORK + _WORK_AT_A_MIB * size_mib * all_mib
         return Effort(
             allowed,
             allowed,
-            _FREE_BYTES + _BYTES_PER_BYTE * log_bytes,
+            free * _FREE_BYTES + _BYTES_PER_BYTE * log_bytes,
             places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
         )
 
@@ -101,6 +106,11 @@ class Effort:
     def spend(self, solution: Solution) -> None:
         """Takes off what a solve used."""
         self.left -= solution.n_linearised * step_work(solution.problem)
+
+
+def efforts_of(runs: Sequence[Run]) -> dict[str, Effort]:
+    """What each of some runs is worth, by its name."""
+    return {run.name: Effort.of_log(run.log_bytes, run.inputs) for run in runs}
 
 
 def step_work(problem: Problem) -> float:

@@ -13,6 +13,7 @@ from typing import Any, Final
 from calib.robot import Wheels, parse_robot_yaml
 from calib.words import counted
 from offline.errors import OfflineError
+from onboard.allowance import Allowance
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
 from onboard.messages import (
@@ -134,19 +135,24 @@ class LogInfo:
         return lines
 
 
-def describe_log(log: Path) -> LogInfo:
+def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
     """Reads a log once.
+
+    Args:
+        log: a file or a run folder.
+        allowance: what it shares with other logs in reading; one of its own where None.
 
     Raises:
         GroundsbotError: the log is missing, damaged, no log of ours, or its robot.yaml cannot be used.
     """
     collected, losses = _Collected(), LogLosses()
-    for entry in read_log(log, losses=losses):
+    for entry in read_log(log, losses=losses, allowance=allowance):
         collected.add(entry)
     run = collected.run
     if run is None:
         found = "; ".join([f"{log}: holds no /run message", *losses.lines()])
         raise OfflineError(f"{found}; is it a groundsbot log?")
+    (allowance or Allowance()).check_text(run.robot_yaml, log, sum(_file_bytes(log).values()))
     wheels = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").wheels
     stamps = [stamp for stamps in collected.stamps_ns.values() for stamp in stamps]
     first_ns = min(stamps, default=0)

@@ -92,7 +92,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
     """
-    effort = effort or Effort.of_log(chain.run.log_bytes)
+    effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
     graph = build_graph([chain])
     effort.check(graph.problem, chain.run.log, chain.name)
     keyframes = coarse_keyframes(chain)

@@ -8,8 +8,9 @@ from pathlib import Path
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
 from offline.components import Found, solved_component
-from offline.effort import Effort
+from offline.effort import efforts_of
 from offline.errors import OfflineError
+from offline.inputs import Inputs
 from offline.kept_maps import kept_of, local_map_of, tags_of, tape_of
 from offline.local_map import LocalMap, solve_local_map
 from offline.map_warnings import map_warnings
@@ -31,6 +32,7 @@ from offline.tag_join_report import join_results, join_warnings
 from offline.tag_joins import TagJoin, joined_over_tags
 from offline.twins import told_apart
 from offline.workings import Workings
+from onboard.allowance import Allowance
 
 
 def read_runs(
@@ -46,10 +48,14 @@ def read_runs(
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.
     """
-    runs = []
+    runs, inputs, allowance, n_stretches = list[Run](), Inputs.of(logs), Allowance(), 0
+    if logs:
+        inputs.check_stretches(len(logs), logs[-1])
     with (stages or Stages()).stage("reading logs", len(logs)) as done:
         for log in logs:
-            runs.append(load_run(log, robot_files))
+            runs.append(load_run(log, robot_files, inputs, allowance))
+            n_stretches += len(runs[-1].stretches)
+            inputs.check_stretches(n_stretches, log)
             done()
     check_robots(runs, robot_files or {})
     return runs
@@ -187,7 +193,7 @@ def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) 
     """Each chain solved alone, parted where its wheels lost the way, and what to say of that."""
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
-        efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
+        efforts = efforts_of(runs)
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()

@@ -12,10 +12,12 @@ from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from calib.words import counted
 from offline.errors import OfflineError
+from offline.inputs import ALONE, Inputs, size_bytes
 from offline.odometry import WheelTrack
 from offline.plausible import check_file_name
 from offline.run_readings import Detections, Positions, RunReadings, TagKey
 from offline.stretches import WheelRow, stretches_of
+from onboard.allowance import Allowance
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, read_log
@@ -53,6 +55,7 @@ class Run:
         camera: None in an imported log.
         warnings: what a person should know.
         log_bytes: of the log; how much work it is worth.
+        inputs: the logs that were read together with it, itself included.
         lost: what of the log cannot be read, in words; empty where all can.
         events: what the recorder told, in order of their stamps.
     """
@@ -70,6 +73,7 @@ class Run:
     positions: Positions
     warnings: tuple[str, ...]
     log_bytes: int = 0
+    inputs: Inputs = ALONE
     lost: str = ""
     events: tuple[RunEvent, ...] = ()
 
@@ -139,34 +143,42 @@ def read_robot_file(path: Path) -> RobotFile:
     return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
 
 
-def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None) -> Run:
+def load_run(
+    log: Path | str,
+    robot_files: Mapping[str, RobotFile] | None = None,
+    inputs: Inputs = ALONE,
+    allowance: Allowance | None = None,
+) -> Run:
     """Reads one log.
 
     Args:
         log: a file or a run folder.
         robot_files: calibrations by robot id that replace what the log holds.
+        inputs: the logs that are read together with it, itself included.
+        allowance: what they share in reading; one of its own where None.
 
     Raises:
         GroundsbotError: one line that says why the log cannot be mapped.
     """
     log = Path(log)
     collected, losses = _Collected(), LogLosses()
-    log_bytes = _size_bytes(log)
-    for entry in read_log(log, topics=_TOPICS, losses=losses):
+    log_bytes = size_bytes(log)
+    for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
-        collected.readings.check(log, log_bytes)
+        collected.readings.check(log, log_bytes, inputs.n_logs)
     info = collected.info
     if info is None:
         found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
         raise OfflineError(f"{found}; is it a groundsbot log?")
     check_file_name(info.robot_id, f"{log}: /run: robot_id")
     check_file_name(info.run_id, f"{log}: /run: run_id")
+    (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     collected.readings.check_tags(log)
-    read = collected.readings.gathered(log_bytes)
+    read = collected.readings.gathered(log_bytes, inputs.n_logs)
     if read.every > 1:
         warnings.append(
             f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
@@ -192,15 +204,10 @@ def load_run(log: Path | str, robot_files: Mapping[str, RobotFile] | None = None
         positions=read.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,
+        inputs=inputs,
         lost=losses.in_words,
         events=tuple(sorted(collected.events)),
     )
-
-
-def _size_bytes(log: Path) -> int:
-    """Of all its files; of none where there is no such log, which reading it says."""
-    files = log.iterdir() if log.is_dir() else [log]
-    return sum(path.stat().st_size for path in files if path.is_file())
 
 
 def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:

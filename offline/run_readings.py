@@ -155,13 +155,13 @@ class RunReadings:
             covariance = each.covariance if len(each.covariance) == 4 else (np.nan,) * 4
             self._places.extend((*place, *covariance))
 
-    def check(self, log: Path, log_bytes: int) -> None:
-        """Refuses more readings and tags than a log can hold.
+    def check(self, log: Path, log_bytes: int, n_logs: int = 1) -> None:
+        """Refuses more readings and tags than a log can hold that shares what is free with others.
 
         Raises:
             OfflineError: naming the log, what it has, the limit and the way out.
         """
-        most = _FREE_READINGS + log_bytes // _LEAST_BYTES_A_READING
+        most = _FREE_READINGS // n_logs + log_bytes // _LEAST_BYTES_A_READING
         if self.count > most:
             raise OfflineError(
                 f"{log}: more than {most} tag readings, the limit for a log of {log_bytes} bytes: a tag that was "
@@ -180,8 +180,8 @@ class RunReadings:
                 "are their numbers right?"
             )
 
-    def gathered(self, log_bytes: int) -> Gathered:
-        """Those of all looks, or of as many as a log of this size is worth, evenly spread."""
+    def gathered(self, log_bytes: int, n_logs: int = 1) -> Gathered:
+        """Those of all looks, or of as many as one of so many logs is worth with this size, evenly spread."""
         tags = tuple(sorted(self._numbers))
         rank = np.empty(len(tags), dtype=np.int64)
         rank[[self._numbers[key] for key in tags]] = np.arange(len(tags))
@@ -198,7 +198,7 @@ class RunReadings:
             in_camera=placed[:, 3] > 0,
         )
         pictures_ns = np.unique(np.array(self._pictures_ns, dtype=np.int64))
-        every = max(1, -(-self.count // (_FREE_TO_USE + log_bytes // _BYTES_TO_USE)))
+        every = max(1, -(-self.count // (_FREE_TO_USE // n_logs + log_bytes // _BYTES_TO_USE)))
         if every > 1:
             used_ns = np.union1d(pictures_ns, positions.stamps_ns)[::every]
             pictures_ns = np.intersect1d(pictures_ns, used_ns)

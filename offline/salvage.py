@@ -9,6 +9,7 @@ from google.protobuf.message import Message
 
 from offline.errors import OfflineError
 from offline.new_log import new_log
+from onboard.allowance import Allowance
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_losses import LogLosses
 from onboard.log_reader import LogMessage, files_of, read_head, read_log
@@ -58,27 +59,29 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
         raise OfflineError(f"{output}: must not end in .mcap, as {log} is a folder, of which each file is salvaged")
     head = read_head(log)
     if "/run" not in head:
-        reasons = "; ".join(line for source in sources for line in _losses_of(source).lines())
+        allowance = Allowance()
+        reasons = "; ".join(line for source in sources for line in _losses_of(source, allowance).lines())
         raise OfflineError(f"{log}: none of its files says whose run it is, so nothing can be saved: {reasons}")
     names = {source: finished_name(source) if log.is_dir() else output.name for source in sources}
     with new_log(output) as folder:
-        salvaged = [_salvaged(source, folder / name, head) for source, name in names.items()]
+        allowance = Allowance()
+        salvaged = [_salvaged(source, folder / name, head, allowance) for source, name in names.items()]
     return [each.placed(output / names[each.source] if log.is_dir() else output) for each in salvaged]
 
 
-def _losses_of(source: Path) -> LogLosses:
+def _losses_of(source: Path, allowance: Allowance) -> LogLosses:
     losses = LogLosses()
     try:
-        for _ in read_log(source, losses=losses):
+        for _ in read_log(source, losses=losses, allowance=allowance):
             pass
     except LogError as error:
         losses.unusable[source] = str(error).removeprefix(f"{source}: ")
     return losses
 
 
-def _salvaged(source: Path, target: Path, head: Mapping[str, Message]) -> SalvagedFile:
+def _salvaged(source: Path, target: Path, head: Mapping[str, Message], allowance: Allowance) -> SalvagedFile:
     losses = LogLosses()
-    messages = read_log(source, losses=losses)
+    messages = read_log(source, losses=losses, allowance=allowance)
     try:
         first = next(messages, None)
     except LogError as error:

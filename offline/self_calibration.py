@@ -8,7 +8,7 @@ from calib.camera_model import CameraModel
 from calib.noise import NoiseParameters
 from offline.chain import Chain
 from offline.corner_factors import FOCAL_SCALE
-from offline.effort import Effort
+from offline.effort import efforts_of
 from offline.graph import IMPORTED_BATCH, TAG_SCALE
 from offline.local_map import solve_local_map
 from offline.result import CalibrationChoice, CalibrationResult
@@ -42,7 +42,7 @@ def free_what_is_told(
         names: what to free whether robot.yaml is contradicted or not; where empty what drives contradict.
         corners: the map will be refined on corners, which tell of the focal length too.
     """
-    efforts = {run.name: Effort.of_log(run.log_bytes) for run in runs}
+    efforts = efforts_of(runs)
     maps = [solve_local_map(chain, efforts[chain.run.name]) for chain in chains]
     choices = choose(told_by(maps, noise, corners=corners), names)
     freed = {Owned(each.owner, each.name): LIMITS[each.name] for each in choices if each.is_freed}

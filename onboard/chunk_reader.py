@@ -10,6 +10,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from onboard.allowance import Allowance
 from onboard.errors import LogError
 from onboard.log_losses import Damage
 from onboard.mcap_summary import Summary, read_summary
@@ -18,10 +19,8 @@ from onboard.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_te
 # A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
 RECORD_LIMIT_BYTES: Final = 64 << 20
 # Our chunks shrink to an eighth at best; a bomb's to a thousandth.
-_UNFOLDED_FREE_BYTES: Final = 1 << 20
 _UNFOLDED_SHARE: Final = 24
-_SEARCH_FREE_BYTES: Final = 64 << 20  # false beginnings of chunks that a search may check
-_SEARCH_SHARE: Final = 4
+_SEARCH_SHARE: Final = 4  # of false beginnings of chunks that a search may check
 _WINDOW_BYTES: Final = 1 << 20
 _LOOK_BYTES: Final = 4 << 20  # how far to look for a chunk in what does not begin as MCAP
 _DATA_END_BYTES: Final = 4
@@ -57,13 +56,16 @@ class ChunkReader:
         offset: behind the chunk yielded last.
     """
 
-    def __init__(self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None]) -> None:
+    def __init__(
+        self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None], allowance: Allowance | None = None
+    ) -> None:
         """Looks at the file's beginning and end.
 
         Args:
             stream: the file.
             path: what to call it.
             on_damage: told of each place that cannot be read; may raise to end the reading.
+            allowance: for what the file's size is not worth; one of its own where None.
 
         Raises:
             LogError: empty, or not MCAP.
@@ -76,8 +78,9 @@ class ChunkReader:
         self._on_damage = on_damage
         self._size = stream.seek(0, 2)
         self._crc: int | None = zlib.crc32(MCAP0_MAGIC)
-        self._unfolded = 0
-        self._searched = 0
+        self._allowance = allowance or Allowance()
+        self._unfolded = self._unfolded_drawn = 0  # drawn: from the allowance
+        self._searched = self._searched_drawn = 0
         stream.seek(0)
         magic = stream.read(len(MCAP0_MAGIC))
         if not magic:
@@ -187,9 +190,9 @@ class ChunkReader:
             head = self._stream_at(offset, RECORD_HEAD.size)
             content = self._stream.read(RECORD_HEAD.unpack(head)[1])
             self._searched += len(content)
-            if self._searched > _SEARCH_FREE_BYTES + _SEARCH_SHARE * self._size:
+            if not self._may_search():
                 return None
-            before = self._unfolded
+            before = self._unfolded, self._unfolded_drawn, self._allowance.unfolded_bytes
             try:
                 self._uncompressed(content)
             except _BadRecordError as bad:
@@ -197,8 +200,8 @@ class ChunkReader:
                     return offset
                 continue
             finally:
-                self._searched += self._unfolded - before
-                self._unfolded = before
+                self._searched += self._unfolded - before[0]
+                self._unfolded, self._unfolded_drawn, self._allowance.unfolded_bytes = before
             return offset
         return None
 
@@ -240,16 +243,31 @@ class ChunkReader:
         data = content[position + U64.size :]
         if len(data) != length:  # more would hide what follows
             raise _BadRecordError(f"a chunk is damaged: holds {len(data)} bytes, not the {length} it claims")
-        allowance = _UNFOLDED_FREE_BYTES + _UNFOLDED_SHARE * self._stream.tell() - self._unfolded
-        if size > min(RECORD_LIMIT_BYTES, allowance):
-            raise _BadRecordError(
-                f"a chunk claims to unfold to {size} bytes, limit {min(RECORD_LIMIT_BYTES, allowance)}"
-            )
-        self._unfolded += size
+        self._take_unfolded(size)
         data = _decompressed(data, compression, size)
         if len(data) != size or crc == 0 or zlib.crc32(data) != crc:
             raise _BadRecordError("a chunk is damaged: its checksum does not fit")
         return data
+
+    def _take_unfolded(self, size: int) -> None:
+        """Refuses a chunk that unfolds to more than the file is worth up to here and the allowance still gives."""
+        worth = _UNFOLDED_SHARE * self._stream.tell()
+        limit = min(RECORD_LIMIT_BYTES, worth + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
+        if size > limit:
+            raise _BadRecordError(f"a chunk claims to unfold to {size} bytes, limit {limit}")
+        self._unfolded += size
+        drawn = max(self._unfolded_drawn, self._unfolded - worth)
+        self._allowance.unfolded_bytes -= drawn - self._unfolded_drawn
+        self._unfolded_drawn = drawn
+
+    def _may_search(self) -> bool:
+        """Whether what has been searched is still worth it."""
+        drawn = max(self._searched_drawn, self._searched - _SEARCH_SHARE * self._size)
+        if drawn - self._searched_drawn > self._allowance.searched_bytes:
+            return False
+        self._allowance.searched_bytes -= drawn - self._searched_drawn
+        self._searched_drawn = drawn
+        return True
 
 
 _READ_WHOLE: Final = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX)

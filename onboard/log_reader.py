@@ -9,6 +9,7 @@ from typing import Final
 
 from google.protobuf.message import Message
 
+from onboard.allowance import Allowance
 from onboard.chunk_reader import ChunkReader
 from onboard.errors import LogError
 from onboard.log_file import ACTIVE_SUFFIX
@@ -19,9 +20,7 @@ from onboard.messages import TOPICS, RunInfo
 
 __all__ = ["LogMessage", "files_of", "find_logs", "read_head", "read_log", "read_run_info"]
 
-# A hostile file may hold millions of records in a few kB. Ours shrink to 14 bytes at best.
-_RECORDS_FREE: Final = 50_000
-_SMALLEST_RECORD_BYTES: Final = 4
+_SMALLEST_RECORD_BYTES: Final = 4  # ours shrink to 14 bytes at best; a hostile file may hold millions in a few kB
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
@@ -49,7 +48,10 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_log(
-    path: Path, topics: Collection[str] | None = None, losses: LogLosses | None = None
+    path: Path,
+    topics: Collection[str] | None = None,
+    losses: LogLosses | None = None,
+    allowance: Allowance | None = None,
 ) -> Iterator[LogMessage]:
     """Iterates over one run's messages.
 
@@ -57,6 +59,7 @@ def read_log(
         path: one file, or one run folder, whose files are joined.
         topics: only these; files of pictures are not opened unless `/camera/image` is among them. None: all.
         losses: takes what cannot be read, and reading goes on behind it. None: that is an error.
+        allowance: what the log may take beyond what its size is worth, shared with others; one of its own where None.
 
     Yields:
         Messages in order of log time. What every file repeats at its head (`/run` and so on) comes once.
@@ -68,11 +71,12 @@ def read_log(
     core, pictures = _files_of(path)
     if topics is not None and PICTURE_TOPIC not in topics and core:
         pictures = []
-    core, pictures = _usable(core, losses), _usable(pictures, losses)
+    allowance = allowance or Allowance()
+    core, pictures = _usable(core, losses, allowance), _usable(pictures, losses, allowance)
     if not core and not pictures:
         raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
-    _check_same_run([*core[:1], *pictures[:1]])
-    streams = [_joined(files, topics, losses) for files in (core, pictures) if files]
+    _check_same_run([*core[:1], *pictures[:1]], allowance)
+    streams = [_joined(files, topics, losses, allowance) for files in (core, pictures) if files]
     yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
 
 
@@ -83,10 +87,10 @@ def read_run_info(path: Path) -> RunInfo:
         LogError: it is missing, or not to be found in any file.
     """
     core, pictures = _files_of(path)
-    files = [*core, *pictures]
+    files, allowance = [*core, *pictures], Allowance()
     for file in files:
         try:
-            found = _run_info(file)
+            found = _run_info(file, allowance)
         except LogError:
             if len(files) == 1:
                 raise
@@ -113,8 +117,9 @@ def read_head(path: Path) -> dict[str, Message]:
         LogError: `path` is missing or its files belong to different runs.
     """
     head: dict[str, Message] = {}
+    allowance = Allowance()
     for file in files_of(path):
-        for each in _beginning(file):
+        for each in _beginning(file, allowance):
             if each.topic in _HEADS:
                 head.setdefault(each.topic, each.message)
     return head
@@ -147,7 +152,7 @@ def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
     return [file for file in files if file not in pictures], pictures
 
 
-def _usable(files: list[Path], losses: LogLosses | None) -> list[Path]:
+def _usable(files: list[Path], losses: LogLosses | None, allowance: Allowance) -> list[Path]:
     """Those that hold something; a run that was killed may leave an empty one."""
     if losses is None:
         return files
@@ -155,7 +160,7 @@ def _usable(files: list[Path], losses: LogLosses | None) -> list[Path]:
     for file in files:
         try:
             with file.open("rb") as stream:
-                ChunkReader(stream, file, lambda _: None)
+                ChunkReader(stream, file, lambda _: None, allowance)
         except LogError as error:
             losses.unusable[file] = str(error).removeprefix(f"{file}: ")
         except OSError as error:
@@ -169,14 +174,16 @@ def _reasons(losses: LogLosses | None) -> str:
     return "; ".join((losses or LogLosses()).lines())
 
 
-def _joined(files: list[Path], topics: Collection[str] | None, losses: LogLosses | None) -> Iterator[LogMessage]:
+def _joined(
+    files: list[Path], topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
+) -> Iterator[LogMessage]:
     """The messages of files in their order. A disk that failed may leave the same ones at a seam twice."""
-    _check_same_run(files)
+    _check_same_run(files, allowance)
     seam: set[bytes] = set()
     for index, file in enumerate(files):
-        following_ns = _first_time_ns(files[index + 1]) if index + 1 < len(files) else None
+        following_ns = _first_time_ns(files[index + 1], allowance) if index + 1 < len(files) else None
         before, seam = seam, set()
-        for each in _read_file(file, topics, losses):
+        for each in _read_file(file, topics, losses, allowance):
             if each.topic not in _HEADS:
                 if before and _identity(each) in before:
                     continue
@@ -201,24 +208,25 @@ def _identity(each: LogMessage) -> bytes:
     )
 
 
-def _first_time_ns(file: Path) -> int | None:
+def _first_time_ns(file: Path, allowance: Allowance) -> int | None:
     """Log time of the first message behind a file's head, which has the time of the file's beginning."""
-    return next((each.log_time_ns for each in _beginning(file)), None)
+    return next((each.log_time_ns for each in _beginning(file, allowance)), None)
 
 
-def _beginning(file: Path) -> list[LogMessage]:
+def _beginning(file: Path, allowance: Allowance) -> list[LogMessage]:
     """The messages of a file's first whole chunk, which holds its head unless that is lost."""
     losses = LogLosses()
     found: list[LogMessage] = []
     with suppress(LogError, OSError), file.open("rb") as stream:
-        found += _messages(ChunkReader(stream, file, losses.add), file, None, losses, only_first=True)
+        reader = ChunkReader(stream, file, losses.add, allowance)
+        found += _messages(reader, file, None, losses, allowance, only_first=True)
     return found
 
 
-def _check_same_run(files: list[Path]) -> None:
+def _check_same_run(files: list[Path], allowance: Allowance) -> None:
     if len(files) < 2:
         return
-    found = {file: _run_info(file) for file in files}
+    found = {file: _run_info(file, allowance) for file in files}
     run_ids = {info.run_id: file for file, info in found.items() if info is not None}
     if len(run_ids) > 1:
         (run_a, file_a), (run_b, file_b) = sorted(run_ids.items())[:2]
@@ -228,32 +236,42 @@ def _check_same_run(files: list[Path]) -> None:
         )
 
 
-def _run_info(file: Path) -> RunInfo | None:
+def _run_info(file: Path, allowance: Allowance) -> RunInfo | None:
     """The `/run` at a file's head; None: the head is damaged."""
-    return next((each.message for each in _beginning(file) if isinstance(each.message, RunInfo)), None)
+    return next((each.message for each in _beginning(file, allowance) if isinstance(each.message, RunInfo)), None)
 
 
-def _read_file(path: Path, topics: Collection[str] | None, losses: LogLosses | None) -> Iterator[LogMessage]:
+def _read_file(
+    path: Path, topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
+) -> Iterator[LogMessage]:
     """One file's messages; the first must be `/run`, unless it was lost."""
     found = NoLosses() if losses is None else losses
     try:
         with path.open("rb") as stream:
-            reader = ChunkReader(stream, path, found.add)
-            yield from _messages(reader, path, topics, found)
+            reader = ChunkReader(stream, path, found.add, allowance)
+            yield from _messages(reader, path, topics, found, allowance)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _messages(
-    reader: ChunkReader, path: Path, topics: Collection[str] | None, losses: LogLosses, only_first: bool = False
+    reader: ChunkReader,
+    path: Path,
+    topics: Collection[str] | None,
+    losses: LogLosses,
+    allowance: Allowance,
+    only_first: bool = False,
 ) -> Iterator[LogMessage]:
     decoder = MessageDecoder(path, topics, lambda reason: losses.add_undecodable(path, reason))
-    n_damaged = losses.n_places
+    n_damaged, drawn = losses.n_places, 0
     for chunk in reader:
         if reader.n_chunks == 1 and losses.n_places > n_damaged:
             decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
-        decoder.allow(_RECORDS_FREE + reader.offset // _SMALLEST_RECORD_BYTES)
+        worth = reader.offset // _SMALLEST_RECORD_BYTES
+        decoder.allow(worth + drawn + allowance.records)
         yield from decoder.messages(chunk)
+        more = max(0, decoder.n_records - worth - drawn)
+        allowance.records, drawn = allowance.records - more, drawn + more
         if only_first:
             return
     if not reader.is_finished:

@@ -30,6 +30,7 @@ class MessageDecoder:
 
     Attributes:
         seen_run: whether a `/run` has come.
+        n_records: so far.
     """
 
     def __init__(self, path: Path, topics: Collection[str] | None, on_undecodable: Callable[[str], None]) -> None:
@@ -49,7 +50,7 @@ class MessageDecoder:
         self._run_channel: int | None = None
         self._first = True
         self._n_allowed = _HEAD_RECORDS
-        self._n_records = 0
+        self.n_records = 0
         self.seen_run = False
 
     def allow(self, n_records: int) -> None:
@@ -102,8 +103,8 @@ class MessageDecoder:
         following = position + RECORD_HEAD.size + length
         if following > len(chunk) or opcode == 0:
             raise struct.error("a record does not fit in its chunk")
-        self._n_records += 1
-        if self._n_records > self._n_allowed:
+        self.n_records += 1
+        if self.n_records > self._n_allowed:
             raise struct.error(f"more than {self._n_allowed} records up to here")
         return opcode, length, following
 

@@ -18,6 +18,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 
 from offline.map_io import ARRAYS_FILE, JSON_FILE, write_map
+from tests.hostile_folders import FOLDERS, RUN_FOLDERS
 from tests.hostile_logs import HOSTILE, yaml_bomb
 from tests.made_bags import STORE1, STORE2, Sent, header, made_message, write_bag
 from tests.made_maps import made_map
@@ -264,6 +265,8 @@ _YAML: dict[str, Callable[[Path], Path]] = {
 }
 
 FILES: dict[str, dict[str, Callable[[Path], Path]]] = {
+    "logs": FOLDERS,
+    "run": RUN_FOLDERS,
     "map": MAPS,
     "import": IMPORTS,
     "truth": {"many tags.json": many_true_tags, "nested.json": _text("[" * 900_000)},

@@ -29,7 +29,7 @@ from tests.made_logs import ROBOT_YAML, START_NS
 
 LIMIT_BYTES = 1 << 20
 MS = 1_000_000
-_NUMBERS = {name: number for number, name in enumerate(TOPICS, 1)}
+NUMBERS = {name: number for number, name in enumerate(TOPICS, 1)}
 _MESSAGE = struct.Struct("<BQHIQQ")
 
 
@@ -43,18 +43,18 @@ def bytes_of(*records: object) -> bytes:
 def declared() -> bytes:
     schemas = [
         Schema(id=number, data=b"", encoding="protobuf", name=TOPICS[name].schema.DESCRIPTOR.full_name)
-        for name, number in _NUMBERS.items()
+        for name, number in NUMBERS.items()
     ]
     channels = [
         Channel(id=number, topic=name, message_encoding="protobuf", metadata={}, schema_id=number)
-        for name, number in _NUMBERS.items()
+        for name, number in NUMBERS.items()
     ]
     return bytes_of(*schemas, *channels)
 
 
 def message(topic: str, content: Message | bytes, at_ns: int = START_NS) -> bytes:
     data = content if isinstance(content, bytes) else content.SerializeToString()
-    head = _MESSAGE.pack(5, _MESSAGE.size - 9 + len(data), _NUMBERS[topic], 0, at_ns, at_ns)
+    head = _MESSAGE.pack(5, _MESSAGE.size - 9 + len(data), NUMBERS[topic], 0, at_ns, at_ns)
     return head + data
 
 
@@ -118,6 +118,15 @@ def claims() -> bytes:
 def bombs(mib: int, count: int) -> bytes:
     bomb = chunk(b"\0" * (mib << 20))
     return log(chunk(run()), *[bomb] * min(count, (LIMIT_BYTES - 4000) // len(bomb)))
+
+
+def giant_bomb(mib: int) -> bytes:
+    """One chunk of nothing but zeros, whose length and checksum are right."""
+    packing, block, crc, packed = zstandard.ZstdCompressor(19).compressobj(mib << 20), bytes(1 << 20), 0, b""
+    for _ in range(mib):
+        packed += packing.compress(block)
+        crc = zlib.crc32(block, crc)
+    return log(chunk(run()), bytes_of(Chunk("zstd", packed + packing.flush(), START_NS, START_NS, crc, mib << 20)))
 
 
 def false_chunks() -> bytes:
@@ -185,6 +194,8 @@ def observed(
     step_m: float = 0.05,
     agree: bool = False,
     run_id: str = "r",
+    size_bytes: int = 0,
+    apart_m: float = 0.0,
 ) -> bytes:
     """A straight drive past tags that all seem to lie a metre ahead; after `n_tags` the first ones come again.
 
@@ -195,19 +206,28 @@ def observed(
         step_m: from look to look.
         agree: all tags lie at the start instead, so that readings of one fit together.
         run_id: of the run.
+        size_bytes: to which it is padded.
+        apart_m: how far each tag lies to the left of the one before.
     """
     contents: list[Content] = []
     for index in range(count):
         at_ns = START_NS + index * 100 * MS
         rolled = PlanarOdometry.WheelDistances(left_m=index * step_m, right_m=index * step_m)
-        place = TagObservation.Cartesian(x_m=-index * step_m if agree else 1.0, y_m=0.1)
         ids = [index * per_message + k if n_tags else index + k for k in range(per_message)]
         numbers = [each % n_tags if n_tags else each for each in ids]
-        tags = [TagObservation(family="tag36h11", tag_id=number, cartesian=place) for number in numbers]
+        ahead_m = -index * step_m if agree else 1.0
+        tags = [
+            TagObservation(
+                family="tag36h11",
+                tag_id=number,
+                cartesian=TagObservation.Cartesian(x_m=ahead_m, y_m=0.1 + apart_m * number),
+            )
+            for number in numbers
+        ]
         contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
         seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
         contents.append(("/tags/observations", seen, at_ns))
-    return of_messages(*contents, run_id=run_id)
+    return of_messages(*contents, run_id=run_id, size_bytes=size_bytes)
 
 
 def resets(stretches: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
@@ -310,6 +330,7 @@ def png(side: int) -> bytes:
 HOSTILE: dict[str, Callable[[], bytes]] = {
     "claimed lengths": claims,
     "one bomb of 60 MiB": lambda: bombs(60, 1),
+    "one bomb of 1 GiB": lambda: giant_bomb(1024),
     "many bombs of 1 MiB": lambda: bombs(1, 1 << 20),
     "many bombs of 30 MiB": lambda: bombs(30, 1 << 20),
     "chunks in chunks": false_chunks,

@@ -37,6 +37,12 @@ LOG_FORMS: Final = {
 }
 """All commands that take logs."""
 
+LOGS_FORMS: Final = {name: LOG_FORMS[name] for name in ("info", "map", "corners", "extend", "calibrate")}
+"""Those that take several."""
+
+RUN_FORMS: Final = LOG_FORMS | {"salvage": Form("offline.salvage", "salvage FILE -o OUT")}
+"""All of them on the folder of a run."""
+
 MAP_FORMS: Final = {
     "compare": Form("offline.evaluation,offline.map_io,offline.survey", "compare FILE --truth TRUTH"),
     "survey": Form("offline.evaluation,offline.map_io,offline.survey", "compare FILE --survey SURVEY"),

@@ -17,10 +17,11 @@ from pathlib import Path
 from offline.map_command import MapOptions, make_map
 from tests.hostile_files import FILES, LOGS, truth_and_survey
 from tests.hostile_logs import LIMIT_BYTES, honest
-from tests.taken_by_commands import LOG_FORMS, MAP_FORMS, OTHER_FORMS, Form, measure
+from tests.taken_by_commands import LOG_FORMS, LOGS_FORMS, MAP_FORMS, OTHER_FORMS, RUN_FORMS, Form, measure
 
 _SECONDS = 10.0
 _EXTRA_BYTES = 256 << 20
+_KINDS = (("log", LOG_FORMS), ("run", RUN_FORMS), ("logs", LOGS_FORMS), ("map", MAP_FORMS))
 
 
 def main() -> int:
@@ -39,7 +40,7 @@ def main() -> int:
                 bad = taken.seconds > _SECONDS or taken.extra_bytes > _EXTRA_BYTES or taken.code not in (0, 1, 3)
                 over += bad
                 figures = f"{taken.seconds:6.2f} s {taken.extra_bytes / 2**20:6.1f} MiB"
-                sys.stdout.write(f"{command:9} {case:32} exit {taken.code} {figures}{'  <- too much' if bad else ''}\n")
+                sys.stdout.write(f"{command:9} {case:34} exit {taken.code} {figures}{'  <- too much' if bad else ''}\n")
                 sys.stdout.flush()
     return int(over > 0)
 
@@ -49,7 +50,7 @@ def _cases(folder: Path, commands: list[str], only: str) -> Iterator[tuple[str, 
     kinds = {"log": LOGS, **FILES}
     files: dict[str, dict[str, Path]] = {}
     for command in commands:
-        for kind, forms in (("log", LOG_FORMS), ("map", MAP_FORMS), (command, OTHER_FORMS)):
+        for kind, forms in (*_KINDS, (command, OTHER_FORMS)):
             if command not in forms:
                 continue
             if kind not in files:

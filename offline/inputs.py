@@ -1,0 +1,59 @@
+"""The logs that one command reads together: what each may take beyond its size's worth is one share of one allowance.
+
+A log gets some time and memory whatever its size, since a drive may be short. Were that so for each of a thousand
+small files, a folder of them would take minutes and gigabytes.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from offline.errors import OfflineError
+
+# Pairs of stretches are laid over each other, so that with the root of the logs' size the time grows with the size. A
+# hundred drives of a minute, of 200 kB and more each, are far from it.
+_FREE_STRETCHES: Final = 25
+_STRETCHES_AT_A_MIB: Final = 20
+
+
+class Inputs(NamedTuple):
+    """How many logs there are, and their size together; one alone unless said otherwise."""
+
+    n_logs: int = 1
+    n_bytes: int = 0
+
+    @staticmethod
+    def of(logs: Sequence[Path]) -> "Inputs":
+        """Files and run folders; one that is not there has no size, and reading it says so."""
+        return Inputs(max(1, len(logs)), sum(map(size_bytes, logs)))
+
+    @property
+    def most_stretches(self) -> int:
+        """How many stretches all of them may have."""
+        return _FREE_STRETCHES + int(_STRETCHES_AT_A_MIB * (self.n_bytes / 2**20) ** 0.5)
+
+    def check_stretches(self, n_stretches: int, log: Path) -> None:
+        """Refuses more stretches of drives than logs of this size are worth.
+
+        Args:
+            n_stretches: of the logs up to this one, at least.
+            log: named in the error.
+
+        Raises:
+            OfflineError: naming how many there are, the limit and the way out.
+        """
+        if self.n_logs > 1 and n_stretches > self.most_stretches:
+            raise OfflineError(
+                f"{log}: with it there are {n_stretches} drives or stretches of such in {self.n_logs} logs, limit "
+                f"{self.most_stretches} for {self.n_bytes} bytes in all; map some of them and add the others by "
+                "--extend, or leave some out"
+            )
+
+
+ALONE: Final = Inputs()
+
+
+def size_bytes(log: Path) -> int:
+    """Of all files of a log; of none where there is no such log."""
+    files = log.iterdir() if log.is_dir() else [log]
+    return sum(path.stat().st_size for path in files if path.is_file())
