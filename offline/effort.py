@@ -59,14 +59,14 @@ class Effort:
     places: float = np.inf
 
     @staticmethod
-    def of_log(log_bytes: int, inputs: Inputs = ALONE) -> "Effort":
-        """What a log of this size is worth beside the others that are mapped with it."""
+    def of_log(log_bytes: int, inputs: Inputs = ALONE, times: int = 1) -> "Effort":
+        """What a log of this size is worth beside the others that are mapped with it, each of so many times."""
         free = 1.0 / inputs.n_logs
         size_mib, all_mib = log_bytes / 2**20, max(log_bytes, inputs.n_bytes) / 2**20
         allowed = free * _FREE_WORK + _WORK_AT_A_MIB * size_mib * all_mib
         return Effort(
-            allowed,
-            allowed,
+            allowed / times,
+            allowed / times,
             free * _FREE_BYTES + _BYTES_PER_BYTE * log_bytes,
             places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
         )
@@ -100,17 +100,18 @@ class Effort:
         )
 
     def steps(self, problem: Problem, share: float, most: int = MAX_STEPS) -> int:
-        """How many steps a share of what is allowed is enough for."""
-        return max(_LEAST_OF_A_SOLVE, min(most, int(share * self.allowed / step_work(problem))))
+        """How many steps a share of what is allowed is enough for, or what the solves before have left of it."""
+        work = min(share * self.allowed, max(self.left, 0.0))
+        return max(_LEAST_OF_A_SOLVE, min(most, int(work / step_work(problem))))
 
     def spend(self, solution: Solution) -> None:
         """Takes off what a solve used."""
         self.left -= solution.n_linearised * step_work(solution.problem)
 
 
-def efforts_of(runs: Sequence[Run]) -> dict[str, Effort]:
-    """What each of some runs is worth, by its name."""
-    return {run.name: Effort.of_log(run.log_bytes, run.inputs) for run in runs}
+def efforts_of(runs: Sequence[Run], times: int = 1) -> dict[str, Effort]:
+    """What each of some runs is worth, by its name, each of the times that a command maps them."""
+    return {run.name: Effort.of_log(run.log_bytes, run.inputs, times) for run in runs}
 
 
 def step_work(problem: Problem) -> float:

@@ -165,6 +165,8 @@ def fitted_windows(
         solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=most_steps)
     else:
         solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_steps)
+        if effort:
+            effort.spend(solution)
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
         sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
@@ -172,6 +174,8 @@ def fitted_windows(
         del solution
         shared = _scaled(apart, factors[0], factors[1] * sharing)
         solution = solve(shared, state, losses=losses, most_steps=most_steps)
+    if effort:
+        effort.spend(solution)
     of_the_whole = effort.steps(problem, share) if effort else MAX_STEPS
     return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, of_the_whole)
 

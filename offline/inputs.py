@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 
 from offline.errors import OfflineError
 
-# Pairs of stretches are laid over each other, so that with the root of the logs' size the time grows with the size. A
-# hundred drives of a minute, of 200 kB and more each, are far from it.
+# Any number of drives may be mapped together, as long as they were driven: recorded ones take 200 kB a minute and more,
+# and who has a hundred has some that broke off. Pairs of stretches are laid over each other.
 _FREE_STRETCHES: Final = 25
-_STRETCHES_AT_A_MIB: Final = 20
+_BYTES_A_STRETCH: Final = 64 << 10
 
 
 class Inputs(NamedTuple):
@@ -30,7 +30,7 @@ class Inputs(NamedTuple):
     @property
     def most_stretches(self) -> int:
         """How many stretches all of them may have."""
-        return _FREE_STRETCHES + int(_STRETCHES_AT_A_MIB * (self.n_bytes / 2**20) ** 0.5)
+        return _FREE_STRETCHES + self.n_bytes // _BYTES_A_STRETCH
 
     def check_stretches(self, n_stretches: int, log: Path) -> None:
         """Refuses more stretches of drives than logs of this size are worth.

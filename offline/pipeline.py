@@ -24,7 +24,7 @@ from offline.result import CalibrationChoice, MapResult
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
 from offline.runs_refused import check_distinct, check_new
-from offline.self_calibration import about_the_files, free_what_is_told
+from offline.self_calibration import TIMES_MAPPED, about_the_files, free_what_is_told
 from offline.self_calibration_option import Calibrate
 from offline.stages import Stages
 from offline.suspects import RunsAlone, with_outliers_apart
@@ -124,7 +124,7 @@ def build_map(
     if extending is not None:
         with stages.stage("the map that is extended"):
             known = [local_map_of(each) for each in extending.kept]
-    maps, broken = local_maps_of(runs, chains, stages)
+    maps, broken = local_maps_of(runs, chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
@@ -189,11 +189,20 @@ def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list
     return chains
 
 
-def local_maps_of(runs: Sequence[Run], chains: Sequence[Chain], stages: Stages) -> tuple[list[LocalMap], list[str]]:
-    """Each chain solved alone, parted where its wheels lost the way, and what to say of that."""
+def local_maps_of(
+    runs: Sequence[Run], chains: Sequence[Chain], stages: Stages, times: int = 1
+) -> tuple[list[LocalMap], list[str]]:
+    """Each chain solved alone, parted where its wheels lost the way, and what to say of that.
+
+    Args:
+        runs: of the chains.
+        chains: stretches.
+        stages: told what is being done.
+        times: how often the command maps the runs; what they are worth is shared out.
+    """
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
-        efforts = efforts_of(runs)
+        efforts = efforts_of(runs, times)
         for chain in chains:
             maps.append(solve_local_map(chain, efforts[chain.run.name]))
             done()

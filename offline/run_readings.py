@@ -108,10 +108,10 @@ _MOST_TAGS: Final = 652
 # A reading that was measured takes twelve bytes at least: noise cannot be compressed.
 _FREE_READINGS: Final = 60_000
 _LEAST_BYTES_A_READING: Final = 10
-# What is used of them: a recorded reading takes 200 bytes and more, and a dense import 33 with what lies around it.
-# 43,000 at 1 MiB take some 6 s of a processor.
-_FREE_TO_USE: Final = 10_000
-_BYTES_TO_USE: Final = 32
+# What is used of them: a recorded reading takes 200 bytes and more, and a dense import 33 with what lies around it, of
+# which beyond a megabyte every second look will do. 24,000 at 1 MiB take some 7 s of a processor.
+_FREE_TO_USE: Final = 8000
+_BYTES_TO_USE: Final = 64
 
 
 class RunReadings:

@@ -20,6 +20,7 @@ from offline.self_calibration_told import told_by
 # Put right before the map is made, which takes them to first order, or on the floor not at all. Wheel readings are in
 # metres by then, and stamps on one clock; both are as good to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
+TIMES_MAPPED: Final = 2  # the runs are, where this comes before their map
 _ADDED: Final = frozenset({"mount_x_m", "mount_y_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad"})
 
 
@@ -42,9 +43,9 @@ def free_what_is_told(
         names: what to free whether robot.yaml is contradicted or not; where empty what drives contradict.
         corners: the map will be refined on corners, which tell of the focal length too.
     """
-    efforts = efforts_of(runs)
+    efforts = efforts_of(runs, TIMES_MAPPED)
     maps = [solve_local_map(chain, efforts[chain.run.name]) for chain in chains]
-    choices = choose(told_by(maps, noise, corners=corners), names)
+    choices = choose(told_by(maps, noise, efforts, corners=corners), names)
     freed = {Owned(each.owner, each.name): LIMITS[each.name] for each in choices if each.is_freed}
     right = _put_right(choices)
     return Freed(

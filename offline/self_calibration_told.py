@@ -6,7 +6,7 @@ that estimate less what it was given: no map is needed, no alignment, and a tag 
 The noise is the one that windows of the drive leave over (`goodness`), so that it matters little what was told of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -19,6 +19,7 @@ from offline.chain import Chain
 from offline.corner_factors import FOCAL_SCALE
 from offline.corner_graph import corner_graph, has_corners
 from offline.corner_solver import CornerSolution, solve_corners
+from offline.effort import Effort
 from offline.goodness import WINDOW_M, fitted_windows
 from offline.graph import Parameter, build_graph
 from offline.local_map import LocalMap
@@ -30,6 +31,7 @@ from offline.solver import Solution, solve
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
 _STRETCHES: Final = 5
 _FEWEST: Final = 2  # of a short one
+_SOLVING_SHARE: Final = 0.2  # of what a log is worth, for each stretch: they are smaller by as much
 
 
 # What a calibration of the camera with a board is good for, where robot.yaml does not say how good its focal length is.
@@ -44,12 +46,13 @@ class _Stretch(NamedTuple):
     vector: FloatArray
 
 
-def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, *, corners: bool) -> Told:
+def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Mapping[str, Effort], *, corners: bool) -> Told:
     """What all stretches of some runs tell.
 
     Args:
         maps: of the runs, solved alone, with what robot.yaml says of the calibration.
         noise: under which.
+        efforts: what each run is worth, by its name.
         corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
     """
     stretches: list[_Stretch] = []
@@ -58,7 +61,7 @@ def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, *, corners: bool) 
         priors |= {parameter[:3]: parameter for parameter in each.graph.parameters}
         chain = _under_own_noise(each, noise)
         for first, end in _cuts(chain):
-            stretch = _told_by_stretch(chain, each, first, end, corners=corners)
+            stretch = _told_by_stretch(chain, each, first, end, efforts[chain.run.name], corners=corners)
             if stretch is not None:
                 stretches.append(stretch)
                 priors = {
@@ -99,7 +102,9 @@ def _cuts(chain: Chain) -> list[tuple[int, int]]:
     return list(zip([0, *ends], [*ends, len(along_m)], strict=True))
 
 
-def _told_by_stretch(chain: Chain, whole: LocalMap, first: int, end: int, *, corners: bool) -> _Stretch | None:
+def _told_by_stretch(
+    chain: Chain, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
+) -> _Stretch | None:
     """None where a stretch reads no tag or cannot be solved alone."""
     part = chain.part(first, end)
     if not len(part.readings):
@@ -110,7 +115,8 @@ def _told_by_stretch(chain: Chain, whole: LocalMap, first: int, end: int, *, cor
     start = graph.start(
         whole.T_start_base[first:end], whole.tags_m, {p: calibration.get(p[:3], 0.0) for p in graph.parameters}
     )
-    solution: Solution | CornerSolution = solve(graph.problem, start)
+    most_steps = effort.steps(graph.problem, _SOLVING_SHARE)
+    solution: Solution | CornerSolution = solve(graph.problem, start, most_steps=most_steps)
     parameters = graph.parameters
     if corners and has_corners(graph):
         on_corners, spatial = corner_graph(graph, solution.state)

@@ -71,7 +71,7 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     monkeypatch.setattr("offline.run_readings._FREE_TO_USE", 0)
     log = written(observed(2000, 10), tmp_path)
     size = log.stat().st_size
-    every = -(-4000 // (size // 32))
+    every = -(-4000 // (size // 64))
     assert every > 1
     run = load_run(log)
     used_ns = [START_NS + index * 100 * MS for index in range(0, 2000, every)]
@@ -94,11 +94,11 @@ def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
 
 
 def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
-    (chain,) = chains_of(load_run(written(observed(100, 650, 100), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(written(observed(80, 650, 100), tmp_path)), NoiseParameters())
     with pytest.raises(OfflineError) as refused:
         solve_local_map(chain)
     (line,) = str(refused.value).splitlines()
-    for words in ("made.mcap: gb1_r: 10000 readings of 650 tags from 100 keyframes", "limit 1.0e9", "leave out some"):
+    for words in ("made.mcap: gb1_r: 8000 readings of 650 tags from 80 keyframes", "limit 1.0e9", "leave out some"):
         assert words in line
 
 

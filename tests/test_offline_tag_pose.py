@@ -169,7 +169,8 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
     assert not found.valid[: len(bad) - 1].any()
     assert found.valid[-1]
     alone = reader(good[None], np.full(1, SIZE_M), CAMERA, rotation, SIGMA_PX)
-    np.testing.assert_array_equal(found.range_bearing[-1], alone.range_bearing[0])
+    # All points are taken through the lens until the last is still, which may move a still one by its last bit.
+    np.testing.assert_allclose(found.range_bearing[-1], alone.range_bearing[0], rtol=1e-14)
     assert not found.valid[len(bad) - 1] or found.chi2[len(bad) - 1] > 100.0
 
 
