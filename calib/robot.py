@@ -27,6 +27,11 @@ DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 RELATIVE_RADIUS_SIGMA = 0.005
 RELATIVE_TRACK_SIGMA = 0.01
 RELATIVE_TAG_SIZE_SIGMA = 0.005
+# How far too far out sides of tags are seen. A camera that is linear in light and sharp stays within 0.05 px: pictures
+# rendered with a gamma of 1.02 and a blur of 0.9 px have them 0.02 to 0.04 px too far in. With a gamma of 2.2 and a
+# blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a step best which was blurred and then coded; that is
+# within reach of this sigma, and the tags of a drive tell it.
+EDGE_SHIFT_PX_SIGMA = 0.1
 # x right, y down, z forward of the camera, in forward, left, up.
 R_LEVEL_OPTICAL = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -164,6 +169,8 @@ class Robot(_Section):
     readout_s: NotNegative = 0.0
     time_offset_s: Finite = 0.0
     time_offset_s_sigma: Positive = 0.002
+    edge_shift_px: Finite = 0.0
+    edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
     tags: list[TagBatch] = []
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
     devices: Devices = Devices()

@@ -204,7 +204,7 @@ def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> Read
         mount=readings.mount[like],
         mount_parameters=readings.mount_parameters[like],
         scale_parameter=readings.scale_parameter[like],
-        by_camera=np.zeros((len(tag), 2, 3)),
+        by_camera=np.zeros((len(tag), *readings.by_camera.shape[1:])),
         camera_parameters=readings.camera_parameters[like],
     )
 

@@ -125,7 +125,10 @@ def _robots(runs: Sequence[Run]) -> dict[str, Run]:
 
 def _numbers(run: Run) -> tuple[object, ...]:
     robot = run.robot
-    return robot.wheels, robot.mount, robot.tags, robot.time_offset_s, robot.time_offset_s_sigma, run.camera
+    return (
+        robot.wheels, robot.mount, robot.tags, robot.time_offset_s, robot.time_offset_s_sigma, robot.edge_shift_px,
+        robot.edge_shift_px_sigma, run.camera,
+    )  # fmt: skip
 
 
 def _best_known(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:

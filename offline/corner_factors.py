@@ -74,8 +74,9 @@ class Looks:
         moved: (M, 4, 3) T_keyframe_base by the wheels, when each corner's row was read out.
         twist: (M, 3) velocity of base (x, y, theta per second) at the keyframe.
         mount: (M, 6) nominal CORNER_MOUNT.
-        mount_parameters: (M, 6), time_parameter: (M,), scale_parameter: (M,), focal_parameter: (M,): indices into the
-            calibration.
+        mount_parameters: (M, 6), time_parameter: (M,), scale_parameter: (M,), focal_parameter: (M,), edge_parameter:
+            (M,): indices into the calibration.
+        outward: (M, 4, 2) how far corners move per pixel by which the tag's sides are seen further out.
     """
 
     pose: IntArray
@@ -91,6 +92,8 @@ class Looks:
     time_parameter: IntArray
     scale_parameter: IntArray
     focal_parameter: IntArray
+    edge_parameter: IntArray
+    outward: FloatArray
 
     def __len__(self) -> int:
         """Number of looks."""
@@ -106,7 +109,7 @@ class Seen(NamedTuple):
 
     Attributes:
         in_base: (M, 4, 3) the corners in base when their rows were read out.
-        pixels: (M, 4, 2) NaN where the lens has no image of a corner.
+        pixels: (M, 4, 2) before sides are seen too far out; NaN where the lens has no image of a corner.
         by_base: (M, 4, 2, 3) derivative of the pixels by in_base.
         in_keyframe: (M, 4, 3) the corners in base at the keyframe.
         R_base_camera: (M, 3, 3)
@@ -138,19 +141,20 @@ class CornerFactors:
 
     def residual(self, state: SpatialState) -> FloatArray:
         """(M, 8), whitened; NaN where the lens has no image of a corner."""
-        return self._residual(self._seen(state))
+        return self._residual(state, self._seen(state))
 
     def linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
         """Residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by WOBBLE."""
         seen = self._seen(state)
         wobble = np.concatenate([_by_turning(seen.by_base, seen.in_base)[..., :2], -seen.by_base[..., 2:]], axis=-1)
         whitened = wobble.reshape(len(self.looks), 8, 3) / self.looks.sigma_px[:, None, None]
-        return Linearised(self._residual(seen), ((self.columns(columns), self._jacobian(state, seen)),)), whitened
+        block = self.columns(columns), self._jacobian(state, seen)
+        return Linearised(self._residual(state, seen), (block,)), whitened
 
     def by_columns(self, state: SpatialState) -> tuple[FloatArray, FloatArray]:
-        """Residuals (M, 8) and their derivatives (M, 8, 18), in the order of `columns`."""
+        """Residuals (M, 8) and their derivatives (M, 8, 19), in the order of `columns`."""
         seen = self._seen(state)
-        return self._residual(seen), self._jacobian(state, seen)
+        return self._residual(state, seen), self._jacobian(state, seen)
 
     def _jacobian(self, state: SpatialState, seen: Seen) -> FloatArray:
         looks = self.looks
@@ -172,6 +176,7 @@ class CornerFactors:
                 by_late,
                 by_scale,
                 by_focal[..., None],
+                looks.outward[..., None],
             ],
             axis=-1,
         )
@@ -179,7 +184,7 @@ class CornerFactors:
         return whitened
 
     def columns(self, columns: SpatialColumns) -> IntArray:
-        """(M, 18) of pose, tag's place, its turn, mount, time, scale and focal length."""
+        """(M, 19) of pose, tag's place, its turn, mount, time, scale, focal length and sides."""
         looks = self.looks
         return np.concatenate(
             [
@@ -191,13 +196,15 @@ class CornerFactors:
                 columns.calibration[looks.time_parameter][:, None],
                 columns.calibration[looks.scale_parameter][:, None],
                 columns.calibration[looks.focal_parameter][:, None],
+                columns.calibration[looks.edge_parameter][:, None],
             ],
             axis=-1,
         )
 
-    def _residual(self, seen: Seen) -> FloatArray:
+    def _residual(self, state: SpatialState, seen: Seen) -> FloatArray:
         looks = self.looks
-        off: FloatArray = (seen.pixels - looks.corners_px) / looks.sigma_px[:, None, None]
+        shifted = seen.pixels + state.calibration[looks.edge_parameter][:, None, None] * looks.outward
+        off: FloatArray = (shifted - looks.corners_px) / looks.sigma_px[:, None, None]
         return off.reshape(len(looks), 8)
 
     def _corners(self, state: SpatialState) -> FloatArray:

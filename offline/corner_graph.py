@@ -9,6 +9,7 @@ import numpy as np
 from calib import wheels
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
+from calib.tag_edges import outward
 from offline.chain import Chain
 from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
 from offline.corner_problem import CornerProblem, columns_of
@@ -112,7 +113,7 @@ def _looks(graph: Graph, parameters: Sequence[Parameter]) -> tuple[Looks, tuple[
         robot, readings = chain.run.robot, chain.readings.where(mask)
         n = len(readings)
         x, y, yaw = mount_parameters_of(robot)
-        roll, pitch, time = camera_parameters_of(chain)
+        roll, pitch, time, edges = camera_parameters_of(chain)
         mount = [index[p] for p in (x, y, _height_parameter(chain), roll, pitch, yaw)]
         scales = np.array([index[scale_parameter_of(chain, tag)] for tag in chain.tags], dtype=np.int64)
         sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
@@ -137,6 +138,8 @@ def _looks(graph: Graph, parameters: Sequence[Parameter]) -> tuple[Looks, tuple[
                 time_parameter=np.full(n, index[time]),
                 scale_parameter=scales[readings.tag],
                 focal_parameter=np.full(n, index[_focal_parameter(chain)]),
+                edge_parameter=np.full(n, index[edges]),
+                outward=outward(readings.corners_px),
             )
         )
     whole = Looks(*(np.concatenate([getattr(each, field.name) for each in found]) for field in fields(Looks)))

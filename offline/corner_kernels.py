@@ -16,7 +16,7 @@ from offline.linearise_kernels import Odometry, Values, series
 from offline.linearise_odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from offline.robust import Loss, loss_and_weight
 
-N_LOOK: Final = 18
+N_LOOK: Final = 19
 N_MOTION: Final = 9
 
 
@@ -36,6 +36,8 @@ class LookArrays(NamedTuple):
     time_parameter: IntArray
     scale_parameter: IntArray
     focal_parameter: IntArray
+    edge_parameter: IntArray
+    outward: FloatArray
 
 
 class SpatialValues(NamedTuple):
@@ -87,7 +89,7 @@ def add_looks(
         _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, 0, normal[0])
         add_vector(kind, m, normal[0], system.gradient)
         if is_whole:
-            for a in range(N_LOOK):  # above the diagonal, and in what blocks of six have below
+            for a in range(N_LOOK):  # above the diagonal, and in what blocks of six and seven have below
                 f0, f1, f2, f3 = w * J[0, a], w * J[1, a], w * J[2, a], w * J[3, a]
                 f4, f5, f6, f7 = w * J[4, a], w * J[5, a], w * J[6, a], w * J[7, a]
                 if a < 6:
@@ -113,7 +115,7 @@ def add_wobble(
     force: FloatArray,
     coupled: FloatArray,
 ) -> None:
-    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 18); B as in `look_factor`.
+    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 19); B as in `look_factor`.
 
     Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
     """
@@ -205,7 +207,7 @@ def _combine(
     first: int,
     out: FloatArray,
 ) -> None:
-    """The rows of J (8, 18), so many times each, from some column on."""
+    """The rows of J (8, 19), so many times each, from some column on."""
     for b in range(first, N_LOOK):
         out[b] = (f0 * J[0, b] + f1 * J[1, b] + f2 * J[2, b] + f3 * J[3, b]) + (
             f4 * J[4, b] + f5 * J[5, b] + f6 * J[6, b] + f7 * J[7, b]
@@ -250,7 +252,7 @@ def look_factor(
     J: FloatArray,
     B: FloatArray,
 ) -> None:
-    """Sets the whitened residual (8,), its derivatives (8, 18), and those by how the picture stands (8, 3).
+    """Sets the whitened residual (8,), its derivatives (8, 19), and those by how the picture stands (8, 3).
 
     NaN where the lens has no image of a corner.
     """
@@ -258,6 +260,7 @@ def look_factor(
     late = values.calibration[looks.time_parameter[m]]
     scale = 1.0 + values.calibration[looks.scale_parameter[m]]
     focal = 1.0 + values.calibration[looks.focal_parameter[m]]
+    shift = values.calibration[looks.edge_parameter[m]]
     half = 0.5 * looks.side_m[m] * scale
     place_x, place_y, heading = values.poses[pose, 0], values.poses[pose, 1], values.poses[pose, 2]
     cos_h, sin_h = np.cos(heading), np.sin(heading)
@@ -295,7 +298,8 @@ def look_factor(
             distorted = px if axis == 0 else py
             scaled = lens[axis] * focal
             off = lens[axis] * distorted
-            r[i] = by_pixel * (focal * off + lens[CENTRE + axis] - looks.corners_px[m, k, axis])
+            outward = looks.outward[m, k, axis]
+            r[i] = by_pixel * (focal * off + lens[CENTRE + axis] + shift * outward - looks.corners_px[m, k, axis])
             gain = by_pixel * scaled * inverse
             j0, j1 = gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11)
             j2 = -(j0 * nx + j1 * ny)
@@ -318,5 +322,5 @@ def look_factor(
             row[14] = w2
             row[15] = b0 * v0 + b1 * v1 - (b0 * base_y - b1 * base_x) * omega
             row[16] = (t0 * u + t1 * v) * by_scale
-            row[17] = by_pixel * off
+            row[17], row[18] = by_pixel * off, by_pixel * outward
             B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2

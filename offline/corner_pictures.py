@@ -18,7 +18,7 @@ class Pictures(NamedTuple):
     Attributes:
         picture: (M,) of each look; weight: (M,) by which it counts.
         own: (P, 3, 3) B^T W B, B being derivatives by how a picture stands; force: (P, 3) B^T W r of level pictures.
-        coupled: (M, 3, 18) B^T W J with each look's columns.
+        coupled: (M, 3, 19) B^T W J with each look's columns.
     """
 
     picture: IntArray

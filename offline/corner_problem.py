@@ -260,7 +260,7 @@ class CornerProblem:
         heavy = weighed.weight[:, None, None] * wobble
         own = self._by_picture(wobble.swapaxes(-1, -2) @ heavy)
         own += np.diag(1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2)
-        coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 18)
+        coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 19)
         taken = np.linalg.solve(own[picture], coupled)
         matrix = matrix - coupled.swapaxes(-1, -2) @ taken
         a, b = self.pairs.T

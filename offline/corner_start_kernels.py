@@ -259,6 +259,7 @@ def _add_look(
     lens, rows = lenses[looks.camera[m]], np.empty((8, 7))
     half = 0.5 * looks.side_m[m] * (1.0 + calibration[looks.scale_parameter[m]])
     focal, by_pixel, square = 1.0 + calibration[looks.focal_parameter[m]], 1.0 / looks.sigma_px[m], 0.0
+    shift = calibration[looks.edge_parameter[m]]
     for k in range(4):
         u = -half if k == 0 or k == 3 else half
         v = half if k < 2 else -half
@@ -273,7 +274,8 @@ def _add_look(
         for axis in range(2):
             row, distorted = rows[2 * k + axis], px if axis == 0 else py
             scaled = by_pixel * lens[axis] * focal
-            off = scaled * distorted + by_pixel * (lens[CENTRE + axis] - looks.corners_px[m, k, axis])
+            seen = looks.corners_px[m, k, axis] - shift * looks.outward[m, k, axis]
+            off = scaled * distorted + by_pixel * (lens[CENTRE + axis] - seen)
             square += off * off
             gain = scaled / c2
             j0, j1 = gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11)

@@ -134,7 +134,7 @@ class ReadingFactors:
         whitening: (M, 2, 2).
         mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
         mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
-        by_camera: (M, 2, 3) derivative of the value by three more calibration numbers, camera_parameters: (M, 3).
+        by_camera: (M, 2, 4) derivative of the value by four more calibration numbers, camera_parameters: (M, 4).
     """
 
     pose: IntArray

@@ -257,8 +257,10 @@ def parameters_of_camera(robot: Robot) -> list[Parameter]:
     mount = robot.mount
     nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
     sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
+    *of_mount_and_time, of_edges = CAMERA_PARAMETERS
     return [
-        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(CAMERA_PARAMETERS, sigmas, strict=True)
+        *(Parameter(robot.robot_id, *each) for each in zip(of_mount_and_time, [nominal] * 3, sigmas, strict=True)),
+        Parameter(robot.robot_id, of_edges, (robot.edge_shift_px,), robot.edge_shift_px_sigma),
     ]
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.readings import CAMERA_PARAMETERS
 
 # What a calibration number corrects is four numbers at most; the rest of a row is NaN.
 _NOMINAL: Final = 4
@@ -50,7 +51,7 @@ class KeptChain:
             (K-1, 3, 3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
         tag_families, tag_ids, tag_instances: (T,) what was read; an instance where the run alone told places apart.
         reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance:
-            (M, 2, 2); reading_by_camera: (M, 2, 3) derivative by mount_roll_rad, mount_pitch_rad, time_offset_s.
+            (M, 2, 2); reading_by_camera: (M, 2, 4) derivative by `readings.CAMERA_PARAMETERS`.
         reading_polar, reading_in_camera: (M,) its form, and whether about the camera or about base.
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the chain's start; tags_m: (T, 2) there; calibration: of its graph.
@@ -106,8 +107,10 @@ def calibration_from(arrays: Any, key: str) -> KeptCalibration | None:  # noqa: 
 
 
 def chain_from(arrays: Any, key: str) -> KeptChain | None:  # noqa: ANN401 - numpy's file of arrays
-    """What `arrays_of` wrote; None where there is none."""
-    return KeptChain(**_values(KeptChain, arrays, key)) if f"{key}name" in arrays else None
+    """What `arrays_of` wrote; None where there is none, or one of a program that knew fewer numbers of a camera."""
+    if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
+        return None
+    return KeptChain(**_values(KeptChain, arrays, key))
 
 
 def _values(kind: type[KeptCalibration | KeptChain], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401

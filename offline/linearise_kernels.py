@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """`factors.ReadingFactors` by rising pose; parameters (M, 7) are those of mount, tag scale and camera."""
+    """`factors.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
 
     pose: IntArray
     tag: IntArray

@@ -8,9 +8,12 @@ from calib.arrays import FloatArray
 from offline.arrowhead_blocks import System
 from offline.jit import borrowed, inlined, inner, jitted
 from offline.linearise_kernels import Free, Readings, Values
+from offline.readings import CAMERA_PARAMETERS
 from offline.robust import Loss, loss_and_weight
 
-_N_PARAMETERS: Final = 7  # of mount, tag scale and camera
+_N_CAMERA: Final = len(CAMERA_PARAMETERS)
+_N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
+N_READING: Final = 5 + _N_PARAMETERS  # what a reading depends on: pose and tag before them
 
 
 @jitted
@@ -21,7 +24,7 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     whitened derivative of the reading by the tag's place in the sensor.
     """
     readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
-    r, J = np.empty(2), np.empty((2, 5 + _N_PARAMETERS))
+    r, J = np.empty(2), np.empty((2, N_READING))
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
@@ -127,7 +130,7 @@ def reading_factor(
         if by_calibration:
             J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
             J[i, 8] = -(a * x + b * y) / scale
-            for k in range(3):
+            for k in range(_N_CAMERA):
                 J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
 
 
@@ -135,7 +138,7 @@ def reading_factor(
 def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
     first, second = readings.value[m, 0], readings.value[m, 1]
-    for k in range(3):
+    for k in range(_N_CAMERA):
         c = values.calibration[readings.parameters[m, 4 + k]]
         if c != 0.0:
             first += readings.by_camera[m, 0, k] * c

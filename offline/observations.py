@@ -93,7 +93,7 @@ def read_detections(
             value=value[good],
             covariance=found.covariance[good] + by_floor,
             parts=_corner_parts(found.where(good), noise.sigma_corner_px, by_floor),
-            by_camera=_by_camera(run.robot, found.range_bearing[good], found.by_turn[good], twist[keyframe[good]]),
+            by_camera=_by_camera(run.robot, found.where(good), twist[keyframe[good]]),
             polar=np.ones(int(good.sum()), dtype=np.bool_),
             in_camera=np.ones(int(good.sum()), dtype=np.bool_),
             corners_px=corners_px[good],
@@ -187,22 +187,23 @@ def _are_covariances(matrices: FloatArray) -> BoolArray:
     return np.asarray(smallest > _LEAST_VARIANCE)
 
 
-def _by_camera(robot: Robot, range_bearing: FloatArray, by_turn: FloatArray, twist: FloatArray) -> FloatArray:
-    """(M, 2, 3) derivative of readings by CAMERA_PARAMETERS.
+def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArray:
+    """(M, 2, 4) derivative of readings by CAMERA_PARAMETERS.
 
     Args:
         robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
-        range_bearing: (M, 2) about the camera, in axes parallel to base.
-        by_turn: (M, 2, 3) derivative of them by a turn of the camera about these axes.
+        found: (M,) the readings.
         twist: (M, 2) speed and turning rate.
     """
-    range_m, cos, sin = range_bearing[:, 0], np.cos(range_bearing[:, 1]), np.sin(range_bearing[:, 1])
+    range_m, bearing_rad = found.range_bearing.T
+    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
     speed, turning = twist.T
     # How a tag moves as seen from the camera, whose place moves with base: a picture that was taken later shows that.
     x_rate = -speed + turning * (robot.mount.y_m + range_m * sin)
     y_rate = -turning * (robot.mount.x_m + range_m * cos)
     by_time = np.stack([cos * x_rate + sin * y_rate, (cos * y_rate - sin * x_rate) / range_m], axis=-1)
-    return np.concatenate([by_turn @ _mount_axes(robot).T, by_time[..., None]], axis=-1)
+    by_turn = found.by_turn @ _mount_axes(robot).T
+    return np.concatenate([by_turn, by_time[..., None], found.by_edge[..., None]], axis=-1)
 
 
 def _mount_axes(robot: Robot) -> FloatArray:

@@ -8,7 +8,7 @@ from calib.arrays import FloatArray
 from offline.jit import jitted
 from offline.linearise_kernels import Values, series, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
-from offline.linearise_readings import reading_factor
+from offline.linearise_readings import N_READING, reading_factor
 from offline.online_kernels import Border, Motions, Sights, spread_out
 
 # Of what is checked of a tag, below which rounding is all there is.
@@ -105,7 +105,7 @@ def foretold(
     border: Border, n: int, sights: Sights, values: Values, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What the first reading leaves over as of now (2,), its derivatives (2, 3 + n), and those by its tag (2, 2)."""
-    r, J, row, rows = np.empty(2), np.empty((2, 12)), np.empty(4 + n), np.empty((2, 3 + n))
+    r, J, row, rows = np.empty(2), np.empty((2, N_READING)), np.empty(4 + n), np.empty((2, 3 + n))
     reading_factor(sights, 0, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
     for i in range(2):
         spread_out(border, sights, 0, J[i], row)

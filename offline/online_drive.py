@@ -14,6 +14,7 @@ from offline.factors import whitening
 from offline.graph import NO_PARAMETER, Parameter, mount_parameters_of, parameters_of_camera, parameters_of_wheels
 from offline.kept_maps import measured_chain, run_without_log
 from offline.online_kernels import Motions, Sights
+from offline.readings import CAMERA_PARAMETERS
 from offline.run import TagKey
 
 _NAME: Final = "the drive"
@@ -28,7 +29,7 @@ class TagReading:
         family, tag_id: of the tag.
         value: (2,) range_m and bearing_rad, left positive; or x_m and y_m.
         covariance: (2, 2) of the value.
-        by_camera: (2, 3) its derivative by mount_roll_rad, mount_pitch_rad and time_offset_s; None where not known.
+        by_camera: (2, 4) its derivative by `readings.CAMERA_PARAMETERS`; None where not known.
         polar: which form.
         in_camera: about the camera's place and yaw, else about base.
     """
@@ -81,7 +82,7 @@ class Drive:
         self._of_mount = [index[each] for each in mount_parameters_of(robot)]
         self._of_camera = [index[each] for each in parameters_of_camera(robot)]
         self._none = index[NO_PARAMETER]
-        square = ((3, 3), float)
+        square, n_camera = ((3, 3), float), len(CAMERA_PARAMETERS)
         self._motions = Table(
             motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
         )
@@ -89,8 +90,8 @@ class Drive:
         self._poses.append(T=np.zeros(3))
         self._readings = Table(
             keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
-            in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, 3), float),
-            parameters=((7,), int),
+            in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, n_camera), float),
+            parameters=((4 + n_camera,), int),
         )  # fmt: skip
 
     @property
@@ -121,7 +122,8 @@ class Drive:
         """Of a tag, by its index, from the last pose; which parameter scales its size."""
         in_camera, mount = reading.in_camera, self._robot.mount
         of_mount = self._of_mount if in_camera else [self._none] * 3
-        of_camera = self._of_camera if in_camera and reading.by_camera is not None else [self._none] * 3
+        is_ours = in_camera and reading.by_camera is not None
+        of_camera = self._of_camera if is_ours else [self._none] * len(CAMERA_PARAMETERS)
         self._readings.append(
             keyframe=self._poses.n - 1,
             tag=tag,

@@ -14,7 +14,7 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.jit import inner, jitted
 from offline.linearise_kernels import Values, wrapped
 from offline.linearise_odometry import error_by_wheels, error_of, motion_at, wheel_correction
-from offline.linearise_readings import reading_factor
+from offline.linearise_readings import N_READING, reading_factor
 
 BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
 
@@ -35,7 +35,7 @@ class Motions(NamedTuple):
 
 
 class Sights(NamedTuple):
-    """`factors.ReadingFactors` by rising pose, counted from the present one; parameters (R, 7) as of `Readings`."""
+    """`factors.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
 
     pose: IntArray
     tag: IntArray
@@ -88,7 +88,7 @@ def sweep(
         left: (M, 3, 7 + n) takes the rows of each pose that is left: (pose, next pose, d, border).
     """
     row, work = np.empty(4 + n), np.empty((6, 7 + n))
-    r, J = np.empty(2), np.empty((2, 12))
+    r, J = np.empty(2), np.empty((2, N_READING))
     k = 0
     for m in range(len(left) + 1):
         if m > 0:
@@ -116,7 +116,7 @@ def spread_out(border: Border, sights: Sights, k: int, derivative: FloatArray, r
     row[:3] = derivative[:3]
     tag = 4 + border.first_tag[0] + 2 * sights.tag[k]
     row[tag], row[tag + 1] = derivative[3], derivative[4]
-    for a in range(7):
+    for a in range(N_READING - 5):
         column = border.columns[sights.parameters[k, a]]
         if column >= 0:
             row[4 + column] += derivative[5 + a]

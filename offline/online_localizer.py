@@ -32,6 +32,7 @@ from offline.online_prior import Numbers
 from offline.online_settling import judged, solved_anew
 from offline.online_smoother import Smoother
 from offline.online_start import SeenTags, StartSearch
+from offline.readings import CAMERA_PARAMETERS
 from offline.result import MapResult
 from offline.run import TagKey
 
@@ -186,7 +187,8 @@ def _warm_up(smoother: Smoother, known: KnownMap, scales: dict[Parameter, int]) 
         return
     of_map, scale = known.tags[0], max(scales.values())
     smoother.add_motion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3), np.eye(3))
-    reading = TagReading(of_map.family, of_map.tag_id, np.array([1.0, 0.0]), 1e-2 * np.eye(2), np.zeros((2, 3)))
+    value, by_camera = np.array([1.0, 0.0]), np.zeros((2, len(CAMERA_PARAMETERS)))
+    reading = TagReading(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
     smoother.add_reading(0, reading, scale, (of_map,))
     smoother.place(np.zeros(3), {0: of_map}, {})
     for _ in range(_WARMING_CALLS):

@@ -12,9 +12,11 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.covariance_parts import CovarianceParts, concatenated
 
+# How many pixels too far out the sides of tags are seen.
+EDGE_SHIFT: Final = "edge_shift_px"
 # What a robot's camera adds to its readings besides place and yaw of the mount, to first order: how its corners are
-# read with another roll or pitch, and where its tags were when the stamps are late.
-CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", "time_offset_s")
+# read with another roll or pitch, where its tags were when the stamps are late, and what tags look too large by.
+CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", "time_offset_s", EDGE_SHIFT)
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Readings:
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
         parts: what the covariance is made of.
-        by_camera: (M, 2, 3) derivative of the value by CAMERA_PARAMETERS.
+        by_camera: (M, 2, 4) derivative of the value by CAMERA_PARAMETERS.
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
         corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.

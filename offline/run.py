@@ -10,6 +10,7 @@ from calib.camera_file import read_camera_yaml
 from calib.camera_model import CameraModel
 from calib.errors import GroundsbotError
 from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from calib.tag_edges import moved_out
 from calib.words import counted
 from offline.errors import OfflineError
 from offline.inputs import ALONE, Inputs, size_bytes
@@ -200,7 +201,11 @@ def load_run(
         stretches=tuple(stretches),
         picture_stamps_ns=read.pictures_ns - late_ns,
         tags=read.tags,
-        detections=replace(read.detections, stamps_ns=read.detections.stamps_ns - late_ns),
+        detections=replace(
+            read.detections,
+            stamps_ns=read.detections.stamps_ns - late_ns,
+            corners_px=moved_out(read.detections.corners_px, -robot.edge_shift_px),
+        ),
         positions=read.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,

@@ -19,6 +19,7 @@ NAMES: Final = (
     "mount_pitch_rad",
     "mount_yaw_rad",
     "time_offset_s",
+    "edge_shift_px",
     "focal_scale",
 )
 

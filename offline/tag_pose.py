@@ -24,6 +24,7 @@ import numpy as np
 from calib.arrays import BoolArray, FloatArray
 from calib.bundle import board_pose
 from calib.camera_model import CameraModel
+from calib.tag_edges import outward
 
 # Corners of a tag with side 1 in its own frame; the order is that of groundsbot.proto.
 UNIT_CORNERS: Final[FloatArray] = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
@@ -46,6 +47,8 @@ class TagReadings:
         covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part of it that does not come from that.
         by_turn: (M, 2, 3) derivative of range_bearing, for the corners as they are, by a small turn (rad) of the camera
             about the axes of base.
+        by_edge: (M, 2) derivative of range_bearing as it should be, for the corners as they are, by how many pixels too
+            far out the tag's sides are seen.
         height_m: (M,) of the tag's centre above the camera; height_variance: (M,) m^2.
         chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
@@ -57,6 +60,7 @@ class TagReadings:
     covariance: FloatArray
     rest: FloatArray
     by_turn: FloatArray
+    by_edge: FloatArray
     height_m: FloatArray
     height_variance: FloatArray
     chi2: FloatArray
@@ -107,11 +111,15 @@ def upright_readings(
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
         normal = jacobian.swapaxes(-1, -2) @ jacobian
         inverse = _solve(normal, np.broadcast_to(np.eye(_N_PARAMETERS), normal.shape))
+        by_residual = -inverse @ jacobian.swapaxes(-1, -2)
         held_by_turn = _residual_by_turn(parameters, sides_m, camera, R_base_camera)
-        by_turn = -inverse @ jacobian.swapaxes(-1, -2) @ held_by_turn
+        by_turn = by_residual @ held_by_turn
+        # Sides seen g too far out: the corners should lie g times that further in, hence the residuals further out.
+        by_edge = by_residual[:, :3] @ outward(corners_px).reshape(-1, 8, 1)
         covariance = inverse[:, :3, :3] * sigma_corner_px**2
         chi2 = (residual**2).sum(-1) / sigma_corner_px**2
-        found = _polar(parameters[:, :3], covariance, np.zeros_like(covariance), by_turn[:, :3], chi2)
+        nothing = np.zeros_like(covariance)
+        found = _polar(parameters[:, :3], covariance, nothing, by_turn[:, :3], by_edge[..., 0], chi2)
         left = held_by_turn + jacobian @ by_turn
         return replace(found, misfit=residual / sigma_corner_px, misfit_by_turn=left / sigma_corner_px)
 
@@ -143,7 +151,9 @@ def general_readings(
         sight = direction[:, :, None] * direction[:, None, :]
         rest = along[:, None, None] * sight
         covariance = rest + across[:, None, None] * (np.eye(3) - sight)
-        return _polar(centres, covariance, rest, -_cross_matrix(centres), chi2)
+        sides_px = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=-1)
+        by_edge = centres * 2.0 / sides_px.mean(axis=1)[:, None]
+        return _polar(centres, covariance, rest, -_cross_matrix(centres), by_edge, chi2)
 
 
 def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray) -> FloatArray:
@@ -216,7 +226,12 @@ def _residual_by_turn(
 
 
 def _polar(
-    centre_m: FloatArray, covariance: FloatArray, rest: FloatArray, by_turn: FloatArray, chi2: FloatArray
+    centre_m: FloatArray,
+    covariance: FloatArray,
+    rest: FloatArray,
+    by_turn: FloatArray,
+    by_edge: FloatArray,
+    chi2: FloatArray,
 ) -> TagReadings:
     """Centres (M, 3) in axes parallel to base, about the camera, as readings.
 
@@ -225,6 +240,7 @@ def _polar(
         covariance: (M, 3, 3) theirs.
         rest: (M, 3, 3) the part of it that does not come from the corners' sigma.
         by_turn: (M, 3, 3) derivative of the centres by a turn of the camera.
+        by_edge: (M, 3) of them by how many pixels too far out the sides are seen.
         chi2: (M,).
     """
     x, y = centre_m[:, 0], centre_m[:, 1]
@@ -235,12 +251,14 @@ def _polar(
     jacobian[:, 1, 0] = -y / range_m**2
     jacobian[:, 1, 1] = x / range_m**2
     polar_covariance, polar_rest = (jacobian @ each @ jacobian.swapaxes(-1, -2) for each in (covariance, rest))
+    polar_by_edge = (jacobian @ by_edge[..., None])[..., 0]
     range_bearing = np.stack([range_m, np.arctan2(y, x)], axis=-1)
     valid = (
         np.isfinite(range_bearing).all(-1)
         & np.isfinite(polar_covariance).all((-1, -2))
         & (polar_covariance[:, 0, 0] > 0.0)
         & (polar_covariance[:, 1, 1] > 0.0)
+        & np.isfinite(polar_by_edge).all(-1)
         & np.isfinite(chi2)
     )
     return TagReadings(
@@ -248,6 +266,7 @@ def _polar(
         polar_covariance,
         polar_rest,
         jacobian @ by_turn,
+        polar_by_edge,
         centre_m[:, 2],
         covariance[:, 2, 2],
         chi2,

@@ -9,9 +9,10 @@ from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
 from offline.measured_factors import DistanceFactors, Measured, StartFactors
+from offline.readings import CAMERA_PARAMETERS
 from offline.solver import Problem
 
-_ROBOT_SIGMA: Final = (0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)  # wheels, mount, what else of the camera
+_ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * 8)  # wheels, mount, what else of the camera
 _OF_ROBOT: Final = len(_ROBOT_SIGMA)
 _BATCH_SIGMA: Final = (0.005, 0.005)
 N_ROBOTS: Final = 2
@@ -33,7 +34,7 @@ def made_graph(
     rng = np.random.default_rng(seed)
     sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
     poses, first, chain_of = _driven(rng, lengths)
-    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * rng.standard_normal(len(sigma)))
+    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _drawn(rng))
     readings = _readings(rng, truth, lengths, chain_of, reach)
     problem = Problem(
         odometry=_odometry(rng, truth, first, chain_of),
@@ -43,6 +44,14 @@ def made_graph(
         anchor=readings.pose[np.unique(readings.tag, return_index=True)[1]],
     )
     return problem, truth
+
+
+def _drawn(rng: np.random.Generator) -> FloatArray:
+    """Calibration in sigmas; of each robot the last number by a generator of its own."""
+    others = rng.standard_normal(1 + N_ROBOTS * (_OF_ROBOT - 1) + len(_BATCH_SIGMA))
+    at = [1 + (i + 1) * (_OF_ROBOT - 1) for i in range(N_ROBOTS)]
+    drawn: FloatArray = np.insert(others, at, rng.spawn(1)[0].standard_normal(N_ROBOTS))
+    return drawn
 
 
 def reordered(problem: Problem, rng: np.random.Generator) -> Problem:
@@ -115,8 +124,10 @@ def _readings(
     value = np.where(polar[:, None], as_polar, place)
     value += np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
     value[rng.random(n) < 0.05] += 1.0
-    by_camera = 0.5 * mounted[:, None, None] * rng.standard_normal((n, 2, 3))
-    camera_parameters = np.where(mounted[:, None], 3 + robot_mount, 0)
+    # The last column by a generator of its own, which leaves all other draws as they were without it.
+    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), rng.spawn(1)[0].standard_normal((n, 2, 1))], axis=-1)
+    by_camera = 0.5 * mounted[:, None, None] * drawn
+    camera_parameters = np.where(mounted[:, None], robot_mount[:, :1] + 3 + np.arange(len(CAMERA_PARAMETERS)), 0)
     value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
     covariance = root @ root.swapaxes(-1, -2)
     return ReadingFactors(

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib import se2
-from calib.arrays import IntArray
+from calib.arrays import FloatArray, IntArray
 from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
 from offline.solver import Problem
 
-# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, three more of the camera.
-CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, 0.01, 0.01, 0.01])
-WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.array([9, 10, 11])
+# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, four more of the camera.
+CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, 0.01, 0.01, 0.01, 0.01])
+WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.arange(9, 13)
 N_CALIBRATION = len(CALIBRATION_SIGMA)
 CHAINS = (9, 7)  # poses in each
 N_TAGS = 6
@@ -44,7 +44,7 @@ def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
         for _ in range(length - 1):
             first.append(len(poses) - 1)
             poses.append(se2.compose(poses[-1], [rng.uniform(0.2, 0.6), rng.normal(0, 0.02), rng.normal(0, 0.4)]))
-    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else rng.standard_normal(N_CALIBRATION))
+    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else _drawn(rng))
     truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
     problem = Problem(
         odometry=_odometry(truth, np.array(first), noise, rng),
@@ -79,6 +79,12 @@ def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> S
     return State(poses, tags, np.r_[0.0, 0.1 * spread * rng.standard_normal(N_CALIBRATION - 1)])
 
 
+def _drawn(rng: np.random.Generator) -> FloatArray:
+    """Calibration in sigmas; the last number by a generator of its own."""
+    others, last = rng.standard_normal(N_CALIBRATION - 1), rng.spawn(1)[0].standard_normal(1)
+    return np.concatenate([others, last])
+
+
 def _odometry(truth: State, first: IntArray, noise: float, rng: np.random.Generator) -> OdometryFactors:
     n = len(first)
     root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
@@ -106,7 +112,9 @@ def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Genera
     value = np.where(polar[:, None], as_polar, place)
     value += noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
     value[rng.choice(n, n_outliers, replace=False)] += 3.0
-    by_camera = 0.5 * mounted[:, None, None] * rng.standard_normal((n, 2, 3))
+    # The last column by a generator of its own, which leaves all other draws as they were without it.
+    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), rng.spawn(1)[0].standard_normal((n, 2, 1))], axis=-1)
+    by_camera = 0.5 * mounted[:, None, None] * drawn
     camera_parameters = np.where(mounted[:, None], CAMERA, 0)
     value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
     covariance = root @ root.swapaxes(-1, -2)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib import se2
 from calib.arrays import FloatArray
 from calib.robot import read_robot_yaml
+from calib.tag_edges import moved_out
 from calib.wheels import advance
 from fixtures.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
 from fixtures.errors import FixturesError
@@ -141,12 +142,13 @@ def test_detections_are_projections_of_the_true_corners(tmp_path: Path) -> None:
     assert camera is not None
     model = camera_model(camera, "b")
     seen = 0
+    assert abs(run.robot.edge_shift_px) > 0.01
     for message in detections_in(tmp_path / "out" / "b" / "seed6"):
         x, y, theta = run.at(np.array(message.stamp_ns - round(run.robot.time_offset_s * 1e9)))
         turn = np.array([[np.cos(theta), -np.sin(theta), 0], [np.sin(theta), np.cos(theta), 0], [0, 0, 1]])
         for found in message.detections:
             in_base = (truth.tags.corners_m[index[found.tag_id]] - [x, y, 0.0]) @ turn
-            expected = model.project(mount.inv().apply(in_base))
+            expected = moved_out(model.project(mount.inv().apply(in_base)), run.robot.edge_shift_px)
             np.testing.assert_allclose(np.array(found.corners_px).reshape(4, 2), expected, atol=1e-3)
             seen += 1
     assert seen > 100
@@ -166,7 +168,8 @@ def test_a_floor_tilts_whole_pictures_and_a_rolling_shutter_takes_each_row_at_it
     corner_of = dict(zip(truth.tags.tag_id.tolist(), truth.tags.corners_m, strict=True))
     found = []
     for message in [each for each in detections_in(tmp_path / "out" / "b" / "seed6") if len(each.detections) > 1]:
-        pixels = np.array([each.corners_px for each in message.detections]).reshape(-1, 2)
+        as_seen = np.array([each.corners_px for each in message.detections]).reshape(-1, 4, 2)
+        pixels = moved_out(as_seen, -run.robot.edge_shift_px).reshape(-1, 2)
         points = np.concatenate([corner_of[each.tag_id] for each in message.detections])
         late_s = readout_s * (pixels[:, 1] / (model.height_px - 1) - 0.5) - run.robot.time_offset_s
         T_world_base = run.at(message.stamp_ns + np.rint(late_s * 1e9).astype(np.int64))

@@ -23,7 +23,7 @@ CAMERAS = {
     "equidistant": (-0.01, 0.004, -0.002, 0.0003),
 }
 N_POSES, N_TAGS, N_LOOKS = 5, 3, 12
-SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
+SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.1])
 WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces somebody who looks along x
 
 
@@ -56,6 +56,8 @@ def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFa
         time_parameter=np.full(N_LOOKS, 7),
         scale_parameter=np.full(N_LOOKS, 8),
         focal_parameter=np.full(N_LOOKS, 9),
+        edge_parameter=np.full(N_LOOKS, 10),
+        outward=rng.uniform(-2.0, 2.0, (N_LOOKS, 4, 2)),
     )
     return CornerFactors(looks, (camera, replace(camera, fx_px=700.0)))
 
@@ -89,8 +91,8 @@ def made_problem(
             np.zeros((0, 3)),
             np.zeros((0, 3), dtype=int),
             none,
-            np.zeros((0, 2, 3)),
-            np.zeros((0, 3), dtype=int),
+            np.zeros((0, 2, 4)),
+            np.zeros((0, 4), dtype=int),
         ),
         prior=CalibrationPrior(SIGMAS),
         measured=NOTHING_MEASURED,

@@ -8,6 +8,7 @@ import pytest
 
 import offline
 from calib.noise import NoiseParameters
+from offline.kept import arrays_of, chain_from
 from offline.map_io import read_map, write_map
 from offline.measured import TapeOptions
 from offline.pipeline import build_map
@@ -89,6 +90,9 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
 
     assert "is in the map already" in told(runs=runs_of(folder, "a"))
     assert "does not hold what its runs measured" in told(extending=replace(known, kept=()))
+    kept = arrays_of(known.kept[0], "")
+    older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
+    assert (chain_from(kept, "") is None, chain_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
     assert "does not hold corners" in told(corners=True)
 

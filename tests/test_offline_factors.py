@@ -119,7 +119,7 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
 
     nominal = random_state(1)
     state = State(nominal.poses, nominal.tags, np.zeros(N_CALIBRATION))
-    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0])
+    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0])
     shrunk = State(0.9 ** np.array([1, 1, 0]) * state.poses, 0.9 * state.tags, change)
     np.testing.assert_allclose(odometry.residual(shrunk), odometry.residual(state), atol=1e-8)
     np.testing.assert_allclose(readings.residual(shrunk), readings.residual(state), atol=1e-8)

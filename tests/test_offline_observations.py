@@ -11,6 +11,7 @@ from calib.arrays import FloatArray
 from calib.errors import GroundsbotError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
+from calib.tag_edges import moved_out
 from offline.observations import check_tag_sizes, read_detections, read_positions
 from offline.readings import Readings
 from offline.run import Detections, Positions, Run, TagKey
@@ -21,6 +22,9 @@ NO_TWIST = np.zeros((1000, 2))  # speed and turning rate at the keyframes
 STILL = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)])
 ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4, "yaw_rad": 0.1, "pitch_rad": 0.05})
 UPRIGHT = [MadeTag(i, (2.0 + 0.7 * i, 0.3 * i - 0.4, 0.4), np.pi + 0.2 * i - 0.3) for i in range(5)]
+
+
+LEANING = MadeTag(0, (2.0, -0.4, 0.4), np.pi - 0.3, pitch_rad=-0.8)
 
 
 def corners_of(tag: MadeTag) -> FloatArray:
@@ -315,3 +319,22 @@ def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
         np.testing.assert_allclose(here.by_camera[0, :, k], (other.value - here.value)[0] / 1e-5, rtol=1e-2, atol=1e-3)
     later = read(run.robot, se2.exp(1e-4 * np.array([speed_m_s, 0.0, turning_rad_s])))
     np.testing.assert_allclose(here.by_camera[0, :, 2], (later.value - here.value)[0] / 1e-4, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize(("tag", "rtol"), [(UPRIGHT[0], 1e-4), (LEANING, 0.2)], ids=["upright", "askew"])
+def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) -> None:
+    """The reading of corners that were put right by hand; of a tag that hangs askew only the range, which is poor."""
+    run = run_of([tag])
+    corners_px = corners_of(tag)
+
+    def read(too_far_out_px: float) -> Readings:
+        seen = np.tile(moved_out(corners_px, -too_far_out_px), (3, 1, 1))
+        detections = detections_of(seen, [0, 0, 0])
+        return read_detections(run, detections, np.arange(3), np.zeros((3, 2)), NOISE)[0]
+
+    here = read(0.0)
+    assert len(here) == 3
+    by_hand = (read(1e-3).value - read(-1e-3).value)[0] / 2e-3
+    assert by_hand[0] > 0.0
+    np.testing.assert_allclose(here.by_camera[0, 0, 3], by_hand[0], rtol=rtol)
+    np.testing.assert_allclose(here.by_camera[0, 1, 3], by_hand[1], atol=1e-6 if tag is UPRIGHT[0] else 1e-3)

@@ -12,6 +12,7 @@ from calib import se2
 from calib.camera_file import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import write_robot_yaml
+from calib.tag_edges import outward
 from offline.run import RobotFile, TagKey, load_run, read_robot_file
 from offline.stretches import wheel_distances
 from onboard.log_head import log_head
@@ -135,6 +136,15 @@ def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
     run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
     assert (run.picture_stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
     assert (run.detections.stamps_ns - START_NS).tolist() == [6_000_000]
+
+
+def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> None:
+    log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
+    write_robot_yaml(made_robot(edge_shift_px=-0.25), tmp_path / "robot.yaml")
+    write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
+    run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
+    plain = np.reshape(CORNERS, (1, 4, 2))
+    np.testing.assert_allclose(run.detections.corners_px, plain + 0.25 * outward(plain))
 
 
 def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:

@@ -233,6 +233,13 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
         assert each.prior_sigma == pytest.approx(learnt[Owned(each.owner, each.name)].sigma, rel=1e-2)
 
 
+def test_what_was_learnt_of_edges_is_written() -> None:
+    robot = made_robot("a", edge_shift_px=0.02)
+    better = corrected(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
+    assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
+    assert all_open(robot).edge_shift_px_sigma == LIMITS["edge_shift_px"]
+
+
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
     assert set(NAMES) == set(LIMITS) == set(DRIVES)
     robot = made_robot("a")

@@ -20,7 +20,7 @@ ComplexArray = NDArray[np.complex128]
 # Of each run; radii, track and focal length as shares of themselves.
 CALIBRATION: Final = (
     "radius_left", "radius_right", "track", "mount_x_m", "mount_y_m", "mount_z_m", "mount_roll_rad", "mount_pitch_rad",
-    "mount_yaw_rad", "time_offset_s", "focal_length",
+    "mount_yaw_rad", "time_offset_s", "focal_length", "edge_shift_px",
 )  # fmt: skip
 N_WHEELS: Final = 3
 _STEP: Final = 1e-5  # of the difference quotients: m, rad, s or share
@@ -71,7 +71,7 @@ class TrueRun:
         picture, tag: [M] which tag was seen in which picture, in order of pictures.
         row_s: [M, 4] how long after the picture's stamp each corner's row was read.
         track_m, mount: true ones; x, y, z, roll, pitch, yaw as robot.yaml has them.
-        sigma: [11] priors by CALIBRATION; 0: known.
+        sigma: [12] priors by CALIBRATION; 0: known.
     """
 
     place: ComplexArray
@@ -148,7 +148,7 @@ def motion_covariance(run: TrueRun, noise: Noise) -> FloatArray:
 
 class CornerJacobians:
     """Derivatives [M, 8, .] of each sighting's pixels: by its pose, its tag (6) and the batch's scale, the run's camera
-    (mount, time offset, focal length) and the sway of the base (roll, pitch, height)."""
+    (mount, time offset, focal length, edge shift) and the sway of the base (roll, pitch, height)."""
 
     def __init__(self, run: TrueRun, tags: TrueTags) -> None:
         self._run, self._tags = run, tags
@@ -160,7 +160,8 @@ class CornerJacobians:
         self.by_pose, self.by_tag, self.by_sway = by_all[..., :3], by_all[..., 3:10], by_all[..., 17:20]
         pixels = run.camera.project(self._points(np.zeros(_N_POINT)))
         by_focal = (pixels - [run.camera.cx_px, run.camera.cy_px]).reshape(len(pose), 8, 1)
-        self.by_camera = np.concatenate([by_all[..., 10:17], by_focal], axis=-1)
+        by_edge = _quotients(lambda by: _with_sides_moved(pixels, by[0]), 1).reshape(len(pose), 8, 1)
+        self.by_camera = np.concatenate([by_all[..., 10:17], by_focal, by_edge], axis=-1)
 
     def _points(self, by: FloatArray) -> FloatArray:
         """[M, 4, 3] corners in the camera, where all is off by: pose 3, tag 6, scale, mount 6, time, sway 3."""
@@ -182,6 +183,18 @@ class CornerJacobians:
         mount = run.mount + by[10:16]
         R = Rotation.from_euler("ZYX", mount[[5, 4, 3]]).as_matrix() @ _OPTICAL
         return np.asarray((in_base - mount[:3]) @ R)
+
+
+def _with_sides_moved(pixels: FloatArray, by_px: float) -> FloatArray:
+    """[M, 4, 2] where the sides of quadrilaterals meet that are moved away from the middle."""
+    ends = np.roll(pixels, -1, axis=1)
+    normal = np.stack([ends[..., 1] - pixels[..., 1], pixels[..., 0] - ends[..., 0]], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    middle = pixels.mean(axis=1, keepdims=True)
+    normal *= np.sign(np.einsum("mki,mki->mk", normal, pixels - middle))[..., None]
+    along = np.einsum("mki,mki->mk", normal, pixels) + by_px
+    sides = np.stack([np.roll(normal, 1, axis=1), normal], axis=-2)
+    return np.linalg.solve(sides, np.stack([np.roll(along, 1, axis=1), along], axis=-1)[..., None])[..., 0]
 
 
 def _quotients(function: Callable[[FloatArray], FloatArray], n: int) -> FloatArray:

@@ -102,7 +102,7 @@ def _priors(robot: Robot, sigma_focal_length: float) -> FloatArray:
             wheels.radius_left_m_sigma / wheels.radius_left_m, wheels.radius_right_m_sigma / wheels.radius_right_m,
             wheels.track_m_sigma / wheels.track_m, mount.x_m_sigma, mount.y_m_sigma, mount.z_m_sigma,
             mount.roll_rad_sigma, mount.pitch_rad_sigma, mount.yaw_rad_sigma, robot.time_offset_s_sigma,
-            sigma_focal_length,
+            sigma_focal_length, robot.edge_shift_px_sigma,
         ]
     )  # fmt: skip
 

@@ -64,8 +64,8 @@ def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
         ),
         readings=ReadingFactors(
             pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_READING), (n, 1, 1)),
-            np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros((n, 2, 3)),
-            np.zeros((n, 3), dtype=np.int64),
+            np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros((n, 2, 4)),
+            np.zeros((n, 4), dtype=np.int64),
         ),
         prior=CalibrationPrior(np.zeros(1)),
         columns=_columns(len(poses), len(seen)),

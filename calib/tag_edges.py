@@ -1,0 +1,34 @@
+"""Where the corners of a tag go when its sides are seen too far out.
+
+A detector puts a side where the picture is half as bright as on both sides of it. Where light is blurred, that is where
+the side is as long as numbers in the picture are proportional to light. A gamma makes all grey brighter, and so do
+overexposed sensors: white spreads into the black border, and each side is seen too far in, by as many pixels whatever
+the tag's size in the picture. A corner lies where its two sides meet.
+"""
+
+import numpy as np
+
+from calib.arrays import FloatArray
+
+
+def outward(corners_px: FloatArray) -> FloatArray:
+    """(..., 4, 2) how far corners move per pixel by which all sides move outwards.
+
+    With n and m the unit normals of a corner's two sides, pointing out, the corner moves by d with n.d = m.d = 1, which
+    is d = (n + m) / (1 + n.m).
+
+    Args:
+        corners_px: (..., 4, 2) clockwise as seen in the picture (y down), as `groundsbot.proto` has them; where two of
+            them coincide the result is no number.
+    """
+    with np.errstate(all="ignore"):
+        side = np.roll(corners_px, -1, axis=-2) - corners_px  # to the next corner
+        normal = np.stack([side[..., 1], -side[..., 0]], axis=-1) / np.linalg.norm(side, axis=-1, keepdims=True)
+        before = np.roll(normal, 1, axis=-2)
+        moved: FloatArray = (normal + before) / (1.0 + (normal * before).sum(axis=-1, keepdims=True))
+    return moved
+
+
+def moved_out(corners_px: FloatArray, by_px: float) -> FloatArray:
+    """(..., 4, 2) the corners with all sides so many pixels further out."""
+    return corners_px if by_px == 0.0 else corners_px + by_px * outward(corners_px)
