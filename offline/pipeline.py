@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
-from offline.components import Found, solved_component
+from offline.components import Found, SolvedComponent, solved_component
 from offline.effort import efforts_of
 from offline.errors import OfflineError
 from offline.inputs import Inputs
@@ -16,7 +17,7 @@ from offline.local_map import LocalMap, solve_local_map
 from offline.map_warnings import map_warnings
 from offline.measured import Measurements, TapeOptions, parse_measurements
 from offline.measured_map import unused
-from offline.merge import merge
+from offline.merge import Merge, merge
 from offline.merge_report import alignment_results
 from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
@@ -120,10 +121,7 @@ def build_map(
     workings.runs += runs
     runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
     measurements = _measurements(tape, runs, chains, extending)
-    known: list[LocalMap] = []
-    if extending is not None:
-        with stages.stage("the map that is extended"):
-            known = [local_map_of(each) for each in extending.kept]
+    known = _known_maps(extending, stages)
     maps, broken = local_maps_of(runs, chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
     if noise is None:
         with stages.stage("fitting the noise"):
@@ -131,16 +129,10 @@ def build_map(
     elif known:
         maps = known + weighed_as(maps, noise, noise_fit)
     kept = tuple(kept_of(each) for each in maps)
-    with stages.stage("aligning local maps"):
-        merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
-        maps = with_outliers_apart(maps, merged)
+    maps, merged, components, joins = _solved_together(
+        maps, measurements, stages, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad
+    )
     workings.maps += maps
-    solve = partial(solved_component, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
-    components = [solve(maps, members, measurements, stages) for members in merged.groups]
-    joins: list[TagJoin] = []
-    if corners and len(components) > 1:
-        components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
-        merged = replace(merged, groups=tuple(each.members for each in components))
     found = Found()
     workings.solved += [found.take(maps, each, measurements, stages) for each in components]
     found.measured += unused(measurements, found.measured)
@@ -223,3 +215,42 @@ def _measurements(
         names = [*dict.fromkeys(each.run for each in extending.kept), *names]
         tags |= {tag for each in extending.kept for tag in tags_of(each)}
     return parse_measurements(tape, names, sorted(tags))
+
+
+def _known_maps(extending: MapResult | None, stages: Stages) -> list[LocalMap]:
+    """The local maps of a map that is extended, under the noise that it was kept with."""
+    if extending is None:
+        return []
+    with stages.stage("the map that is extended"):
+        return [local_map_of(each) for each in extending.kept]
+
+
+class _Together(NamedTuple):
+    """Local maps, how they were aligned and solved together, and which single tags were asked to join components."""
+
+    maps: list[LocalMap]  # tags apart that lie elsewhere than in the other maps
+    merged: Merge
+    components: list[SolvedComponent]
+    joins: list[TagJoin]
+
+
+def _solved_together(
+    maps: Sequence[LocalMap],
+    measurements: Measurements,
+    stages: Stages,
+    *,
+    keep_suspects: bool,
+    corners: bool,
+    upright_sigma_rad: float | None,
+) -> _Together:
+    """Aligns local maps and solves each group that hangs together; on corners a single tag may join two of them."""
+    with stages.stage("aligning local maps"):
+        merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
+        maps = with_outliers_apart(maps, merged)
+    solve = partial(solved_component, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
+    components = [solve(maps, members, measurements, stages) for members in merged.groups]
+    joins: list[TagJoin] = []
+    if corners and len(components) > 1:
+        components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
+        merged = replace(merged, groups=tuple(each.members for each in components))
+    return _Together(maps, merged, components, joins)
