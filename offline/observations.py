@@ -70,37 +70,44 @@ def read_detections(
     sides_m = _sides_m(run, tag)
     at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
     found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, noise.sigma_corner_px)
-    warnings = [
-        f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
-        for t in np.unique(tag[is_askew])
-    ]
-    range_m = found.range_bearing[:, 0]
+    good = _good(found, is_askew, level)
+    n, kept = int(good.sum()), found.where(good)
+    by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
+    by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
     # From base's axes to the camera's yaw, about which all readings in_camera are.
-    value = np.stack([range_m, se2.wrap_angle(found.range_bearing[:, 1] - run.robot.mount.yaw_rad)], axis=-1)
+    bearing_rad = se2.wrap_angle(kept.range_bearing[:, 1] - run.robot.mount.yaw_rad)
+    readings = Readings(
+        keyframe=keyframe[good],
+        tag=tag[good],
+        value=np.stack([kept.range_bearing[:, 0], bearing_rad], axis=-1),
+        covariance=kept.covariance + by_floor,
+        parts=_corner_parts(kept, noise.sigma_corner_px, by_floor),
+        by_camera=_by_camera(run.robot, kept, twist[keyframe[good]]),
+        polar=np.ones(n, dtype=np.bool_),
+        in_camera=np.ones(n, dtype=np.bool_),
+        corners_px=corners_px[good],
+        corner_sigmas=np.ones(n),
+    )
+    return readings, _told(run, tag[is_askew], good)
+
+
+def _good(found: TagReadings, is_askew: BoolArray, level: float) -> BoolArray:
+    """(M,) readings of tags that are near and large enough for their range to have no bias beside its sigma."""
+    range_m = found.range_bearing[:, 0]
     with np.errstate(invalid="ignore"):
         sure = min(level, 1.0) * found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
-        good = found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew)
+        return np.asarray(found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew))
+
+
+def _told(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
+    """Sentences about tags that hang askew, and about readings that are not good."""
+    told = [
+        f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
+        for t in np.unique(askew_tags)
+    ]
     if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
-        warnings.append(
-            f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has"
-        )
-    by_tilt = tilt_rad * reading_by_tilt(found.where(good), run.robot.mount.z_m)
-    by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
-    return (
-        Readings(
-            keyframe=keyframe[good],
-            tag=tag[good],
-            value=value[good],
-            covariance=found.covariance[good] + by_floor,
-            parts=_corner_parts(found.where(good), noise.sigma_corner_px, by_floor),
-            by_camera=_by_camera(run.robot, found.where(good), twist[keyframe[good]]),
-            polar=np.ones(int(good.sum()), dtype=np.bool_),
-            in_camera=np.ones(int(good.sum()), dtype=np.bool_),
-            corners_px=corners_px[good],
-            corner_sigmas=np.ones(int(good.sum())),
-        ),
-        warnings,
-    )
+        told.append(f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has")
+    return told
 
 
 def _upright_or_askew(
