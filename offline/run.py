@@ -167,12 +167,7 @@ def load_run(
     for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
         collected.readings.check(log, log_bytes, inputs.n_logs)
-    info = collected.info
-    if info is None:
-        found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
-        raise OfflineError(f"{found}; is it a groundsbot log?")
-    check_file_name(info.robot_id, f"{log}: /run: robot_id")
-    check_file_name(info.run_id, f"{log}: /run: run_id")
+    info = _run_info(collected, log, losses)
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
@@ -180,15 +175,8 @@ def load_run(
     warnings += losses.lines()
     collected.readings.check_tags(log)
     read = collected.readings.gathered(log_bytes, inputs.n_logs)
-    if read.every > 1:
-        warnings.append(
-            f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
-            f"{read.every} is used"
-        )
+    warnings += _not_used(collected, read.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
-    if collected.n_other_size:
-        pictures = counted(collected.n_other_size, "picture")
-        warnings.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
     name = f"{info.robot_id}_{info.run_id}"
     late_ns = round(robot.time_offset_s * 1e9)  # by which the camera's stamps are ahead of the wheels'
     return Run(
@@ -213,6 +201,31 @@ def load_run(
         lost=losses.in_words,
         events=tuple(sorted(collected.events)),
     )
+
+
+def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:
+    """Whose run it is, by names that are fit for files."""
+    info = collected.info
+    if info is None:
+        found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
+        raise OfflineError(f"{found}; is it a groundsbot log?")
+    check_file_name(info.robot_id, f"{log}: /run: robot_id")
+    check_file_name(info.run_id, f"{log}: /run: run_id")
+    return info
+
+
+def _not_used(collected: _Collected, every: int, log_bytes: int) -> list[str]:
+    """Sentences about what was read and is left out."""
+    told = []
+    if every > 1:
+        told.append(
+            f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
+            f"{every} is used"
+        )
+    if collected.n_other_size:
+        pictures = counted(collected.n_other_size, "picture")
+        told.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
+    return told
 
 
 def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:
