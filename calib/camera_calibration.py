@@ -99,13 +99,12 @@ def check_ruler(measured_mm: Sequence[float]) -> None:
         )
 
 
-def calibrate_from(found: Search, board: Board, finder: BoardFinder, name: str, model: str, most: int) -> Calibration:
+def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, most: int) -> Calibration:
     """The camera, or why there is none.
 
     Args:
         found: at least one view.
-        board: which.
-        finder: of that board.
+        finder: of the board.
         name: of the camera.
         model: one of `KINDS`, or `auto`.
         most: views to use; of more, the most telling ones.

@@ -64,7 +64,7 @@ def checked(model: CameraModel, estimate: CameraEstimate | None, views: Sequence
     with np.errstate(over="ignore", invalid="ignore"):  # a camera that no lens has puts points nowhere
         with_file = _residuals_with(model, again)
         chance = _chance(model, estimate, again, with_file)
-        difference = difference_px(again.model, model, PictureGrid.of(again.model))
+        difference = difference_px(model, PictureGrid.of(again.model))
         off_px = rms_px(difference) if np.isfinite(difference).any() else np.inf
         typical = _typical_px(with_file), _typical_px(again.lens.fit.residual_px)
     fits = chance > _CHANCE or off_px < _MATTERS_PX

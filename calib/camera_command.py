@@ -42,7 +42,7 @@ def calibrate_camera(
     finder = BoardFinder(printed)
     found = search(grey_pictures(pictures), finder)
     require_board(found, printed, finder)
-    result = calibrate_from(found, printed, finder, name, model, most_views)
+    result = calibrate_from(found, finder, name, model, most_views)
     sentences = verdict(result, printed)
     try:
         with written_whole(page) as partial:

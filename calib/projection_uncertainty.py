@@ -67,13 +67,12 @@ def expected_error_px(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)))
 
 
-def difference_px(model: CameraModel, other: CameraModel, grid: PictureGrid) -> FloatArray:
-    """(rows, columns, 2) by how much `other` puts far points elsewhere, after the best rotation of all.
+def difference_px(other: CameraModel, grid: PictureGrid) -> FloatArray:
+    """(rows, columns, 2) by how much `other` puts a grid's points elsewhere, after the best rotation of all.
 
     Args:
-        model: one camera.
-        other: the other, of the same picture size.
-        grid: of `model`. NaN where one of the two has no image.
+        other: a camera.
+        grid: of another one with the same picture size. NaN where one of the two has no image.
     """
     turn, rays = Rotation.identity(), grid.rays.reshape(-1, 3)
     used = np.asarray(np.isfinite(rays).all(axis=1))

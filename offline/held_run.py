@@ -175,7 +175,7 @@ class _Judge:
     """What a solution says of tags of the map."""
 
     def __init__(self, graph: Graph, solution: Solution, known: KnownMap) -> None:
-        self._graph, self._known = graph, known
+        self._known = known
         self._state: State = solution.state
         self._index = {tag: i for i, tag in enumerate(graph.tags)}
         factor = graph.problem.measured.known

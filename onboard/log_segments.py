@@ -40,7 +40,6 @@ class LogSegments:
     """Writes records into files; raises OSError, and can go on in new files then.
 
     Attributes:
-        n_written: records appended to a file so far.
         names: the files being written, for a person; replaced as a whole, so that other threads may read it.
     """
 
@@ -59,7 +58,6 @@ class LogSegments:
             head: what stands at the head of every file.
             limits: when a new segment begins; None: there is only one.
         """
-        self.n_written = 0
         self.names = ""
         self._storage = storage
         self._files_of = files_of
@@ -112,7 +110,6 @@ class LogSegments:
             self._replace_files({})
             self.open(record.log_time_ns)
         self._by_topic[record.topic].append(record)
-        self.n_written += 1
 
     def commit(self) -> None:
         """Writes all that was appended, in whole chunks."""

@@ -29,7 +29,6 @@ class MessageDecoder:
     """Decodes one file's chunks.
 
     Attributes:
-        seen_run: whether a `/run` has come.
         n_records: so far.
     """
 
@@ -51,7 +50,6 @@ class MessageDecoder:
         self._first = True
         self._n_allowed = _HEAD_RECORDS
         self.n_records = 0
-        self.seen_run = False
 
     def allow(self, n_records: int) -> None:
         """Bounds how many records there may be, from the first on."""
@@ -109,9 +107,7 @@ class MessageDecoder:
         return opcode, length, following
 
     def _target(self, channel: int) -> tuple[str, type[Message]] | None:
-        if channel == self._run_channel:
-            self.seen_run = True
-        elif self._first:
+        if self._first and channel != self._run_channel:
             raise LogError(
                 f"{self._path}: does not begin with /run, so it is not a groundsbot log; import it or choose another"
             )

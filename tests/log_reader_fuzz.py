@@ -21,10 +21,7 @@ from onboard.messages import TOPICS
 from tests.made_logs import Entry, drive, head
 
 _READER = (chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes)
-MODULES = [
-    str(module.__file__)
-    for module in (chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes)
-]
+MODULES = [str(module.__file__) for module in _READER]
 LONGEST_BYTES = 6000
 _LIMIT_BYTES = 64 << 20
 _CHUNK = struct.Struct("<BQQQQII")  # code, length, times, size, CRC-32, length of the compression's name

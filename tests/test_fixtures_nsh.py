@@ -16,7 +16,6 @@ from fixtures.visibility import sightings
 from fixtures.world import World, load_world
 from onboard.tag_detector import TagDetector
 
-NS_PER_S = 1_000_000_000
 SEEDS = range(3)
 ROBOTS = ("hallway", "loop")
 

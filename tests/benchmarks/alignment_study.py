@@ -31,14 +31,13 @@ from offline.condensed import CondensedMap, condense
 from offline.local_map import solve_local_map
 from offline.run import TagKey
 from tests.benchmarks.command_line import say
-from tests.made_long_drives import N_CROSSINGS, ROAD_M, Town, made_long_drive, made_town
+from tests.made_long_drives import Town, made_long_drive, made_town
 
 N_SHARED: Final = (6, 20)
 N_TRUE: Final = 4
 LEAST_SHIFT_M: Final = 1.0
 SHELF_SHIFT_M: Final = (2.0, 8.0)
 PART_M: Final = 50.0  # of the town
-TOWN_M: Final = ROAD_M * (N_CROSSINGS - 1)
 TAG_SPACING_M: Final = (2.0, 8.0)
 LENGTH_M: Final = 800.0
 RIGHT: Final = "right"

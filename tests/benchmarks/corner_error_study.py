@@ -105,11 +105,6 @@ class Errors:
         """Mean outward."""
         return float(np.mean(self.outward)) if self.outward else float("nan")
 
-    @property
-    def common_px(self) -> float:
-        """RMS of a coordinate of what all four corners of a picture are off together."""
-        return float(np.sqrt(np.mean(np.square(np.mean(self.found, axis=1))))) if self.found else float("nan")
-
     def cell(self) -> str:
         """As the table has it."""
         return f"{100 * self.rmse_px:6.1f} /{100 * self.bias_px:6.1f}" if self.found else f"{'-':>14}"

@@ -60,7 +60,7 @@ def judged(truth: CameraModel, views: Sequence[View]) -> Outcome:
     covariance, off = lens.covariance(), parameters_of(lens.fit.model) - parameters_of(truth)
     distance = float(off @ np.linalg.solve(covariance, off))
     grid = PictureGrid.of(truth)
-    error = difference_px(truth, lens.fit.model, grid)
+    error = difference_px(lens.fit.model, grid)
     predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid)) ** 2
     return Outcome(
         distance, distance < float(chi2.ppf(REGION, len(off))), rms_px(error), (error**2).sum(axis=-1), predicted,
@@ -104,7 +104,7 @@ def plain_error_px(truth: CameraModel, views: Sequence[View]) -> float:
         undistorted_camera("plain", size, kind, float(K[0, 0])),
         np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients.ravel()]),
     )
-    return rms_px(difference_px(truth, found, PictureGrid.of(truth)))
+    return rms_px(difference_px(found, PictureGrid.of(truth)))
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def beside(truth: CameraModel, views: Sequence[View]) -> Beside:
         found = calibrated(views, BoardFinder(DEFAULT_BOARD), truth.name, KINDS)
     except CalibError:
         return Beside(np.nan, plain_px, "refused", 0)
-    ours_px = rms_px(difference_px(truth, found.model, PictureGrid.of(truth)))
+    ours_px = rms_px(difference_px(found.model, PictureGrid.of(truth)))
     return Beside(ours_px, plain_px, found.model.distortion_model, int(found.lens.views.sum()))
 
 
