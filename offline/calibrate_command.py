@@ -14,9 +14,10 @@ from offline.errors import OfflineError
 from offline.jit import compilation_announced
 from offline.map_command import metre_line, read_robot_files, say
 from offline.measured import TapeOptions
+from offline.parameter_results import CalibrationResult
 from offline.pipeline import build_map, read_runs
 from offline.progress import progress_bar
-from offline.result import CalibrationResult, MapResult
+from offline.result import MapResult
 from offline.run import Run
 from offline.self_calibration import refocused
 from offline.self_calibration_option import AUTO, parse_calibrate

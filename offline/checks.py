@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from offline.graph import TAG_SCALE, Graph
-from offline.result import CheckResult, MetreResult
+from offline.parameter_results import CheckResult, MetreResult
 from offline.solver import Solution
 
 # The corrections that each check compares.

@@ -8,6 +8,7 @@ from offline.advice import advise
 from offline.checks import checks_of, metre_of
 from offline.corner_graph import has_corners
 from offline.corner_map import Refined, refine
+from offline.fit_results import MeasurementResult, SuspectTag
 from offline.global_map import calibration_of, component_of, solve_global_map
 from offline.graph import Graph
 from offline.joined_goodness import joined_goodness
@@ -15,15 +16,8 @@ from offline.local_map import LocalMap
 from offline.measured import Measurements
 from offline.measured_map import judged
 from offline.merge import Group
-from offline.result import (
-    AdviceResult,
-    CalibrationResult,
-    CheckResult,
-    Component,
-    MeasurementResult,
-    MetreResult,
-    SuspectTag,
-)
+from offline.parameter_results import CalibrationResult, CheckResult, MetreResult
+from offline.result import AdviceResult, Component
 from offline.solver import Solution
 from offline.stages import Stages
 from offline.suspects import joined, split_together

@@ -18,14 +18,8 @@ from offline.map_model import MapModel
 from offline.measured import Measurements
 from offline.measured_map import with_measurements
 from offline.merge import Group
-from offline.result import (
-    CalibrationResult,
-    Component,
-    RunResult,
-    StartToStart,
-    TagPose,
-    TagResult,
-)
+from offline.parameter_results import CalibrationResult
+from offline.result import Component, RunResult, StartToStart, TagPose, TagResult
 from offline.run import TagKey
 from offline.solver import Solution, solve
 from offline.stages import Stages

@@ -14,16 +14,18 @@ from calib.files import folder_written_whole
 from calib.noise import read_noise_yaml
 from calib.words import counted
 from offline.errors import OfflineError
+from offline.fit_results import AlignmentResult, MeasurementResult
 from offline.jit import compilation_announced
 from offline.map_io import JSON_FILE, read_map, write_map
 from offline.map_json import advice_as_json, map_as_json
 from offline.map_mcap import MAP_FILE, write_mcap
 from offline.measured import TapeOptions
+from offline.parameter_results import FittedNoise, MetreResult
 from offline.picture import write_picture
 from offline.pipeline import build_map, read_runs
 from offline.progress import progress_bar
 from offline.report_words import advice_sentence
-from offline.result import AlignmentResult, Component, FittedNoise, MapResult, MeasurementResult, MetreResult
+from offline.result import Component, MapResult
 from offline.run import RobotFile, read_robot_file
 from offline.run_noise import NOT_NEEDED
 from offline.self_calibration_option import OFF, parse_calibrate

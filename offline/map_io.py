@@ -18,6 +18,7 @@ from calib.errors import CalibError
 from calib.files import written_whole
 from offline.array_file import open_arrays
 from offline.errors import OfflineError
+from offline.fit_results import SuspectTag
 from offline.kept import KeptChain, arrays_of, calibration_from, chain_from
 from offline.map_json import (
     FORMAT_VERSION,
@@ -34,17 +35,8 @@ from offline.map_json import (
     tag_from,
 )
 from offline.map_model import MapModel
-from offline.result import (
-    CalibrationChoice,
-    CalibrationResult,
-    Component,
-    GraphEdges,
-    MapResult,
-    MetreResult,
-    RunResult,
-    StartToStart,
-    SuspectTag,
-)
+from offline.parameter_results import CalibrationChoice, CalibrationResult, MetreResult
+from offline.result import Component, GraphEdges, MapResult, RunResult, StartToStart
 from offline.tags_table import tags_csv
 from offline.trajectory_file import read_tum, write_tum
 

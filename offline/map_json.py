@@ -11,22 +11,9 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
-from offline.result import (
-    AdviceResult,
-    AlignmentResult,
-    CheckResult,
-    Component,
-    FittedNoise,
-    FittedParameter,
-    FloorSigmas,
-    MapResult,
-    MeasurementResult,
-    RivalResult,
-    RunResult,
-    SuspectTag,
-    TagPose,
-    TagResult,
-)
+from offline.fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from offline.parameter_results import CheckResult, FittedNoise, FittedParameter
+from offline.result import AdviceResult, Component, FloorSigmas, MapResult, RunResult, TagPose, TagResult
 
 FORMAT_VERSION: Final = 1
 

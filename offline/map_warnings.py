@@ -10,7 +10,7 @@ from offline.local_map import LocalMap
 from offline.measured_map import measurement_warnings
 from offline.merge import Merge
 from offline.merge_report import merge_warnings
-from offline.result import MAX_SIGMAS, CalibrationResult, CheckResult
+from offline.parameter_results import MAX_SIGMAS, CalibrationResult, CheckResult
 from offline.run import Run
 from offline.tag_joins import TagJoin
 

@@ -10,10 +10,10 @@ from scipy.stats import chi2
 from calib.arrays import FloatArray
 from offline.corner_solver import CornerSolution
 from offline.factors import Linearised, State, whitening
+from offline.fit_results import MeasurementResult
 from offline.graph import Graph
 from offline.measured import MeasuredDistance, MeasuredStart, Measurements
 from offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
-from offline.result import MeasurementResult
 from offline.run import TagKey
 from offline.solver import Solution
 

@@ -6,9 +6,9 @@ from math import degrees
 from calib.arrays import FloatArray
 from offline.alignment import Alignment
 from offline.corner_graph import has_corners
+from offline.fit_results import AlignmentResult, RivalResult
 from offline.local_map import LocalMap
 from offline.merge import Group, Merge, PairAlignment
-from offline.result import AlignmentResult, RivalResult
 from offline.run import TagKey
 from offline.tag_joins import TagJoin
 

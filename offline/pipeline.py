@@ -21,7 +21,8 @@ from offline.merge import Merge, merge
 from offline.merge_report import alignment_results
 from offline.observations import check_tag_sizes
 from offline.odometry_breaks import split_where_broken
-from offline.result import CalibrationChoice, MapResult
+from offline.parameter_results import CalibrationChoice
+from offline.result import MapResult
 from offline.run import RobotFile, Run, load_run
 from offline.run_noise import fit_and_weigh, weighed_as
 from offline.runs_refused import check_distinct, check_new

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.words import counted
-from offline.result import MAX_SIGMAS
+from offline.parameter_results import MAX_SIGMAS
 
 # A tag read less often has little to contradict it.
 FEW_READINGS: Final = 3

@@ -7,17 +7,19 @@ A run with unbroken odometry is one chain; where the odometry broke, a run has s
 from dataclasses import dataclass, field
 from math import atan2
 from pathlib import Path
-from typing import Final
-
-import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
+from offline.fit_results import AlignmentResult, MeasurementResult, SuspectTag
 from offline.kept import KeptCalibration, KeptChain
 from offline.map_model import MapModel
-
-# What is right goes beyond this once in 16,000 times.
-MAX_SIGMAS: Final = 4.0
+from offline.parameter_results import (
+    CalibrationChoice,
+    CalibrationResult,
+    CheckResult,
+    FittedNoise,
+    MetreResult,
+)
 
 
 @dataclass(frozen=True)
@@ -87,32 +89,6 @@ class TagResult:
     def full_label(self) -> str:
         """The same with its family, for maps of several."""
         return f"{self.family}:{self.label}"
-
-
-@dataclass(frozen=True)
-class RivalResult:
-    """Another transform that explains the shared tags almost as well."""
-
-    T_from_to: FloatArray  # (3,)
-    tags: tuple[tuple[str, int], ...]  # (family, tag id) of those that fit it
-
-
-@dataclass(frozen=True)
-class AlignmentResult:
-    """Transform between two local maps, from the tags they share."""
-
-    from_run: str
-    to_run: str
-    T_from_to: FloatArray  # (3,) pose of the second run's start in the first run's frame
-    n_shared: int
-    n_inliers: int
-    inlier_rmse_m: float
-    outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
-    is_sure: bool = True  # else the runs are not joined by it: chance or a rival explains the tags almost as well
-    rivals: tuple[RivalResult, ...] = ()
-    is_weak: bool = False  # one tag alone joins them: if that was moved in between, nothing shows it
-    # (3, 3) of T_from_to as x, y, theta in the first run's frame; None where the transform only begins a solve.
-    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -195,143 +171,6 @@ class Component:
         """Joint covariance of all tags, (2 T, 2 T) in m^2."""
         n = 3 * len(self.runs)
         return self.joint_covariance[n:, n:]
-
-
-@dataclass(frozen=True)
-class SuspectTag:
-    """A tag that does not belong.
-
-    Attributes:
-        kind: moved (between runs), moving (during one), swapped, duplicated (two tags with one id), phantom (a false
-            detection) or inconsistent (its run has most of its tags elsewhere).
-        runs: moved, swapped: in which it is not where it was first; moving: during which it was moved; duplicated:
-            that saw it; phantom: with the false detections; inconsistent: the one that is wrong.
-        evidence: in words, with numbers.
-        swapped_with: the other tag's id.
-    """
-
-    family: str
-    tag_id: int
-    kind: str
-    runs: tuple[str, ...]
-    evidence: str
-    swapped_with: int | None = None
-
-    def line(self) -> str:
-        """For a terminal."""
-        return f"tag {self.tag_id} ({self.family}) {self.kind}: {self.evidence}"
-
-
-@dataclass(frozen=True)
-class CalibrationResult:
-    """One calibration number that the solve carried, as a correction to what robot.yaml says."""
-
-    owner: str  # robot id, or the printed batch of tags
-    name: str  # wheel_scale, wheel_ratio, track_scale, mount_x_m, mount_y_m, mount_yaw_rad, tag_scale
-    component: int
-    value: float
-    sigma: float
-    prior_sigma: float
-
-
-@dataclass(frozen=True)
-class CalibrationChoice:
-    """Whether self-calibration freed one number of robot.yaml, and why not.
-
-    Attributes:
-        owner: robot id, or the printed batch of tags.
-        name: as in CalibrationResult.
-        value: the correction by the drives alone, with its sigma.
-        prior_sigma: what robot.yaml says of it.
-        off_sigmas: how far drives and robot.yaml differ.
-        held_out_gain: log likelihood of each stretch by what the other stretches tell, over that by robot.yaml; summed.
-            None where no two stretches tell anything of it.
-        reason: why it stays as robot.yaml has it; empty where it is freed.
-        is_asked: it was asked for by its name.
-    """
-
-    owner: str
-    name: str
-    is_freed: bool
-    value: float
-    sigma: float
-    prior_sigma: float
-    off_sigmas: float
-    held_out_gain: float | None
-    reason: str
-    is_asked: bool = False
-
-
-@dataclass(frozen=True)
-class MeasurementResult:
-    """What a person measured, and what the map makes of it."""
-
-    kind: str  # start or distance
-    a: str  # the run whose start is the frame, or one end: a run, or family:id of a tag
-    b: str  # the run, or the other end
-    measured: FloatArray  # (3,) x_m, y_m, theta_rad in map, or (1,) metres
-    sigma: FloatArray  # likewise
-    component: int | None  # in which it was used; None: its ends are in different components
-    in_map: FloatArray | None = None  # (3,) or (1,) as the map has it in the end
-    residual_sigmas: float | None = None  # length of what is left over, whitened
-    # How far it lies from what all else says, in sigmas of the difference; None where nothing else says anything.
-    off_sigmas: float | None = None
-    contradicts: bool = False  # by more than chance allows
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Two ways to know one thing, held against each other: wheels and tags."""
-
-    name: str  # scale: how much longer a metre by the tags is than one by the wheels; turn: likewise a full turn
-    component: int
-    robot_id: str
-    batch: str | None  # of tags; None for a turn, which needs no sizes
-    value: float  # as a share, by readings alone: without the priors
-    sigma: float
-    prior_sigma: float  # how far the two may differ by what robot.yaml says
-
-    @property
-    def sigmas(self) -> float:
-        """How far they differ, in sigmas of what readings and robot.yaml allow."""
-        return abs(self.value) / float(np.hypot(self.sigma, self.prior_sigma))
-
-    @property
-    def contradicts(self) -> bool:
-        """By more than chance allows."""
-        return self.sigmas > MAX_SIGMAS
-
-
-@dataclass(frozen=True)
-class MetreResult:
-    """What holds the length of a metre in a component: wheels, tags and all places could be stretched together."""
-
-    component: int
-    sigma: float  # relative
-    shares: dict[str, float]  # of wheels, track, tags, mount, distances, starts; they add up to 1
-
-
-@dataclass(frozen=True)
-class FittedParameter:
-    """One noise parameter, and what the runs told of it."""
-
-    name: str  # as in NoiseParameters
-    value: float
-    low: float | None  # where it lies with 99 %; None where it was not fitted
-    high: float | None
-    redundancy: float  # of how many squared residuals of its own it is the mean
-    kept: str = ""  # why it stands at its prior; empty where it was fitted
-
-
-@dataclass(frozen=True)
-class FittedNoise:
-    """Where the noise comes from when nobody gave it."""
-
-    parameters: tuple[FittedParameter, ...]
-    shared_range: float  # variance that readings of a tag within 2.5 m of the way share, as a multiple of their own
-    shared_bearing: float
-    runs: tuple[str, ...]  # names of those that it was fitted to
-    contradicting: tuple[str, ...]  # of those that contradict themselves: under the prior, or this where it is larger
 
 
 @dataclass(frozen=True)

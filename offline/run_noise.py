@@ -21,7 +21,7 @@ from offline.factors import State, whitening
 from offline.local_map import LocalMap
 from offline.noise_fit import FittedPart, FittedSigma, fit_noise
 from offline.odometry import ODOMETRY_NOISE
-from offline.result import FittedNoise, FittedParameter
+from offline.parameter_results import FittedNoise, FittedParameter
 from offline.shared_errors import SharedErrors, fit_shared_errors
 from offline.solver import solve
 

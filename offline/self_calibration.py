@@ -11,7 +11,7 @@ from offline.corner_factors import FOCAL_SCALE
 from offline.effort import efforts_of
 from offline.graph import IMPORTED_BATCH, TAG_SCALE
 from offline.local_map import solve_local_map
-from offline.result import CalibrationChoice, CalibrationResult
+from offline.parameter_results import CalibrationChoice, CalibrationResult
 from offline.run import Run
 from offline.self_calibration_gate import choose
 from offline.self_calibration_robot import LIMITS, Learnt, Owned, corrected, opened

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from calib.arrays import BoolArray, FloatArray
 from offline.graph import Parameter
-from offline.result import CalibrationChoice
+from offline.parameter_results import CalibrationChoice
 from offline.self_calibration_robot import LIMITS
 
 # Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from offline.result import CalibrationChoice, CalibrationResult, MapResult
+from offline.parameter_results import CalibrationChoice, CalibrationResult
+from offline.result import MapResult
 from offline.self_calibration_gate import TELLS_LESS
 
 # How to drive so that it can be told.

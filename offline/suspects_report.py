@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from calib.words import counted
-from offline.result import SuspectTag
+from offline.fit_results import SuspectTag
 from offline.suspects import Searched
 from offline.suspects_kinds import (
     INCONSISTENT,

@@ -8,7 +8,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.components import SolvedComponent
-from offline.result import AlignmentResult, RivalResult
+from offline.fit_results import AlignmentResult, RivalResult
 from offline.tag_joins import TagJoin
 
 

@@ -7,19 +7,9 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
-from offline.result import (
-    AdviceResult,
-    AlignmentResult,
-    CalibrationResult,
-    CheckResult,
-    Component,
-    MapResult,
-    MeasurementResult,
-    MetreResult,
-    RunResult,
-    StartToStart,
-    TagResult,
-)
+from offline.fit_results import AlignmentResult, MeasurementResult
+from offline.parameter_results import CalibrationResult, CheckResult, MetreResult
+from offline.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
 from offline.truth import TrueRun, Truth
 
 STEP_NS = 100_000_001  # so that stamps do not fit into a float of seconds

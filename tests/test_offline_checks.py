@@ -10,8 +10,9 @@ from offline.checks import check_warnings
 from offline.graph import TAG_SCALE
 from offline.map_warnings import calibration_warnings
 from offline.measured import TapeOptions
+from offline.parameter_results import CalibrationResult, CheckResult
 from offline.pipeline import build_map
-from offline.result import CalibrationResult, CheckResult, MapResult
+from offline.result import MapResult
 from offline.run import TagKey
 from offline.stages import Stages
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run

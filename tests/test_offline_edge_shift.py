@@ -12,8 +12,9 @@ from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from calib.tag_edges import moved_out
 from offline.map_model import MapModel
+from offline.parameter_results import CalibrationResult
 from offline.pipeline import build_map
-from offline.result import CalibrationResult, MapResult
+from offline.result import MapResult
 from offline.run import Run, load_run
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 

@@ -13,8 +13,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from calib import se2
+from offline.fit_results import SuspectTag
 from offline.map_io import read_map, write_map
-from offline.result import Component, SuspectTag
+from offline.result import Component
 from onboard.log_reader import read_log
 from onboard.messages import TagDetections, WheelEncoders, nanoseconds
 from tests.exported_map import make_small_map

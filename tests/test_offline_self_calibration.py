@@ -18,8 +18,9 @@ from offline.errors import OfflineError
 from offline.graph import TAG_SCALE, Parameter, parameters_of_wheels
 from offline.map_io import read_map, write_map
 from offline.odometry import WHEEL_PARAMETERS
+from offline.parameter_results import CalibrationChoice
 from offline.pipeline import build_map, read_runs
-from offline.result import CalibrationChoice, MapResult
+from offline.result import MapResult
 from offline.run import RobotFile, read_robot_file
 from offline.self_calibration_gate import TELLS_LESS, Told, choose
 from offline.self_calibration_option import NAMES, Calibrate, parse_calibrate

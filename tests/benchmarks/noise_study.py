@@ -20,8 +20,8 @@ import numpy as np
 from calib.noise import NoiseParameters
 from fixtures.simulate import TRUTH_FILE, simulate
 from offline.evaluation import evaluate
+from offline.parameter_results import FittedParameter
 from offline.pipeline import build_map, read_runs
-from offline.result import FittedParameter
 from offline.run_noise import NOT_NEEDED
 from offline.truth import read_truth
 from onboard.log_reader import find_logs

@@ -23,11 +23,11 @@ from calib import se2
 from calib.arrays import BoolArray, IntArray
 from calib.noise import NoiseParameters
 from offline.alignment import fit_transform
+from offline.fit_results import SuspectTag
 from offline.global_map import solve_global_map
 from offline.graph import Graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
-from offline.result import SuspectTag
 from offline.run_noise import fit_and_weigh
 from offline.solver import Solution
 from offline.stages import Stages
