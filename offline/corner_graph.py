@@ -1,7 +1,7 @@
 """From a solved map of the floor to the problem of refining it on tag corners."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from calib.tag_edges import outward
 from offline.chain import Chain
 from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
 from offline.corner_problem import CornerProblem, columns_of
+from offline.corner_sides import facing_as_predicted
 from offline.corner_start import tags_hung
 from offline.factors import CalibrationPrior, ReadingFactors, State
 from offline.graph import Graph, Parameter, camera_parameters_of, mount_parameters_of, scale_parameter_of
@@ -91,7 +92,9 @@ def corner_graph(
         heights_m=np.where(seen, np.nan, 0.0),
         turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
     )
-    return CornerGraph(problem, graph, parameters), tags_hung(problem, start)
+    start = tags_hung(problem, start)
+    problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
+    return CornerGraph(problem, graph, parameters), start
 
 
 def _from_corners(chain: Chain) -> BoolArray:

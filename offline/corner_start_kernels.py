@@ -222,24 +222,32 @@ def _eyes(looks: LookArrays, values: SpatialValues, which: IntArray) -> tuple[Fl
     axes, places = np.empty((len(which), 4, 3, 3)), np.empty((len(which), 4, 3))
     eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for i in range(len(which)):
-        m = which[i]
-        face(looks, m, values.calibration, eye)
-        late = values.calibration[looks.time_parameter[m]]
-        v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
-        along, even, _ = series(-late * omega)
-        across = -late * omega * even
-        back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
-        pose = values.poses[looks.pose[m]]
-        cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
-        for k in range(4):
-            moved = looks.moved[m, k]
-            cos_m, sin_m = np.cos(moved[2]), np.sin(moved[2])
-            x, y = moved[0] + cos_m * back_x - sin_m * back_y, moved[1] + sin_m * back_x + cos_m * back_y
-            _camera_at(
-                eye, pose[0] + cos_h * x - sin_h * y, pose[1] + sin_h * x + cos_h * y,
-                pose[2] + moved[2] - late * omega, axes[i, k], places[i, k],
-            )  # fmt: skip
+        eyes_of(looks, values, which[i], eye, axes[i], places[i])
     return axes, places
+
+
+@inner
+def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: FloatArray, places: FloatArray) -> None:
+    """Sets R_camera_map (4, 3, 3) and the camera's places (4, 3) when each corner's row of one look was read out.
+
+    `eye` is for looks by the same one, as in `face`.
+    """
+    face(looks, m, values.calibration, eye)
+    late = values.calibration[looks.time_parameter[m]]
+    v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
+    along, even, _ = series(-late * omega)
+    across = -late * omega * even
+    back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
+    pose = values.poses[looks.pose[m]]
+    cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
+    for k in range(4):
+        moved = looks.moved[m, k]
+        cos_m, sin_m = np.cos(moved[2]), np.sin(moved[2])
+        x, y = moved[0] + cos_m * back_x - sin_m * back_y, moved[1] + sin_m * back_x + cos_m * back_y
+        _camera_at(
+            eye, pose[0] + cos_h * x - sin_h * y, pose[1] + sin_h * x + cos_h * y,
+            pose[2] + moved[2] - late * omega, axes[k], places[k],
+        )  # fmt: skip
 
 
 @inner

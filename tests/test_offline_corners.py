@@ -13,12 +13,14 @@ from scipy.stats import chi2
 from calib import se2
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
+from calib.tag_edges import outward
 from fixtures.simulate import TRUTH_FILE, simulate
 from offline import corner_map
 from offline.corner_factors import SpatialState
 from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import corner_graph
 from offline.corner_problem import CornerProblem
+from offline.corner_sides import facing_as_predicted
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.edges import edges_of
 from offline.evaluation import evaluate
@@ -236,6 +238,16 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
     np.testing.assert_allclose(se2.compose(poses[edges.first], edges.motion)[:, :2], poses[edges.first + 1, :2])
     floor = edges_of(workings.solved[0].graph, workings.solved[0].solution)
     np.testing.assert_array_equal(edges.place_information, floor.place_information)
+
+
+def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Workings]) -> None:
+    """As seen they would be some sigma_corner_px over a side's length askew."""
+    solved = room[2].solved[0]
+    corners, start = corner_graph(solved.graph, solved.solution.state)
+    looks = corners.problem.corners.looks
+    expected = facing_as_predicted(corners.problem.corners, start).looks.outward
+    np.testing.assert_array_equal(looks.outward, expected)
+    assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
 
 
 def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Workings]) -> None:
