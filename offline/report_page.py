@@ -11,7 +11,7 @@ from string import Template
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from offline.report_tables import Table
+from offline.report_cells import Table
 
 _ASSETS: Final = "offline.report_assets"
 # Longer tables are folded away.
