@@ -11,6 +11,7 @@ from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingF
 from offline.measured_factors import DistanceFactors, Measured, StartFactors
 from offline.readings import CAMERA_PARAMETERS
 from offline.solver import Problem
+from tests.made_factors import odometry_of, readings_of
 
 _ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * 8)  # wheels, mount, what else of the camera
 _OF_ROBOT: Final = len(_ROBOT_SIGMA)
@@ -96,15 +97,8 @@ def _driven(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, I
 
 
 def _odometry(rng: np.random.Generator, truth: State, first: IntArray, chain_of: IntArray) -> OdometryFactors:
-    n = len(first)
-    root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
-    jacobian = 0.2 * rng.standard_normal((n, 3, 3))
     parameters = (1 + _OF_ROBOT * (chain_of[first] % N_ROBOTS))[:, None] + np.arange(3)
-    moved = se2.between(truth.poses[first], truth.poses[first + 1])
-    error = np.einsum("nij,nj->ni", root, rng.standard_normal((n, 3)))
-    by_calibration = np.einsum("nij,nj->ni", jacobian, truth.calibration[parameters])
-    motion = se2.compose(se2.compose(moved, se2.exp(error)), se2.inverse(se2.exp(by_calibration)))
-    return OdometryFactors(first, motion, whitening(root @ root.swapaxes(-1, -2)), jacobian, parameters)
+    return odometry_of(truth, first, parameters, rng, by_wheels=0.2)
 
 
 def _readings(
@@ -113,27 +107,14 @@ def _readings(
     pose, tag = _who_reads_what(rng, lengths, len(truth.tags), reach)
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
-    mount = np.where(mounted[:, None], [0.2, -0.1, 0.3], 0.0)
-    robot_mount = (4 + _OF_ROBOT * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
-    mount_parameters = np.where(mounted[:, None], robot_mount, 0)
-    scale_parameter = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
-    root = 0.05 * (np.eye(2) + 0.3 * rng.standard_normal((n, 2, 2)))
-    sensor = se2.compose(truth.poses[pose], mount + truth.calibration[mount_parameters])
-    place = se2.apply(se2.inverse(sensor), truth.tags[tag]) / (1.0 + truth.calibration[scale_parameter])[:, None]
-    as_polar = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
-    value = np.where(polar[:, None], as_polar, place)
-    value += np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
-    value[rng.random(n) < 0.05] += 1.0
-    # The last column by a generator of its own, which leaves all other draws as they were without it.
-    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), rng.spawn(1)[0].standard_normal((n, 2, 1))], axis=-1)
-    by_camera = 0.5 * mounted[:, None, None] * drawn
-    camera_parameters = np.where(mounted[:, None], robot_mount[:, :1] + 3 + np.arange(len(CAMERA_PARAMETERS)), 0)
-    value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
-    covariance = root @ root.swapaxes(-1, -2)
-    return ReadingFactors(
-        pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter, by_camera,
-        camera_parameters,
-    )  # fmt: skip
+    mount = (4 + _OF_ROBOT * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
+    scale = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
+    camera = mount[:, :1] + 3 + np.arange(len(CAMERA_PARAMETERS))
+
+    def spoil(value: FloatArray) -> None:
+        value[rng.random(n) < 0.05] += 1.0
+
+    return readings_of(truth, pose, tag, polar, mounted, (mount, scale, camera), spoil, rng)
 
 
 def _who_reads_what(

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
+from calib.arrays import FloatArray
+from offline.factors import CalibrationPrior, Columns, ReadingFactors, State
 from offline.solver import Problem
+from tests.made_factors import odometry_of, readings_of
 
 # Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, four more of the camera.
 CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, 0.01, 0.01, 0.01, 0.01])
@@ -47,7 +48,7 @@ def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
     calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else _drawn(rng))
     truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
     problem = Problem(
-        odometry=_odometry(truth, np.array(first), noise, rng),
+        odometry=odometry_of(truth, np.array(first), np.tile(WHEELS, (len(first), 1)), rng, by_wheels=0.4, noise=noise),
         readings=_readings(truth, noise, n_outliers, rng),
         prior=CalibrationPrior(CALIBRATION_SIGMA),
         columns=made_columns(n_poses),
@@ -85,40 +86,14 @@ def _drawn(rng: np.random.Generator) -> FloatArray:
     return np.concatenate([others, last])
 
 
-def _odometry(truth: State, first: IntArray, noise: float, rng: np.random.Generator) -> OdometryFactors:
-    n = len(first)
-    root = 0.03 * (np.eye(3) + 0.4 * rng.standard_normal((n, 3, 3)))
-    covariance = root @ root.swapaxes(-1, -2)
-    jacobian = 0.4 * rng.standard_normal((n, 3, 3))
-    moved = se2.between(truth.poses[first], truth.poses[first + 1])
-    error = noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 3)))
-    by_calibration = np.einsum("nij,j->ni", jacobian, truth.calibration[WHEELS])
-    motion = se2.compose(se2.compose(moved, se2.exp(error)), se2.inverse(se2.exp(by_calibration)))
-    return OdometryFactors(first, motion, whitening(covariance), jacobian, np.tile(WHEELS, (n, 1)))
-
-
 def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Generator) -> ReadingFactors:
-    n_poses = len(truth.poses)
-    pose, tag = (index.reshape(-1) for index in np.mgrid[0:n_poses, 0:N_TAGS])
+    pose, tag = (index.reshape(-1) for index in np.mgrid[0 : len(truth.poses), 0:N_TAGS])
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.5
-    mount = np.where(mounted[:, None], [0.2, -0.1, 0.3], 0.0)
-    mount_parameters = np.where(mounted[:, None], MOUNT, 0)
     scale_parameter = np.where(rng.random(n) < 0.8, BATCHES[tag % 2], 0)
-    root = 0.05 * (np.eye(2) + 0.3 * rng.standard_normal((n, 2, 2)))
-    sensor = se2.compose(truth.poses[pose], mount + truth.calibration[mount_parameters])
-    place = se2.apply(se2.inverse(sensor), truth.tags[tag]) / (1 + truth.calibration[scale_parameter])[:, None]
-    as_polar = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
-    value = np.where(polar[:, None], as_polar, place)
-    value += noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
-    value[rng.choice(n, n_outliers, replace=False)] += 3.0
-    # The last column by a generator of its own, which leaves all other draws as they were without it.
-    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), rng.spawn(1)[0].standard_normal((n, 2, 1))], axis=-1)
-    by_camera = 0.5 * mounted[:, None, None] * drawn
-    camera_parameters = np.where(mounted[:, None], CAMERA, 0)
-    value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
-    covariance = root @ root.swapaxes(-1, -2)
-    return ReadingFactors(
-        pose, tag, value, polar, whitening(covariance), mount, mount_parameters, scale_parameter, by_camera,
-        camera_parameters,
-    )  # fmt: skip
+
+    def spoil(value: FloatArray) -> None:
+        value[rng.choice(n, n_outliers, replace=False)] += 3.0
+
+    parameters = np.tile(MOUNT, (n, 1)), scale_parameter, np.tile(CAMERA, (n, 1))
+    return readings_of(truth, pose, tag, polar, mounted, parameters, spoil, rng, noise)
