@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,10 +41,16 @@ def calib(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     """`groundsbot-calib ARGUMENTS`, as the program."""
     from calib import cli
 
+    return _calling(cli.main, "groundsbot-calib", monkeypatch, capsys)
+
+
+def _calling(
+    main: Callable[[], None], name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Run:
     def call(*arguments: object) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["groundsbot-calib", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         with pytest.raises(SystemExit) as caught:
-            cli.main()
+            main()
         captured = capsys.readouterr()
         return Outcome(int(caught.value.code or 0), captured.out, captured.err)
 
@@ -56,15 +63,24 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     from offline import cli
     from offline.jit import COMPILING
 
+    program = _calling(cli.main, "groundsbot-offline", monkeypatch, capsys)
+
     def call(*arguments: object) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["groundsbot-offline", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        captured = capsys.readouterr()
+        outcome = program(*arguments)
         # Whichever test comes first on a fresh machine has the solver compiled.
-        return Outcome(int(caught.value.code or 0), captured.out, captured.err.replace(f"{COMPILING}\n", ""))
+        return replace(outcome, err=outcome.err.replace(f"{COMPILING}\n", ""))
 
     return call
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of three robots in a room that share tags, unrendered, and the truth; to be read only."""
+    from fixtures.simulate import simulate
+
+    folder = tmp_path_factory.mktemp("drives") / "room"
+    simulate("room", 3, folder, render=False)
+    return folder
 
 
 @pytest.fixture

@@ -342,3 +342,8 @@ class BagOfLog:
 
 def _transform(place: Any, rotation: Rotation) -> dict[str, Any]:
     return {"translation": xyz(place), "rotation": xyzw(rotation)}
+
+
+def good(log: Path) -> BagOfLog:
+    """The bag of a log, with nothing amiss."""
+    return BagOfLog.of(log).mount().odometry().camera_info().apriltag_msgs()

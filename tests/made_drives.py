@@ -1,7 +1,7 @@
 """Drives and logs made by hand, whose truth is known to the last digit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ S = 1_000_000_000
 START_NS = 1_800_000_000_000_000_003  # loses its last digits in a float
 FAMILY = "tag36h11"
 CAMERA = CameraModel("c", 1280, 720, 902.4, 901.1, 643.2, 356.7, "plumb_bob", (-0.182, 0.071, 0.0006, -0.0004, 0.0))
+PINHOLE = replace(CAMERA, distortion=(0.0,) * 5)
 _HALF_SIDE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 _FACE_TOWARDS_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 

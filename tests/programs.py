@@ -4,8 +4,10 @@ import os
 import pty
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,31 @@ class Outcome:
 
 
 Run = Callable[..., Outcome]
+
+
+@contextmanager
+def running(
+    command: Sequence[object],
+    *,
+    folder: Path | None = None,
+    stdout: int = subprocess.PIPE,
+    environment: Mapping[str, str] | None = None,
+    own_group: bool = False,
+) -> Iterator[subprocess.Popen[str]]:
+    """A process that says all it says on one pipe, as text; killed in the end."""
+    with subprocess.Popen(
+        [str(word) for word in command],
+        cwd=folder,
+        stdout=stdout,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        start_new_session=own_group,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def on_terminal(*arguments: object) -> tuple[int, str, str]:

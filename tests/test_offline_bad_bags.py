@@ -2,19 +2,16 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.made_bags import CAMERA, BagOfLog, Sent, header, without_definitions, write_bag
-from tests.made_drives import CAMERA as LENS
-from tests.made_drives import MadeTag, made_drive, write_drive
+from tests.made_bags import CAMERA, BagOfLog, Sent, good, header, without_definitions, write_bag
+from tests.made_drives import HALL, PINHOLE, made_drive, write_drive
 from tests.programs import Run
 
-TAGS = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2)]
 DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)], step_ns=20_000_000)
 SIZE = ("--tag-size-m", "0.15")
 
@@ -23,11 +20,7 @@ Spoil = Callable[[BagOfLog, Path], Path]
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drive(tmp_path_factory.mktemp("log"), DRIVE, TAGS, camera=replace(LENS, distortion=(0.0,) * 5))
-
-
-def good(log: Path) -> BagOfLog:
-    return BagOfLog.of(log).mount().odometry().camera_info().apriltag_msgs()
+    return write_drive(tmp_path_factory.mktemp("log"), DRIVE, HALL[:2], camera=PINHOLE)
 
 
 def changed(

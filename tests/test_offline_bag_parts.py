@@ -24,23 +24,18 @@ from offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, 
 from offline.import_robot import ImportOptions
 from offline.imported_run import ImportReport
 from offline.run import Run, TagKey, load_run
-from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, header, made_message, write_bag
+from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
 from tests.made_drives import CAMERA as LENS
-from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
+from tests.made_drives import HALL, PINHOLE, made_drive, made_robot, write_drive
 from tests.programs import Run as Program
 
-TAGS = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi + 0.2)]
 DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.3, 1.0)], step_ns=20_000_000)
 SIZED = BagOptions(tag_size_m=0.15)
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drive(tmp_path_factory.mktemp("log"), DRIVE, TAGS, camera=replace(LENS, distortion=(0.0,) * 5))
-
-
-def good(log: Path) -> BagOfLog:
-    return BagOfLog.of(log).mount().odometry().camera_info().apriltag_msgs()
+    return write_drive(tmp_path_factory.mktemp("log"), DRIVE, HALL[:2], camera=PINHOLE)
 
 
 def imported(

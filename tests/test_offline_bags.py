@@ -21,7 +21,7 @@ from onboard.log_writer import LogWriter
 from onboard.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
 from onboard.tag_detector import TagDetector
 from tests.made_bags import BagOfLog, without_definitions
-from tests.made_drives import CAMERA, HALL, START_NS, S, made_drive, made_robot, picture_stamps, write_drive
+from tests.made_drives import HALL, PINHOLE, START_NS, S, made_drive, made_robot, picture_stamps, write_drive
 from tests.made_steps import accumulated, covariances_of_steps
 from tests.tag_pictures import draw_tag
 
@@ -29,7 +29,6 @@ TAGS = [HALL[i] for i in (0, 1, 2, 4, 6, 7)]
 DRIVE = made_drive(
     [1.0, 1.5, 0.3], [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 4.0), (0.3, 0.5, 1.0)], step_ns=S // 50
 )
-PINHOLE = replace(CAMERA, distortion=(0.0,) * 5)
 SHORT = made_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)])
 PICTURES = CameraModel("c", 640, 480, 600.0, 601.0, 320.5, 239.5, "plumb_bob", (-0.18, 0.07, 0.0006, -0.0004, 0.0))
 OPTIONS = ImportOptions(run_id="one", robot_id="carl", track_width_m=0.5)

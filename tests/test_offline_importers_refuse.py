@@ -1,5 +1,7 @@
 """CSV folders that cannot become logs are refused in one line, with nothing left behind."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -38,12 +40,19 @@ BAD_ODOMETRY = [
 ]
 
 
+@contextmanager
+def refused(folder: Path, said: str) -> Iterator[None]:
+    """One line that says so, and no log."""
+    with pytest.raises(GroundsbotError) as caught:
+        yield
+    assert said in str(caught.value)
+    assert not (folder / "logs").exists()
+
+
 @pytest.mark.parametrize(("text", "said"), BAD_ODOMETRY)
 def test_bad_odometry_is_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(GroundsbotError) as caught:
+    with refused(tmp_path, said):
         imported(tmp_path, odometry=text)
-    assert said in str(caught.value)
-    assert not (tmp_path / "logs").exists()
 
 
 def test_lines_end_where_csv_ends_them(tmp_path: Path) -> None:
@@ -76,10 +85,8 @@ BAD_OBSERVATIONS = [
 
 @pytest.mark.parametrize(("text", "said"), BAD_OBSERVATIONS)
 def test_bad_observations_are_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(GroundsbotError) as caught:
+    with refused(tmp_path, said):
         imported(tmp_path, observations=text)
-    assert said in str(caught.value)
-    assert not (tmp_path / "logs").exists()
 
 
 BAD_PAPER_FILES = [
@@ -97,10 +104,8 @@ BAD_PAPER_FILES = [
 @pytest.mark.parametrize(("odometry", "landmarks", "said"), BAD_PAPER_FILES)
 def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str, landmarks: str, said: str) -> None:
     folder = folder_with(tmp_path, {"odom.csv": odometry, "landmarks.csv": landmarks})
-    with pytest.raises(GroundsbotError) as caught:
+    with refused(tmp_path, said):
         import_folder(folder, tmp_path / "logs", PAPER)
-    assert said in str(caught.value)
-    assert not (tmp_path / "logs").exists()
 
 
 @pytest.mark.parametrize(
@@ -121,10 +126,8 @@ def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str,
 )
 def test_what_is_missing_is_said(tmp_path: Path, files: dict[str, str], options: ImportOptions, said: str) -> None:
     folder = folder_with(tmp_path, files)
-    with pytest.raises(GroundsbotError) as caught:
+    with refused(tmp_path, said):
         import_folder(folder, tmp_path / "logs", options)
-    assert said in str(caught.value)
-    assert not (tmp_path / "logs").exists()
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])

@@ -24,13 +24,6 @@ HALL = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi), 
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drives") / "room"
-    simulate("room", 3, folder, render=False)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def maps(room: Path) -> list[LocalMap]:
     return [solve_local_map(chain) for log in find_logs([room]) for chain in chains_of(load_run(log), PRIOR)]
 

@@ -95,13 +95,6 @@ def test_a_calibration_that_is_off_is_found(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drives") / "room"
-    simulate("room", 3, folder, render=False)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def room_map(room: Path) -> MapResult:
     return build_map(read_runs(find_logs([room])))
 

@@ -31,6 +31,7 @@ from onboard.errors import OnboardError
 from onboard.messages import StampSource
 from tests.board_views import good_views, rendered
 from tests.live_recording import PATIENCE_S, until
+from tests.programs import running
 
 MS = 1_000_000
 STEP_NS = 110 * MS
@@ -270,12 +271,8 @@ def program(folder: Path, *options: str) -> Iterator["subprocess.Popen[str]"]:
     (folder / "robot.yaml").write_text(ROBOT)
     command = [sys.executable, "-m", "onboard.cli", "capture", "--robot", str(folder / "robot.yaml")]
     command += ["--output", str(folder / "pictures"), *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
+    with running(command) as process:
         yield process
-    finally:
-        process.kill()
-        process.wait()
 
 
 def hold_up(camera: PictureFolder, pictures: Path, process: "subprocess.Popen[str]", which: Iterable[int]) -> None:

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from onboard.status import read_status
 from tests.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
 from tests.made_cores import frames_of, wheels_of
 from tests.processor_wait import ended_within
+from tests.programs import running
 
 LIMIT_S = 5.0
 BOTH_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -62,34 +63,18 @@ os.fdatasync = stalling
 """
 
 
-@contextmanager
 def recorder(
     folder: Path,
     robot: Path,
     before: str = "",
     stdout: int = subprocess.PIPE,
     environment: Mapping[str, str] | None = None,
-) -> Iterator["subprocess.Popen[str]"]:
+) -> AbstractContextManager["subprocess.Popen[str]"]:
     """`groundsbot-onboard record` as a process of its own, working in `folder`."""
     program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **(environment or {})}
-    process = subprocess.Popen(
-        command,
-        cwd=folder,
-        stdout=stdout,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=environment,
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+    return running(command, folder=folder, stdout=stdout, environment=environment, own_group=True)
 
 
 def wait_for(process: "subprocess.Popen[str]", *words: str) -> None:

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import IO
@@ -21,6 +21,7 @@ from onboard.messages import Event, TagDetections, WheelEncoders
 from onboard.picture_schedule import PictureSchedule
 from tests.live_recording import CORNERS, PATIENCE_S, PATIENT, robot_yaml
 from tests.made_cores import frames_of, wheels_of
+from tests.programs import running
 from tests.tag_pictures import draw_tag
 
 MS = 1_000_000
@@ -32,15 +33,8 @@ def send(port: PtyPort, index: int) -> int | None:
     return now_ns if port.send(wheel_line(index, now_ns)) else None
 
 
-@contextmanager
-def program(*arguments: str | Path, before: str = "") -> Iterator["subprocess.Popen[str]"]:
-    command = [sys.executable, "-c", f"{before}\nfrom onboard.cli import main\nmain()", *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+def program(*arguments: str | Path, before: str = "") -> AbstractContextManager["subprocess.Popen[str]"]:
+    return running([sys.executable, "-c", f"{before}\nfrom onboard.cli import main\nmain()", *arguments])
 
 
 def wait_for(output: IO[str] | None, *words: str) -> list[str]:
