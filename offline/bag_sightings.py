@@ -22,7 +22,9 @@ from offline.errors import OfflineError
 from offline.imported_run import Entry
 from offline.run import read_robot_file
 from offline.stages import Progress
-from onboard.messages import TagDetection, TagDetections, TagObservations
+from onboard.measurements import tag_message
+from onboard.messages import TagDetections, TagObservations
+from onboard.tag_detector import Detection
 
 
 @dataclass(frozen=True)
@@ -145,12 +147,8 @@ def _corner_entries(looks: Sequence[Look], camera: CameraModel, topic: BagTopic)
                 width_px=camera.width_px,
                 height_px=camera.height_px,
                 detections=[
-                    TagDetection(
-                        family=each.family,
-                        tag_id=each.tag_id,
-                        hamming=each.hamming,
-                        decision_margin=each.decision_margin,
-                        corners_px=each.corners_px.ravel().tolist(),
+                    tag_message(
+                        Detection(each.family, each.tag_id, each.hamming, each.decision_margin, each.corners_px)
                     )
                     for each in look.sightings
                     if each.corners_px is not None

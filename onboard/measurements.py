@@ -39,14 +39,16 @@ def detections_message(
         detector=detector,
         detector_settings=detector_settings,
         stamp_source=StampSource.Name(source),
-        detections=[
-            TagDetection(
-                family=each.family,
-                tag_id=each.tag_id,
-                hamming=each.hamming,
-                decision_margin=each.decision_margin,
-                corners_px=each.corners_px.ravel().tolist(),
-            )
-            for each in detections
-        ],
+        detections=[tag_message(each) for each in detections],
+    )
+
+
+def tag_message(each: Detection) -> TagDetection:
+    """One tag of a picture."""
+    return TagDetection(
+        family=each.family,
+        tag_id=each.tag_id,
+        hamming=each.hamming,
+        decision_margin=each.decision_margin,
+        corners_px=each.corners_px.ravel().tolist(),
     )
