@@ -131,6 +131,11 @@ class CornerFactors:
     cameras: tuple[CameraModel, ...]
 
     @cached_property
+    def _last(self) -> list[tuple[SpatialState, SpatialColumns, tuple[Linearised, FloatArray]]]:
+        """What was linearised last, where, and for which columns; at most one."""
+        return []
+
+    @cached_property
     def arrays(self) -> LookArrays:
         """The looks for compiled functions."""
         return LookArrays(*(np.ascontiguousarray(getattr(self.looks, field.name)) for field in fields(Looks)))
@@ -145,7 +150,15 @@ class CornerFactors:
         return self._residual(state, self._seen(state))
 
     def linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
-        """Residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by WOBBLE."""
+        """Residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by WOBBLE.
+
+        The last answer is kept: a floor's sigmas are looked for at one state.
+        """
+        if not self._last or self._last[0][0] is not state or self._last[0][1] is not columns:
+            self._last[:] = [(state, columns, self._linearised(state, columns))]
+        return self._last[0][2]
+
+    def _linearised(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
         seen = self._seen(state)
         wobble = np.concatenate([_by_turning(seen.by_base, seen.in_base)[..., :2], -seen.by_base[..., 2:]], axis=-1)
         whitened = wobble.reshape(len(self.looks), 8, 3) / self.looks.sigma_px[:, None, None]

@@ -108,8 +108,9 @@ def with_wobble(problem: CornerProblem, sigma: FloatArray) -> CornerProblem:
 
 def _unlikeliness(problem: CornerProblem, state: SpatialState) -> float:
     """The negative logarithm of the restricted likelihood, up to a constant."""
+    system, cost = problem.system(state)
     try:
-        factor = problem.factor(state)
+        factor = problem.order.factorise(system)
     except NotPositiveError:
         return np.inf
-    return problem.system(state, is_whole=False)[1] + 0.5 * (problem.log_spread(state) + factor.log_determinant())
+    return cost + 0.5 * (problem.log_spread(state) + factor.log_determinant())
