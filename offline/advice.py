@@ -20,7 +20,7 @@ from offline.advice_tags import Drives, Place, View, drives_of, gain_of_place, p
 from offline.factors import State
 from offline.graph import Graph
 from offline.result import AdviceResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 from offline.weak_parts import MAX_RELATIVE_ERROR
 

@@ -20,7 +20,7 @@ from offline.alignment_search import Explanation, explanations, halves, settled,
 from offline.condensed import CondensedMap
 from offline.joint_fit import REACH_M, JointFit
 from offline.measured import Placement
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.tag_fit import FALSE_ALARM
 
 # An alignment's covariance holds for other choices of tags as well, down to this much less likely: that costs width

@@ -10,7 +10,8 @@ from calib.noise import NoiseParameters
 from offline.observations import read_detections, read_positions
 from offline.odometry import ChainOdometry, WheelTrack, compose_odometry
 from offline.readings import Readings, joined
-from offline.run import Detections, Positions, Run, TagKey
+from offline.run import Run
+from offline.run_tags import Detections, Positions, TagKey
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
 KEYFRAME_DISTANCE_M: Final = 0.02

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from calib import se2
 from calib.arrays import FloatArray, IntArray
 from offline.local_map import LocalMap
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

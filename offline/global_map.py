@@ -20,7 +20,7 @@ from offline.measured_map import with_measurements
 from offline.merge import Group
 from offline.parameter_results import CalibrationResult
 from offline.result import Component, RunResult, StartToStart, TagPose, TagResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution, solve
 from offline.stages import Stages
 

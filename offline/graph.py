@@ -20,7 +20,7 @@ from offline.factors import (
 )
 from offline.odometry import WHEEL_PARAMETERS
 from offline.readings import CAMERA_PARAMETERS
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Problem
 
 TAG_SCALE: Final = "tag_scale"

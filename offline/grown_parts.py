@@ -12,7 +12,7 @@ from calib.arrays import FloatArray
 from offline.chain import Chain
 from offline.graph import Parameter, build_graph
 from offline.odometry import chained
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import solve
 
 # Of all drives whose wheels are right, so many are taken for broken.

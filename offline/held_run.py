@@ -21,7 +21,7 @@ from offline.graph import Graph, build_graph, unheld
 from offline.joint_fit import UNMODELLED_SIGMA_M
 from offline.known_map import KnownMap
 from offline.local_map import LocalMap
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution, solve
 from offline.suspects import renamed
 from offline.suspects_search import FALSE_ALARM

@@ -15,7 +15,8 @@ from calib.words import counted
 from offline.errors import OfflineError
 from onboard.allowance import Allowance
 from onboard.log_losses import LogLosses
-from onboard.log_reader import LogMessage, read_log
+from onboard.log_reader import read_log
+from onboard.message_decoder import LogMessage
 from onboard.messages import (
     TOPICS,
     Event,

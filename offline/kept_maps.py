@@ -28,7 +28,8 @@ from offline.observations import SAME_SIZE_M
 from offline.odometry import ChainOdometry
 from offline.readings import Readings
 from offline.result import MapResult
-from offline.run import Detections, Positions, Run, TagKey
+from offline.run import Run
+from offline.run_tags import Detections, Positions, TagKey
 from offline.solver import solve
 
 

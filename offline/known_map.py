@@ -21,7 +21,7 @@ from offline.joint_fit import REACH_M
 from offline.kept import KeptCalibration, nominal_row
 from offline.measured_factors import NOTHING_MEASURED, KnownPlaces
 from offline.result import Component
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 # Far below what a tag's place is ever known to, and far above rounding.
 _LEAST_SIGMA_M: Final = 1e-6

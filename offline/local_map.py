@@ -22,7 +22,7 @@ from offline.effort import Effort
 from offline.goodness import Goodness, Windows, fitted_windows
 from offline.graph import Graph, Parameter, build_graph
 from offline.odometry import chained
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution, solve
 
 # A chain is built up in pieces over which dead reckoning stays in the right valley: what a wheel ratio 1 % off turns in

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.arrays import FloatArray, IntArray
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

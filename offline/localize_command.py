@@ -23,7 +23,8 @@ from offline.map_command import check_output, read_robot_files, say
 from offline.map_io import read_map
 from offline.pipeline import check_robots
 from offline.progress import progress_bar
-from offline.run import TagKey, load_run
+from offline.run import load_run
+from offline.run_tags import TagKey
 from offline.stages import Stages
 from offline.trajectory_file import write_tum
 from onboard.log_reader import find_logs

@@ -13,7 +13,7 @@ from offline.condensed import CondensedMap, condense
 from offline.known_map import KnownMap
 from offline.local_map import LocalMap
 from offline.merge import variance_factor
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

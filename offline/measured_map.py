@@ -14,7 +14,7 @@ from offline.fit_results import MeasurementResult
 from offline.graph import Graph
 from offline.measured import MeasuredDistance, MeasuredStart, Measurements
 from offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 
 # A measurement that belongs is said to contradict the map so rarely.

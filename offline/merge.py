@@ -18,7 +18,7 @@ from offline.condensed import CondensedMap, condense
 from offline.cycles import Contradiction, Link, consistent_links, spanning_tree
 from offline.local_map import LocalMap
 from offline.measured import Placement
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from offline.corner_graph import has_corners
 from offline.fit_results import AlignmentResult, RivalResult
 from offline.local_map import LocalMap
 from offline.merge import Group, Merge, PairAlignment
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.tag_joins import TagJoin
 
 _MOST_NAMED = 8

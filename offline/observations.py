@@ -18,7 +18,8 @@ from offline.errors import OfflineError
 from offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
 from offline.readings import CAMERA_PARAMETERS, Readings, no_readings
 from offline.rolling_shutter import read_at_once
-from offline.run import Detections, Positions, Run
+from offline.run import Run
+from offline.run_tags import Detections, Positions
 from offline.standing_corners import averaged
 from offline.tag_pose import TagReadings, general_readings, upright_readings
 

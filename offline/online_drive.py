@@ -15,7 +15,7 @@ from offline.graph import NO_PARAMETER, Parameter, mount_parameters_of, paramete
 from offline.kept_maps import measured_chain, run_without_log
 from offline.online_kernels import Motions, Sights
 from offline.readings import CAMERA_PARAMETERS
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 _NAME: Final = "the drive"
 _ROOM: Final = 1024

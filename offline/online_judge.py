@@ -7,7 +7,7 @@ from typing import Final
 from scipy.stats import chi2
 
 from offline.online_root import SLICE, Lifted, OnlineRoot
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.suspects_search import FALSE_ALARM
 
 CALLED: Final = 150_000  # what calling many small functions costs, in multiplications

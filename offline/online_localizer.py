@@ -34,7 +34,7 @@ from offline.online_smoother import Smoother
 from offline.online_start import SeenTags, StartSearch
 from offline.readings import CAMERA_PARAMETERS
 from offline.result import MapResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 _WARMING_CALLS: Final = 10  # two rounds
 _DOUBTFUL: Final = "tags that lie elsewhere than the map has them may as well be those that stayed; settle"

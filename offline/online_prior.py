@@ -14,7 +14,7 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from offline.factors import whitening
 from offline.known_map import KnownMap
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 _ROOM: Final = 64
 

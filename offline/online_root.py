@@ -21,7 +21,7 @@ from offline.online_drive import Drive
 from offline.online_kernels import BY_POINTS, Border, Motions, Sights, sweep
 from offline.online_prior import OnlinePrior, padded
 from offline.online_turn import Known, pose_among, relaxed, turned, twist_of
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import HUBER_THRESHOLD
 
 _DIAGONAL: Final = np.arange(3), np.arange(3)

@@ -13,7 +13,7 @@ from offline.known_map import KnownMap
 from offline.local_map import LocalMap, solve_local_map
 from offline.located import Located, locate
 from offline.online_smoother import Smoother
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 
 _COMPONENT: Final = 0  # there is one only

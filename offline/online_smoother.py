@@ -25,7 +25,7 @@ from offline.online_kernels import Sights
 from offline.online_prior import Numbers, OnlinePrior
 from offline.online_root import SLICE, OnlineRoot
 from offline.online_turn import pose_among
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.tag_fit import TAG_GATE
 
 _POSES_A_SLICE: Final = 256

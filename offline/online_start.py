@@ -18,7 +18,7 @@ from offline.alignment_search import Explanation, distances, is_same_distance, t
 from offline.condensed import quarter_turned
 from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold
 from offline.known_map import KnownMap
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.tag_fit import ill_fitting
 
 _STEPS: Final = 4

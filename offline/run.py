@@ -16,12 +16,14 @@ from offline.errors import OfflineError
 from offline.inputs import ALONE, Inputs, size_bytes
 from offline.odometry import WheelTrack
 from offline.plausible import check_file_name
-from offline.run_readings import Detections, Positions, RunReadings, TagKey
+from offline.run_readings import RunReadings
+from offline.run_tags import Detections, Positions, TagKey
 from offline.stretches import WheelRow, stretches_of
 from onboard.allowance import Allowance
 from onboard.log_head import camera_from_message
 from onboard.log_losses import LogLosses
-from onboard.log_reader import LogMessage, read_log
+from onboard.log_reader import read_log
+from onboard.message_decoder import LogMessage
 from onboard.messages import (
     CameraCalibration,
     Event,
@@ -32,8 +34,6 @@ from onboard.messages import (
     TagObservations,
     WheelEncoders,
 )
-
-__all__ = ["Detections", "Positions", "RobotFile", "Run", "RunEvent", "TagKey", "load_run", "read_robot_file"]
 
 
 class RunEvent(NamedTuple):

@@ -12,9 +12,10 @@ from offline.new_log import new_log
 from onboard.allowance import Allowance
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_losses import LogLosses
-from onboard.log_reader import LogMessage, files_of, read_head, read_log
+from onboard.log_reader import files_of, read_head, read_log
 from onboard.log_segments import finished_name, of_pictures
 from onboard.log_writer import LogWriter
+from onboard.message_decoder import LogMessage
 from onboard.messages import TOPICS, Event, EventKind, Severity
 
 

@@ -17,7 +17,7 @@ from offline.graph import Graph, build_graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured_factors import Measured
 from offline.merge import Merge
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution, solve
 from offline.suspects_evidence import Evidence, Heard, contradicted, gathered, heard, noise_scales, to_other_tags
 from offline.suspects_passings import few_of_each_tag

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.arrays import IntArray
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.suspects_evidence import Evidence
 from offline.suspects_places import Places
 from offline.suspects_sightings import Sightings

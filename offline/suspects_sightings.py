@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, IntArray
 from offline.chain import Chain
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 # Longer out of sight, by the way driven or by the clock, and it is another sighting.
 GAP_M: Final = 2.0

@@ -19,7 +19,7 @@ from offline.fronts import NotPositiveError
 from offline.joint_fit import UNMODELLED_SIGMA_M
 from offline.local_map import LocalMap
 from offline.merge import variance_factor
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.tag_join_fit import HungTags, TagFit, fitted, hung_tags, radial_sigmas
 
 # Then sigma is no more than 1.4 times what first order says of it; where a tag is seen squarely it may be anything.

@@ -22,7 +22,7 @@ from offline.measured import Measurements
 from offline.measured_factors import StartFactors
 from offline.measured_map import with_measurements
 from offline.merge import Group, Merge, size_rank
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import solve
 from offline.stages import Stages
 from offline.tag_join_verdict import Verdict, verdict

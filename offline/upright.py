@@ -15,7 +15,7 @@ from calib.arrays import FloatArray, IntArray
 from offline.corner_factors import SpatialColumns, SpatialState
 from offline.errors import OfflineError
 from offline.factors import Linearised
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 # A level tells a hundredth of a degree at best; what leans by ten is not upright.
 _FINEST_DEG: Final = 0.01

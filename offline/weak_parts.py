@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.arrays import IntArray
 from offline.graph import Graph
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 
 # Rounding that changes a covariance by a hundredth is a tenth of what the sigma of a good noise model is off.

@@ -18,8 +18,6 @@ from onboard.log_segments import PICTURE_TOPIC, of_pictures
 from onboard.message_decoder import LogMessage, MessageDecoder
 from onboard.messages import TOPICS, RunInfo
 
-__all__ = ["LogMessage", "files_of", "find_logs", "read_head", "read_log", "read_run_info"]
-
 _SMALLEST_RECORD_BYTES: Final = 4  # ours shrink to 14 bytes at best; a hostile file may hold millions in a few kB
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 

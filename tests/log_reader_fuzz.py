@@ -16,7 +16,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from onboard import chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes
 from onboard.errors import LogError
 from onboard.log_losses import LogLosses
-from onboard.log_reader import LogMessage, read_log
+from onboard.log_reader import read_log
+from onboard.message_decoder import LogMessage
 from onboard.messages import TOPICS
 from tests.made_logs import Entry, drive, head
 

@@ -13,7 +13,8 @@ from calib.arrays import FloatArray, IntArray
 from calib.camera_model import CameraModel
 from calib.robot import Robot
 from offline.odometry import WheelTrack, chained
-from offline.run import Detections, Positions, Run, TagKey
+from offline.run import Run
+from offline.run_tags import Detections, Positions, TagKey
 from onboard.log_head import log_head
 from onboard.log_writer import LogWriter
 from onboard.messages import TagDetection, TagDetections, WheelEncoders

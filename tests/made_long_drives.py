@@ -16,7 +16,7 @@ from offline.chain import Chain, chains_of
 from offline.factors import State
 from offline.graph import Graph
 from offline.odometry import WheelTrack
-from offline.run import Positions, TagKey
+from offline.run_tags import Positions, TagKey
 from tests.made_drives import FAMILY, START_NS, S, made_robot, made_run
 
 ROAD_M: Final = 25.0

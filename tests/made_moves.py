@@ -13,7 +13,7 @@ from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.chain import Chain
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from tests.made_drives import FAMILY, S
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 

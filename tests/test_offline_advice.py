@@ -16,7 +16,7 @@ from offline.factors import State
 from offline.graph import Graph, build_graph
 from offline.readings import joined
 from offline.report_words import advice_sentence
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 from tests.benchmarks.advice_study import Scene, made_scene, trial
 

@@ -15,7 +15,7 @@ from offline.alignment import Alignment, align, covariance_union, fit_transform
 from offline.alignment_rivals import MARGIN_NATS
 from offline.condensed import CondensedMap
 from offline.measured import Placement
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 ANY = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)
 NEAR_PI = [np.pi, -np.pi, np.pi - 1e-9, -np.pi + 1e-9, 0.0, np.pi / 2]

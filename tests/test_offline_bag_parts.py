@@ -23,7 +23,8 @@ from offline.bag_tags import Sighting, read_look
 from offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
 from offline.import_robot import ImportOptions
 from offline.imported_run import ImportReport
-from offline.run import Run, TagKey, load_run
+from offline.run import Run, load_run
+from offline.run_tags import TagKey
 from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
 from tests.made_drives import CAMERA as LENS
 from tests.made_drives import HALL, PINHOLE, made_drive, made_robot, write_drive

@@ -13,7 +13,7 @@ from offline.measured import TapeOptions
 from offline.parameter_results import CalibrationResult, CheckResult
 from offline.pipeline import build_map
 from offline.result import MapResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.stages import Stages
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
 

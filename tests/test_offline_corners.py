@@ -29,7 +29,8 @@ from offline.map_io import read_map, write_map
 from offline.map_model import MapModel
 from offline.pipeline import build_map, read_runs
 from offline.result import FloorSigmas, MapResult
-from offline.run import Detections, Run, load_run
+from offline.run import Run, load_run
+from offline.run_tags import Detections
 from offline.truth import read_truth
 from offline.workings import Workings
 from onboard.log_reader import find_logs

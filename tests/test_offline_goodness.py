@@ -15,7 +15,7 @@ from offline.effort import Effort
 from offline.goodness import Goodness, fitted_windows, in_windows
 from offline.graph import build_graph
 from offline.local_map import LocalMap, solve_local_map
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution, solve
 from tests.made_drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
 from tests.made_long_drives import made_long_drive, with_a_moved_tag

@@ -17,7 +17,8 @@ from calib.robot import parse_robot_yaml
 from offline.import_forms import WheelScale, read_odometry
 from offline.import_robot import ImportOptions
 from offline.importers import import_folder
-from onboard.log_reader import LogMessage, read_log
+from onboard.log_reader import read_log
+from onboard.message_decoder import LogMessage
 from tests.made_imports import (
     OBSERVATIONS,
     ODOMETRY,

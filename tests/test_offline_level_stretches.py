@@ -13,7 +13,8 @@ from fixtures.simulate import simulate
 from fixtures.world import load_world
 from offline.map_command import as_json, summary
 from offline.pipeline import build_map, read_runs
-from offline.run import Detections, Run, load_run
+from offline.run import Run, load_run
+from offline.run_tags import Detections
 from onboard.log_reader import find_logs
 from tests.made_drives import HALL, MadeTag, S, made_drive, made_robot, write_drive
 

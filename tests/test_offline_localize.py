@@ -14,7 +14,8 @@ from calib.arrays import FloatArray
 from offline.localizing import localize
 from offline.map_io import read_map, write_map
 from offline.result import Component, MapResult
-from offline.run import Run, TagKey
+from offline.run import Run
+from offline.run_tags import TagKey
 from tests.made_drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Run as Program
 

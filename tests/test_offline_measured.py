@@ -16,7 +16,7 @@ from offline.measured import (
     parse_start,
 )
 from offline.measured_factors import DistanceFactors, StartFactors
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 RUNS = ("a_one", "b_one", "c=d_one")
 TAGS = (TagKey("tag36h11", 7), TagKey("tag25h9", 7), TagKey("tag36h11", 8))

@@ -14,7 +14,8 @@ from offline.errors import OfflineError
 from offline.measured import TapeOptions
 from offline.pipeline import build_map
 from offline.result import MapResult
-from offline.run import Run, TagKey
+from offline.run import Run
+from offline.run_tags import TagKey
 from offline.stages import Stages
 from tests.made_drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Outcome

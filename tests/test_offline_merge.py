@@ -14,7 +14,7 @@ from offline.local_map import LocalMap, solve_local_map
 from offline.measured import Placement
 from offline.merge import Merge, merge
 from offline.merge_report import alignment_results, merge_warnings
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
 
 HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(12)}

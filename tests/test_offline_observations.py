@@ -14,7 +14,8 @@ from calib.robot import Robot
 from calib.tag_edges import moved_out
 from offline.observations import check_tag_sizes, read_detections, read_positions
 from offline.readings import Readings
-from offline.run import Detections, Positions, Run, TagKey
+from offline.run import Run
+from offline.run_tags import Detections, Positions, TagKey
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, seen_corners_px
 
 NOISE = NoiseParameters()

@@ -13,7 +13,7 @@ from offline.odometry import WheelTrack
 from offline.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
 from offline.pipeline import build_map
 from offline.result import MapResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from tests.benchmarks.breaks_study import broken_drive, outcome_of, summary
 from tests.made_breaks import made_clean_drive
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run

@@ -8,7 +8,7 @@ import pytest
 
 from offline.online_judge import TagJudge
 from offline.online_root import Lifted, OnlineRoot
-from offline.run import TagKey
+from offline.run_tags import TagKey
 
 TAGS = [TagKey("tag36h11", i) for i in range(6)]
 HELD = {i: TAGS[i] for i in range(4)}

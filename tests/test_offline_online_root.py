@@ -16,7 +16,7 @@ from offline.online_localizer import OnlineLocalizer
 from offline.online_prior import OnlinePrior
 from offline.online_root import OnlineRoot
 from offline.online_turn import Known, pose_among, turned
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import HUBER_THRESHOLD
 from tests.benchmarks.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one
 

@@ -13,7 +13,8 @@ from calib.camera_file import write_camera_yaml
 from calib.errors import GroundsbotError
 from calib.robot import write_robot_yaml
 from calib.tag_edges import outward
-from offline.run import RobotFile, TagKey, load_run, read_robot_file
+from offline.run import RobotFile, load_run, read_robot_file
+from offline.run_tags import TagKey
 from offline.stretches import wheel_distances
 from onboard.log_head import log_head
 from onboard.log_writer import LogWriter

@@ -13,7 +13,7 @@ from offline.factors import OdometryFactors, State
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import WheelTrack, chained
 from offline.robust import cauchy, losses_and_weights
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, START_NS, made_positions, made_robot, made_run

@@ -20,7 +20,8 @@ from offline.map_json import map_as_json
 from offline.merge import merge
 from offline.pipeline import build_map
 from offline.result import MapResult
-from offline.run import Run, TagKey
+from offline.run import Run
+from offline.run_tags import TagKey
 from offline.solver import PLAIN_SQUARES, solve
 from offline.stages import Stages
 from offline.suspects import Searched, split_together

@@ -11,7 +11,7 @@ from offline import suspects_passings
 from offline.chain import Chain, chains_of
 from offline.graph import Graph, build_graph
 from offline.local_map import LocalMap, solve_local_map
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.suspects import split_alone
 from offline.suspects_passings import few_of_each_tag
 from offline.suspects_sightings import sightings_of

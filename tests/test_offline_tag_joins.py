@@ -16,7 +16,8 @@ from offline.measured import TapeOptions
 from offline.pipeline import build_map
 from offline.report_tables import tables
 from offline.result import MapResult
-from offline.run import Detections, Run, load_run
+from offline.run import Run, load_run
+from offline.run_tags import Detections
 from tests.benchmarks.tag_join_study import study_seed
 from tests.made_drives import HALL, made_drive, made_robot, write_drive
 

@@ -8,7 +8,8 @@ from calib.noise import NoiseParameters
 from offline.chain import chains_of
 from offline.local_map import LocalMap, solve_local_map
 from offline.pipeline import build_map
-from offline.run import Detections, Run, TagKey
+from offline.run import Run
+from offline.run_tags import Detections, TagKey
 from offline.suspects import split_alone
 from offline.twins import told_apart
 from tests.made_drives import (

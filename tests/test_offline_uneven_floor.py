@@ -15,7 +15,7 @@ from offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
 from offline.observations import read_detections
 from offline.pipeline import build_map, read_runs
 from offline.rolling_shutter import read_at_once
-from offline.run import Detections, TagKey
+from offline.run_tags import Detections, TagKey
 from offline.tag_pose import TagReadings, upright_readings
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy import rough

@@ -22,7 +22,7 @@ from offline.importers import import_folder
 from offline.map_json import map_as_json
 from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import PLAIN_SQUARES, Problem, Solution, solve
 from offline.weak_parts import weak_parts
 from tests.benchmarks.plain_solver import plain_normal_equations

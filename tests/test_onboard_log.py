@@ -16,8 +16,9 @@ from calib.camera_model import CameraModel
 from calib.robot import Mount, parse_robot_yaml
 from onboard.errors import LogError, MessageRefusedError
 from onboard.log_head import camera_from_message, log_head, mount_message
-from onboard.log_reader import LogMessage, find_logs, read_log, read_run_info
+from onboard.log_reader import find_logs, read_log, read_run_info
 from onboard.log_writer import LogWriter
+from onboard.message_decoder import LogMessage
 from onboard.messages import (
     CameraCalibration,
     ClockAnchor,

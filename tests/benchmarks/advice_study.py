@@ -32,7 +32,7 @@ from offline.graph import Graph, build_graph
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
 from offline.readings import joined
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.solver import Solution
 from offline.stages import Stages
 from tests.benchmarks.command_line import say, seeds_of

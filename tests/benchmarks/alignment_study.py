@@ -29,7 +29,7 @@ from offline.alignment import Alignment, align
 from offline.alignment_rivals import GROUP_MARGIN
 from offline.condensed import CondensedMap, condense
 from offline.local_map import solve_local_map
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import Town, made_long_drive, made_town
 

@@ -19,7 +19,8 @@ from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.chain import Chain, chains_of
 from offline.result import Component, MapResult, RunResult, TagResult
-from offline.run import Run, TagKey
+from offline.run import Run
+from offline.run_tags import TagKey
 
 # The paper's solver: odometry's x, y, then heading; a tag reading's x and y.
 ODOMETRY_VARIANCE: Final = (2.5e-5, 2.5e-5, 2.5e-6)

@@ -24,7 +24,7 @@ from offline.global_map import solve_global_map
 from offline.local_map import LocalMap, solve_local_map
 from offline.merge import merge
 from offline.merge_report import merge_warnings
-from offline.run import TagKey
+from offline.run_tags import TagKey
 from offline.stages import Stages
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town

@@ -23,7 +23,8 @@ from calib.arrays import FloatArray
 from fixtures.simulate import TRUTH_FILE, simulate
 from offline.pipeline import build_map
 from offline.result import MapResult
-from offline.run import Detections, Run, load_run
+from offline.run import Run, load_run
+from offline.run_tags import Detections
 from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
 from tests.benchmarks.command_line import seeds_of
