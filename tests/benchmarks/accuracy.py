@@ -35,7 +35,7 @@ from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.baselines import dead_reckoning, paper_scheme
-from tests.benchmarks.command_line import say, seeds_of
+from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.benchmarks.cramer_rao import Bound
 from tests.benchmarks.cramer_rao_world import bound_of
 from tests.benchmarks.from_truth import most_likely_from_truth
@@ -260,10 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for each in tallies:
         row = each.row()
         say(_line(each.world, each.method, row["seeds"], list(row.values())[3:]))
-    missed = [sentence for each in tallies for sentence in each.missed()] + missed_in_pairs(tallies)
-    for sentence in missed:
-        say(f"missed: {sentence}")
-    return 1 if missed else 0
+    return exit_code([sentence for each in tallies for sentence in each.missed()] + missed_in_pairs(tallies))
 
 
 _COLUMNS: Final = ("start m", "tags m", "path m", "bound: start", "tags", "NEES: tags", "start")

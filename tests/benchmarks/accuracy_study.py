@@ -25,7 +25,7 @@ from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
 from offline.truth import Truth, read_truth
 from onboard.log_reader import find_logs
-from tests.benchmarks.command_line import say, seeds_of
+from tests.benchmarks.command_line import exit_code, say, seeds_of
 
 # Medians over seeds. With the calibration drawn the paper's own figure is 1.8 %.
 START_PERCENT_DRAWN = 1.0
@@ -142,10 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     how = {"exact_calibration": given.exact_calibration, "render": given.render}
     found = run_study(given.world, given.seeds, **how, jobs=given.jobs)
     say("medians: " + ", ".join(f"{name} {value:.4g}" for name, value in medians(found).items()))
-    missed = missed_bounds(found, **how)
-    for sentence in missed:
-        say(f"missed: {sentence}")
-    return 1 if missed else 0
+    return exit_code(missed_bounds(found, **how))
 
 
 def _known(value: float | None) -> float:

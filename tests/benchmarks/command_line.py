@@ -1,6 +1,7 @@
 """What studies and benches share: seeds from the command line, and lines to whoever waits."""
 
 import sys
+from collections.abc import Sequence
 
 
 def seeds_of(text: str) -> range:
@@ -17,3 +18,10 @@ def say(text: str) -> None:
     """To standard output, at once."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
+
+
+def exit_code(missed: Sequence[str]) -> int:
+    """Says each promise that was missed; 1 where there is any."""
+    for sentence in missed:
+        say(f"missed: {sentence}")
+    return 1 if missed else 0

@@ -23,7 +23,7 @@ from offline.goodness import fitted_windows
 from offline.graph import build_graph
 from offline.local_map import solve_local_map
 from offline.solver import Solution, solve
-from tests.benchmarks.command_line import say, seeds_of
+from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import made_long_drive
 
 COST_TOLERANCE: Final = 1e-6  # relative
@@ -153,10 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(_row(each))
     for line in summary(found):
         say(line)
-    missed = missed_bounds(found)
-    for sentence in missed:
-        say(f"missed: {sentence}")
-    return 1 if missed else 0
+    return exit_code(missed_bounds(found))
 
 
 def _row(each: Figures) -> str:

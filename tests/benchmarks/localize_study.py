@@ -46,7 +46,7 @@ from offline.online_drive import TagReading
 from offline.online_localizer import OnlineLocalizer
 from offline.result import Component, MapResult
 from offline.stages import Stages
-from tests.benchmarks.command_line import say, seeds_of
+from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 
 NEES: Final = (0.85, 1.15)
@@ -321,10 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = study(given.seeds)
     if given.output is not None:
         given.output.write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows), encoding="utf-8")
-    sentences = missed(rows)
-    for sentence in sentences:
-        say(f"missed: {sentence}")
-    return 1 if sentences else 0
+    return exit_code(missed(rows))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from offline.stages import Stages
 from offline.suspects import Searched, split_alone, split_together, with_outliers_apart
 from offline.suspects_places import gain_of, settled
 from offline.suspects_report import suspect_tags
-from tests.benchmarks.command_line import say
+from tests.benchmarks.command_line import exit_code, say
 from tests.benchmarks.suspects_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
 from tests.made_moves import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, made_scene, without
 
@@ -269,10 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for (kind, _), counts in table.items():
         by_kind.setdefault(kind, []).extend(counts.told)
     draw_curve(by_kind, given.output / "suspects_detection.png")
-    missed = missed_bounds(table)
-    for sentence in missed:
-        say(f"missed: {sentence}")
-    return 1 if missed else 0
+    return exit_code(missed_bounds(table))
 
 
 if __name__ == "__main__":
