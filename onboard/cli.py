@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from onboard.messages import Event
 
 PRIORITY = -10  # the recorder's among the processes of its computer, as `nice` counts
+KEPT_BYTES = 16 << 20  # free memory that stays with the recorder: several chunks of pictures on their way to the disk
 
 app = new_app("Record a drive of a robot: wheels, camera and the tags it sees, on one clock.")
 
@@ -43,6 +44,7 @@ def record(
     from onboard.ending import told_to_end
     from onboard.housekeeping import Housekeeper
     from onboard.live_recorder import LiveRecorder
+    from onboard.process_memory import keep_memory
     from onboard.robot_files import RobotFiles
     from onboard.status import STATUS_SUFFIX
     from onboard.systemd import Notifier
@@ -60,6 +62,7 @@ def record(
     with ConsoleLines(sys.stdout) as console:
         recorder = LiveRecorder(files, output, stop, tell_event, console.say)
         keeper = Housekeeper(recorder, path, Notifier(), console.say)
+        keep_memory(KEPT_BYTES)
         keeper.start()
         try:
             recorder.run()

@@ -25,14 +25,15 @@ _ROUNDS: Final = 6
 _ARRIVED_PX: Final = 2e-3
 _LONGEST_STEP: Final = 0.5  # px, and of the blur's logarithm
 # What is summed over pixels: the derivatives by the distance at the side's begin, at its end and by the blur's
-# logarithm, each over -h; those by a and by h; and the light.
+# logarithm, each over a factor that a side's pixels have in common; those by a and by h; and the light.
 _BEGIN, _END, _BLUR, _ONE, _EDGE, _LIGHT = range(6)
 _N: Final = 5  # unknowns
 # Of a tag's corners, the one that follows each, and the two opposite the side that begins there.
 _NEXT: Final = (1, 2, 3, 0)
+_BEFORE: Final = (3, 0, 1, 2)
 _OPPOSITE: Final = ((2, 3), (3, 0), (0, 1), (1, 2))
 _FIRST_BLUR_PX: Final = 0.7
-_BLUR_PX: Final = (0.2, 3.0)
+_LOG_BLUR: Final = (np.log(0.2), np.log(3.0))  # of px
 _CLEAR_PX: Final = 0.3  # before a cell is over and the next one's light comes in
 _LEAST_BAND_PX: Final = 1.2
 _CLEAR_OF_CORNER_PX: Final = 2.0
@@ -41,6 +42,9 @@ _LEAST_CONTRAST: Final = 10.0  # grey levels: twice h
 # Residuals' RMS over the contrast, 0.02 for an edge under a sensor's noise: beyond, something else is there too.
 _ROUGHEST: Final = 0.1
 _LEAST_PIXELS: Final = 25  # five for each parameter
+# How far from its side an array's place is taken for that holds no pixel: there the blur's slope is 0, and erf 1.
+_NOWHERE_PX: Final = 1e3
+_NOT_FOUND_PX: Final = 1e9  # where sides do not meet
 
 
 def refined_corners(
@@ -72,7 +76,8 @@ def _sagitta(corners_px: FloatArray, across: FloatArray, camera: CameraModel) ->
     flat = rays / rays[..., 2:]
     middle = camera.project(0.5 * (flat + flat[:, _NEXT])).reshape(-1, 2)
     chord = 0.5 * (corners_px + corners_px[:, _NEXT]).reshape(-1, 2)
-    return np.asarray(np.nan_to_num(((middle - chord) * across).sum(axis=-1)), dtype=np.float64)
+    bend = ((middle - chord) * across).sum(axis=-1)
+    return np.where(np.isfinite(bend), bend, 0.0)
 
 
 class _Sides:
@@ -83,19 +88,26 @@ class _Sides:
     ) -> None:
         self._begin = corners_px.reshape(-1, 2)
         self._along = corners_px[:, _NEXT].reshape(-1, 2) - self._begin
-        self._length = np.maximum(np.linalg.norm(self._along, axis=-1), 1e-9)
+        self._length = np.maximum(np.hypot(self._along[:, 0], self._along[:, 1]), 1e-9)
         self._across = self._along[:, ::-1] * (-1.0, 1.0) / self._length[:, None]  # turned from x towards y
         self._sagitta = np.zeros(len(self._begin)) if camera is None else _sagitta(corners_px, self._across, camera)
         band_px = np.clip(self._depth(corners_px) / np.repeat(cells, 4) - _CLEAR_PX, _LEAST_BAND_PX, _ACROSS)
-        light, share, distance, seen = self._pixels(grey, band_px)
-        count = seen.sum(axis=1)
-        taken = np.arange(count.max()) < count[:, None]
-        self._share, self._distance = np.zeros(taken.shape), np.zeros(taken.shape)
-        self._share[taken], self._distance[taken] = share[seen], distance[seen]
-        self._seen = taken.astype(np.float64)
+        self._take(grey, *self._pixels(grey, band_px))
+
+    def _take(
+        self, grey: NDArray[np.uint8], index: IntArray, share: FloatArray, distance: FloatArray, seen: BoolArray
+    ) -> None:
+        """Keeps of what `_pixels` gives the pixels that are seen: (S, P), a side's first, then places without one."""
+        self._count = seen.sum(axis=1)
+        taken = np.arange(self._count.max()) < self._count[:, None]
+        pixels = np.flatnonzero(seen)
+        self._share, self._distance = np.zeros(taken.shape), np.full(taken.shape, _NOWHERE_PX)
+        self._share[taken], self._distance[taken] = share.take(pixels), distance.take(pixels)
         self._rows = np.zeros((len(taken), _N + 1, taken.shape[1]))
-        self._rows[:, _ONE] = self._seen
-        self._rows[:, _LIGHT][taken] = light - 128.0  # about as much above as below: sums lose fewer digits
+        self._rows[:, _ONE] = taken
+        # About as much light above 0 as below: sums lose fewer digits.
+        self._rows[:, _LIGHT][taken] = grey.take(index.take(pixels)) - 128.0
+        self._n_nowhere = taken.shape[1] - self._count
 
     def _depth(self, corners_px: FloatArray) -> FloatArray:
         """(S,) how far the tag reaches across each side, to the nearer of the two corners opposite."""
@@ -105,7 +117,7 @@ class _Sides:
 
     def _pixels(
         self, grey: NDArray[np.uint8], band_px: FloatArray
-    ) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, BoolArray]:
+    ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
         """Whole pixels about the sides, each once: Q for each side, some of them seen, (S, Q).
 
         A side that runs along the rows rather than the columns has pixels of as many columns, in each of them those
@@ -117,8 +129,8 @@ class _Sides:
             band_px: (S,) how far from the side a pixel may lie.
 
         Returns:
-            Light (of the seen ones, side by side), share of the side's length (S, Q), distance from the side (S, Q),
-            and whether they are seen: near, not at its ends, and in the picture (S, Q).
+            (S, Q) each: where in the picture, row after row; share of the side's length; distance from the side; and
+            whether they are seen: near, not at its ends, and in the picture.
         """
         along_rows = np.abs(self._along[:, :1]) > np.abs(self._along[:, 1:])
         begin, along, across = (
@@ -135,67 +147,66 @@ class _Sides:
         # Along rows or columns it is farther to the band's edges than across a side at a slant.
         slant = np.abs(along[:, 0]) / self._length
         reach = int(np.ceil(band_px.max() / slant.min()))
-        offsets = np.arange(-reach, reach + 1)  # (O,)
+        offsets = np.arange(-reach, reach + 1.0)  # (O,)
         first = (line >= 0) & (line < size[:, :1])
         first[:, 1:] &= np.diff(line, axis=1) != 0
-        inside = (offsets >= -middle[..., None]) & (offsets < (size[:, 1:] - middle)[..., None]) & first[..., None]
-        index = (line * stride[:, :1] + middle * stride[:, 1:]).astype(np.int64)[..., None]
-        index = index + offsets * stride[:, 1:, None]
+        seen = (offsets >= -middle[..., None]) & (offsets < (size[:, 1:] - middle)[..., None]) & first[..., None]
+        index = line * stride[:, :1] + middle * stride[:, 1:]
+
+        def summed(over_line: FloatArray, by_offset: FloatArray) -> FloatArray:
+            """(S, Q) of (S, A) and (S,): what grows evenly with the pixels' offsets from the line."""
+            return (over_line[..., None] + (by_offset[:, None] * offsets)[:, None]).reshape(len(line), -1)
+
         off = line - begin[:, :1], middle - begin[:, 1:]
-        by_along, distance = (
-            ((off[0] * by[:, :1] + off[1] * by[:, 1:])[..., None] + offsets * by[:, 1:, None]).reshape(len(line), -1)
-            for by in (along, across)
-        )
-        share = by_along / self._length[:, None] ** 2
-        distance -= (4.0 * self._sagitta)[:, None] * share * (1.0 - share)
+        along /= self._length[:, None] ** 2
+        share = summed(off[0] * along[:, :1] + off[1] * along[:, 1:], along[:, 1])
+        distance = summed(off[0] * across[:, :1] + off[1] * across[:, 1:], across[:, 1])
+        distance -= (4.0 * self._sagitta)[:, None] * (share - share**2)
         clear = np.minimum(_CLEAR_OF_CORNER_PX / self._length, 0.25)[:, None]
-        near = (np.abs(distance) < band_px[:, None]) & (np.abs(share - 0.5) < 0.5 - clear)
-        seen = inside.reshape(near.shape) & near
-        return grey.reshape(-1)[index.reshape(near.shape)[seen]], share, distance, seen
+        seen = seen.reshape(distance.shape)
+        seen &= (np.abs(distance) < band_px[:, None]) & (clear < share) & (share < 1.0 - clear)
+        return summed(index, stride[:, 1]).astype(np.int64), share, distance, seen
 
     def fitted(self) -> tuple[FloatArray, BoolArray]:
         """(S, 2) how far each side lies from the detector's at both ends; (T,) of which tags all four look right."""
         p = np.zeros((len(self._begin), 3))  # distance at the side's begin, at its end, logarithm of s
         p[:, 2] = np.log(_FIRST_BLUR_PX)
-        for _ in range(_ROUNDS):
-            sums = self._sums(p)
-            step = _step(sums, *_levels(sums))
+        rounds = 0
+        while True:
+            rounds += 1
+            rate = np.exp(-p[:, 2]) / np.sqrt(2.0)  # of the model's change with the distance: 1 / (sqrt(2) s)
+            fit = _Fit(self._sums(p, rate), rate)
+            step = fit.step()
             p[:, :2] -= step[:, :2]
-            p[:, 2] = np.clip(p[:, 2] - step[:, 2], *np.log(_BLUR_PX))
-            if np.abs(step[:, :2]).max() < _ARRIVED_PX:
+            p[:, 2] = np.maximum(np.minimum(p[:, 2] - step[:, 2], _LOG_BLUR[1]), _LOG_BLUR[0])
+            if rounds == _ROUNDS or np.abs(step[:, :2]).max() < _ARRIVED_PX:
                 break
-        return p[:, :2], np.asarray(self._looks_right(p).reshape(-1, 4).all(axis=1))
+        return p[:, :2], np.asarray(self._looks_right(p, fit).reshape(-1, 4).all(axis=1))
 
-    def _sums(self, p: FloatArray) -> FloatArray:
+    def _sums(self, p: FloatArray, rate: FloatArray) -> FloatArray:
         """(S, 6, 6) sums over the pixels of the products of each two of _BEGIN, ..., _LIGHT."""
-        rate = np.exp(-p[:, 2, None]) / np.sqrt(2.0)
-        off = self._distance - p[:, :1]
-        off -= (p[:, 1:2] - p[:, :1]) * self._share
-        scaled = off * rate
+        scaled = self._distance * rate[:, None]
+        scaled -= self._share * ((p[:, 1] - p[:, 0]) * rate)[:, None]
+        scaled -= (p[:, 0] * rate)[:, None]
         rows = self._rows
-        np.multiply(self._seen, erf(scaled), out=rows[:, _EDGE])
-        scaled *= -scaled
-        slope = np.exp(scaled, out=scaled)
-        slope *= self._seen
-        slope *= (2.0 / np.sqrt(np.pi)) * rate
+        erf(scaled, out=rows[:, _EDGE])
+        slope = scaled * scaled
+        np.exp(np.negative(slope, out=slope), out=slope)
         np.multiply(slope, self._share, out=rows[:, _END])
         np.subtract(slope, rows[:, _END], out=rows[:, _BEGIN])
-        np.multiply(slope, off, out=rows[:, _BLUR])
-        return np.asarray(rows @ rows.swapaxes(-1, -2))
+        np.multiply(slope, scaled, out=rows[:, _BLUR])
+        sums = rows @ rows.swapaxes(-1, -2)
+        sums[:, _EDGE, _EDGE] -= self._n_nowhere
+        return np.asarray(sums)
 
-    def _looks_right(self, p: FloatArray) -> BoolArray:
-        sums = self._sums(p)
-        n = sums[:, _ONE, _ONE]
-        a, h = _levels(sums)
-        model = np.zeros((len(p), _N + 1))
-        model[:, _ONE], model[:, _EDGE], model[:, _LIGHT] = a, h, -1.0
-        square = np.einsum("si,sij,sj->s", model, sums, model)
-        rms = np.sqrt(np.maximum(square, 0.0) / np.maximum(n, 1.0))
-        contrast = 2.0 * np.abs(h)
-        one_way = np.repeat(np.abs(np.sign(h).reshape(-1, 4).sum(axis=1)) == 4.0, 4)
-        good = (n >= _LEAST_PIXELS) & (contrast > _LEAST_CONTRAST) & (rms < _ROUGHEST * contrast) & one_way
+    def _looks_right(self, p: FloatArray, fit: "_Fit") -> BoolArray:
+        """(S,) whether a side is one: `fit` is that of the last round, from which p is a step away."""
+        rms = np.sqrt(np.maximum(fit.square, 0.0) / np.maximum(self._count, 1.0))
+        contrast = 2.0 * np.abs(fit.h)
+        one_way = np.repeat(np.abs(np.sign(fit.h).reshape(-1, 4).sum(axis=1)) == 4.0, 4)
+        good = (self._count >= _LEAST_PIXELS) & (contrast > _LEAST_CONTRAST) & (rms < _ROUGHEST * contrast) & one_way
         # A blur at its limit is one that light and blur trade places in: too few pixels tell them apart.
-        good &= p[:, 2] < np.log(_BLUR_PX[1]) - 1e-6
+        good &= p[:, 2] < _LOG_BLUR[1] - 1e-6
         return np.asarray(good & (np.abs(p[:, :2]).max(axis=1) < _FARTHEST_PX))
 
     def corners(self, moved: FloatArray) -> FloatArray:
@@ -204,33 +215,42 @@ class _Sides:
         bend = 4.0 * self._sagitta[:, None] * self._across
         begin, end = self._begin + moved[:, :1] * self._across, self._begin + self._along + moved[:, 1:] * self._across
         leaves, arrives = self._along + slope + bend, self._along + slope - bend
-        before = np.roll(np.arange(len(begin)).reshape(-1, 4), 1, axis=1).ravel()
-        gap = end[before] - begin
-        cross = leaves[:, 0] * arrives[before, 1] - leaves[:, 1] * arrives[before, 0]
+        end, arrives = (each.reshape(-1, 4, 2)[:, _BEFORE].reshape(-1, 2) for each in (end, arrives))
+        gap = end - begin
+        cross = leaves[:, 0] * arrives[:, 1] - leaves[:, 1] * arrives[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = (gap[:, 0] * arrives[before, 1] - gap[:, 1] * arrives[before, 0]) / cross
-        return np.asarray(np.nan_to_num(begin + share[:, None] * leaves, nan=1e9).reshape(-1, 4, 2))
+            share = (gap[:, 0] * arrives[:, 1] - gap[:, 1] * arrives[:, 0]) / cross
+            found = begin + share[:, None] * leaves
+        return np.where(np.isfinite(found), found, _NOT_FOUND_PX).reshape(-1, 4, 2)
 
 
-def _levels(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(S,) a and h, by linear least squares; a without what `_LIGHT` leaves out."""
-    n = np.maximum(sums[:, _ONE, _ONE], 1.0)
-    mean_edge, mean_light = sums[:, _ONE, _EDGE] / n, sums[:, _ONE, _LIGHT] / n
-    spread = sums[:, _EDGE, _EDGE] - n * mean_edge**2
-    h = (sums[:, _EDGE, _LIGHT] - n * mean_edge * mean_light) / np.maximum(spread, 1e-9)
-    return mean_light - h * mean_edge, h
+class _Fit:
+    """How well the model fits S sides for the sums over their pixels, and where it would fit better.
 
-
-def _step(sums: FloatArray, a: FloatArray, h: FloatArray) -> FloatArray:
-    """(S, 3) of Gauss-Newton in the distances at both ends and the blur's logarithm; a and h go along in it.
-
-    The five derivatives of a + h erf(...) are rows of `sums` times one factor each, and the residual is a sum of three.
+    Attributes:
+        h: (S,) half the contrast, by linear least squares.
+        square: (S,) sum of the squared residuals.
     """
-    factor = np.ones((len(sums), _N))
-    factor[:, [_BEGIN, _END, _BLUR]] = -h[:, None]
-    residual = a[:, None] * sums[:, :_N, _ONE] + h[:, None] * sums[:, :_N, _EDGE] - sums[:, :_N, _LIGHT]
-    normal = factor[:, :, None] * sums[:, :_N, :_N] * factor[:, None]
-    diagonal = np.einsum("sii->si", normal)
-    diagonal += 1e-3 * diagonal + 1e-6
-    step = np.linalg.solve(normal, (factor * residual)[..., None])[..., 0]
-    return np.asarray(np.clip(step[:, [_BEGIN, _END, _BLUR]], -_LONGEST_STEP, _LONGEST_STEP))
+
+    def __init__(self, sums: FloatArray, rate: FloatArray) -> None:
+        """Takes what `_Sides` sums, and (S,) 1 / (sqrt(2) s)."""
+        n = np.maximum(sums[:, _ONE, _ONE], 1.0)
+        mean_edge, mean_light = sums[:, _ONE, _EDGE] / n, sums[:, _ONE, _LIGHT] / n
+        spread = sums[:, _EDGE, _EDGE] - n * mean_edge**2
+        self.h = (sums[:, _EDGE, _LIGHT] - n * mean_edge * mean_light) / np.maximum(spread, 1e-9)
+        residual = np.zeros((len(sums), _N + 1))  # as a sum of rows
+        residual[:, _ONE], residual[:, _EDGE], residual[:, _LIGHT] = mean_light - self.h * mean_edge, self.h, -1.0
+        self._sums, self._rate = sums, rate
+        self._products = (sums @ residual[..., None])[..., 0]  # of the residual with each row
+        self.square = (self._products * residual).sum(axis=-1)
+
+    def step(self) -> FloatArray:
+        """(S, 3) of Gauss-Newton in the distances at both ends and the blur's logarithm; a and h go along in it."""
+        factor = np.ones((len(self._sums), _N))  # by which a row is the derivative
+        factor[:, _BLUR] = (-2.0 / np.sqrt(np.pi)) * self.h
+        factor[:, _BEGIN] = factor[:, _END] = factor[:, _BLUR] * self._rate
+        normal = factor[:, :, None] * self._sums[:, :_N, :_N] * factor[:, None]
+        diagonal = np.einsum("sii->si", normal)
+        diagonal += 1e-3 * diagonal + 1e-6
+        step = np.linalg.solve(normal, (factor * self._products[:, :_N])[..., None])[:, : _BLUR + 1, 0]
+        return np.asarray(np.maximum(np.minimum(step, _LONGEST_STEP), -_LONGEST_STEP))

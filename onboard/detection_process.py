@@ -22,6 +22,7 @@ from calib.picture_bytes import is_jpeg
 from onboard.ending import ENDING_SIGNALS
 from onboard.errors import OnboardError
 from onboard.picture import decode, decode_grey, encode_jpeg, to_grey
+from onboard.process_memory import keep_memory
 from onboard.tag_detector import Detection, TagDetector
 
 Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
@@ -30,9 +31,7 @@ _START_LIMIT_S: Final = 30.0
 _JOB_LIMIT_S: Final = 5.0
 _END_LIMIT_S: Final = 0.5
 _PR_SET_PDEATHSIG: Final = 1
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _KEPT_BYTES: Final = 64 << 20  # free memory that stays with the child: more than pictures of 1920x1080 px take
-_MAPPED_BYTES: Final = 32 << 20  # buffers from here on go back in any case; the most that glibc lets one ask for
 
 
 @dataclass(frozen=True)
@@ -255,7 +254,6 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, 0)  # the recorder goes first, also where it is allowed to be in a hurry
     # A detection that hangs would not notice that its parent was killed.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-    _keep_memory()
     import cv2
 
     cv2.setNumThreads(1)
@@ -264,6 +262,7 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
     except OnboardError as error:
         connection.send(str(error))
         return
+    keep_memory(_KEPT_BYTES)
     connection.send((detector.library, detector.settings))
     while True:
         try:
@@ -271,14 +270,6 @@ def _child(connection: Connection, settings: DetectorSettings) -> None:
             connection.send((number, _detect(detector, picture, want_jpeg, settings.jpeg_quality)))
         except (EOFError, OSError):
             return
-
-
-def _keep_memory() -> None:
-    """What one picture's detection gives back stays for the next: the kernel would clear a thousand pages for each."""
-    with suppress(AttributeError):  # a C library without it
-        libc = ctypes.CDLL(None)
-        libc.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES)
-        libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 def _detect(detector: TagDetector, picture: Picture, want_jpeg: bool, quality: int) -> DetectionResult:

@@ -21,9 +21,10 @@ _READ_S: Final = 0.05
 _RETRY_S: Final = 0.5
 _QUIET_S: Final = 0.1  # a device that has been silent so long at the end has given everything
 _DRAIN_NS: Final = 300_000_000  # and one that never is silent has given all that it held
-# Lines that come meanwhile are read at once: their own times tell when they were measured. No whole number of ms: in
-# step with the lines, the reader would find each at the same age, and never one that has just come.
-_BREATH_S: Final = 0.0037
+# Lines that come meanwhile are read at once: their own times tell when they were measured, and waking a thread costs as
+# much as two lines. No whole number of ms: in step with the lines, the reader would find each at the same age, and
+# never one that has just come.
+_BREATH_S: Final = 0.0073
 
 Act = Callable[[int], None]  # takes the time at which it was handed over
 Put = Callable[[Act], None]

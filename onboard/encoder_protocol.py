@@ -131,7 +131,7 @@ def parse_line(piece: bytes) -> WheelLine | None:
     match = _LINE.fullmatch(piece, max(start, 0))
     if match is None or crc16(match[1]) != int(match[8], 16):
         return None
-    boot_id, sequence, t_us, left, right, flags = (int(match[index]) for index in range(2, 8))
+    boot_id, sequence, t_us, left, right, flags = map(int, match.group(2, 3, 4, 5, 6, 7))
     unsigned_fit = boot_id < _U32 and sequence < _U32 and t_us < _U32 and flags < _U16
     if not (unsigned_fit and -_I32 <= left < _I32 and -_I32 <= right < _I32):
         return None

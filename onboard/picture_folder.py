@@ -13,7 +13,7 @@ from onboard.messages import StampSource
 
 _NS_PER_S: Final = 1_000_000_000
 _PICTURE_NAME: Final = re.compile(r"(\d{1,19})\.(?:png|jpe?g)", re.IGNORECASE)
-_POLL_S: Final = 0.01
+_POLL_S: Final = 0.02
 _REST: Final = 5.0
 _SETTLE_NS: Final = 50_000_000
 _UNFINISHED_LIMIT_NS: Final = _NS_PER_S

@@ -1,7 +1,9 @@
 """Detections wait for the wheel reading after their picture, so that they can name the one before it."""
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from onboard.messages import TagDetections
@@ -25,7 +27,7 @@ class WaitingDetections:
         """`wheels`: whether there are any to wait for."""
         self._wait_ns = _WAIT_FOR_WHEELS_NS if wheels else 0
         self._waiting: deque[ReadyDetections] = deque()
-        self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence)
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence), in order
 
     @property
     def newest_wheels_ns(self) -> int | None:
@@ -59,7 +61,7 @@ class WaitingDetections:
             yield self._waiting.popleft()
 
     def _name_wheels(self, message: TagDetections) -> None:
-        before = next((sequence for at_ns, sequence in reversed(self._recent) if at_ns <= message.stamp_ns), None)
-        if before is not None:
+        n_before = bisect_right(self._recent, message.stamp_ns, key=itemgetter(0))
+        if n_before:
             message.has_wheel_sequence = True
-            message.wheel_sequence = before
+            message.wheel_sequence = self._recent[n_before - 1][1]
