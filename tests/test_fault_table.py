@@ -4,14 +4,29 @@ import ast
 import re
 from pathlib import Path
 
+from tests.benchmarks.fault_mutations import verdict
 from tests.benchmarks.fault_table import PAGE, ROOT, row_of, rows_of, with_proofs, with_results
-from tests.protections import PROTECTIONS
+from tests.protections import PROTECTIONS, Protection
 
 TABLE = """
 | row | fault | what must happen | test | result | taken out |
 |---|---|---|---|---|---|
 | 1b | power cut | nothing wrong | old | old | a sync: fails |
 | 7 | footer gone | every message | | | |
+"""
+
+# A program whose row 7 has a test that needs its limit, one that does not, and one that is red anyway.
+MADE = """
+from pathlib import Path
+from program import LIMIT
+def test_row_07_bounded():
+    Path("ran").open("a").write("bounded ")
+    assert LIMIT == 3
+def test_row_07_careless():
+    Path("ran").open("a").write("careless ")
+def test_row_07_red_anyway():
+    Path("ran").open("a").write("red ")
+    assert LIMIT == 4
 """
 
 
@@ -45,3 +60,18 @@ def test_each_row_has_a_protection_that_can_be_taken_out() -> None:
     for each in PROTECTIONS:
         source = (ROOT / each.file).read_text(encoding="utf-8")
         ast.parse(each.taken_out_of(source))
+
+
+def test_what_fails_without_mutation_proves_nothing_and_each_test_is_first_run_once(tmp_path: Path) -> None:
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_made.py").write_text(MADE)
+    (tmp_path / "program.py").write_text("LIMIT = 3\n")
+    green: dict[tuple[str, str], bool] = {}
+    found = [
+        verdict(Protection("7", "a limit", "program.py", "3", new, test), tmp_path, green)
+        for test, new in (("bounded", "4"), ("bounded", "5"), ("careless", "4"), ("red", "4"), ("absent", "4"))
+    ]
+    red = "RED WITHOUT MUTATION"  # one that could not be run, too
+    assert found == ["fails", "fails", "STILL PASSES", red, red]
+    assert (tmp_path / "ran").read_text().split() == ["bounded"] * 3 + ["careless"] * 2 + ["red"]
+    assert (tmp_path / "program.py").read_text() == "LIMIT = 3\n"
