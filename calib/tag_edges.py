@@ -6,9 +6,15 @@ overexposed sensors: white spreads into the black border, and each side is seen 
 the tag's size in the picture. A corner lies where its two sides meet.
 """
 
+from typing import Final
+
 import numpy as np
 
 from calib.arrays import FloatArray
+
+_NEXT: Final = np.array([1, 2, 3, 0])
+_LAST: Final = np.array([3, 0, 1, 2])
+_TURNED: Final = np.array([1.0, -1.0])  # (x, y) to (y, -x)
 
 
 def outward(corners_px: FloatArray) -> FloatArray:
@@ -22,9 +28,9 @@ def outward(corners_px: FloatArray) -> FloatArray:
             them coincide the result is no number.
     """
     with np.errstate(all="ignore"):
-        side = np.roll(corners_px, -1, axis=-2) - corners_px  # to the next corner
-        normal = np.stack([side[..., 1], -side[..., 0]], axis=-1) / np.linalg.norm(side, axis=-1, keepdims=True)
-        before = np.roll(normal, 1, axis=-2)
+        side = corners_px[..., _NEXT, :] - corners_px
+        normal = side[..., ::-1] * _TURNED / np.sqrt((side**2).sum(axis=-1, keepdims=True))
+        before = normal[..., _LAST, :]
         moved: FloatArray = (normal + before) / (1.0 + (normal * before).sum(axis=-1, keepdims=True))
     return moved
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import Odometry, wrapped
+from offline.linearise_kernels import Odometry, multiply, wrapped
 from offline.linearise_odometry import motion_at, wheel_correction
 
 
@@ -82,13 +82,13 @@ def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, 
     A[0, 0], A[0, 1], A[0, 2] = cos, sin, sin * x - cos * y
     A[1, 0], A[1, 1], A[1, 2] = -sin, cos, cos * x + sin * y
     A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, 1.0
-    _multiply(A, blocks[0], product)
+    multiply(A, blocks[0], product)
     for i in range(3):
         for j in range(3):
             blocks[0, i, j] = odometry.covariance[m, i, j]
             for k in range(3):
                 blocks[0, i, j] += product[i, k] * A[j, k]
-    _multiply(A, blocks[1], product)
+    multiply(A, blocks[1], product)
     for i in range(3):
         for j in range(3):
             blocks[1, i, j] = product[i, j] + odometry.jacobian[m, i, j]
@@ -96,13 +96,6 @@ def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, 
     motion[0], motion[1] = motion[0] + c * x - s * y, motion[1] + s * x + c * y
     motion[2] = wrapped(motion[2] + turn)
     motion[3], motion[4] = c * cos - s * sin, s * cos + c * sin
-
-
-@inner
-def _multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
 @jitted

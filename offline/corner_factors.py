@@ -19,7 +19,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
-from offline.corner_kernels import LookArrays, SpatialValues
+from offline.corner_look_kernels import LookArrays, SpatialValues
 from offline.factors import Columns, Linearised, State
 from offline.lens_kernels import lenses_of
 from offline.tag_pose import UNIT_CORNERS

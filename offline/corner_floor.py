@@ -44,7 +44,11 @@ def guessed_wobble(
         factor: of H there, if it is at hand.
         pictures: as they stand there, if they are at hand.
     """
-    if not _shows(problem, pictures or pictures_at(problem, state), factor or problem.factor(state)):
+    try:
+        shows = _shows(problem, pictures or pictures_at(problem, state), factor or problem.factor(state))
+    except NotPositiveError:  # something is not tied down, and how a floor lies is the least of it
+        return LEVEL
+    if not shows:
         return LEVEL
     guesses = [scale * _USUAL for scale in (1.0, _NEARER)]
     unlikely = [_unlikeliness(with_wobble(problem, sigma), state) for sigma in (LEVEL, *guesses)]
@@ -64,13 +68,11 @@ def _shows(problem: CornerProblem, pictures: Pictures, factor: FrontFactor) -> b
     kind, random = problem.order.kinds[LOOKS], np.random.default_rng(0)
     for of in (slice(0, 2), slice(2, 3)):
         whole = float(np.trace(own[:, of, of], axis1=1, axis2=2).sum())
-        taken = []
-        for _ in range(_PROBES):
+        probes = np.zeros((_PROBES, problem.columns.n))
+        for probe in probes:
             signs = random.choice([-1.0, 1.0], size=force[:, of].shape)
-            probe = np.zeros(problem.columns.n)
             add_vectors(kind, np.einsum("mk,mkc->mc", signs[picture], coupled[:, of]), probe)
-            taken.append(probe @ factor.solve(probe))
-        left = whole - float(np.mean(taken))
+        left = whole - float((factor.whitened(probes) ** 2).sum()) / _PROBES
         spread = float(np.sqrt(2.0 * (own[:, of, of] ** 2).sum())) * left / whole
         if (force[:, of] ** 2).sum() - left > _SHOWS * spread:
             return True

@@ -11,6 +11,7 @@ from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
 from calib.tag_edges import outward
 from offline.chain import Chain
+from offline.corner_calibrated_start import calibrated
 from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
 from offline.corner_problem import CornerProblem, columns_of
 from offline.corner_sides import facing_as_predicted
@@ -54,7 +55,7 @@ def has_corners(graph: Graph) -> bool:
 def corner_graph(
     graph: Graph, state: State, wobble_sigma: FloatArray | None = None, upright_sigma_rad: float | None = None
 ) -> tuple[CornerGraph, SpatialState]:
-    """The problem, and its start: the floor's solution with every tag hung where its looks put it.
+    """The problem, and its start: the floor's solution with every tag hung, and cameras mounted, as looks have it.
 
     Args:
         graph: of the floor; a reading of it stands for each look.
@@ -62,15 +63,15 @@ def corner_graph(
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
         upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
     """
-    chains = graph.chains
-    seeing = [chain for chain in chains if _from_corners(chain).any()]
+    chains, masks = graph.chains, [_from_corners(chain) for chain in graph.chains]
+    seeing = [chain for chain, mask in zip(chains, masks, strict=True) if mask.any()]
     of_corners = sorted({each for chain in seeing for each in (_height_parameter(chain), _focal_parameter(chain))})
     parameters = (*graph.parameters, *of_corners)
-    looks, cameras = _looks(graph, parameters)
+    looks, cameras = _looks(graph, parameters, masks)
     floor = graph.problem
     n_tags = len(graph.tags)
     seen = np.bincount(looks.tag, minlength=n_tags) > 0
-    kept = np.concatenate([~_from_corners(chain) for chain in chains])
+    kept = ~np.concatenate(masks)
     sigmas = np.array([parameter.sigma for parameter in parameters])
     problem = CornerProblem(
         odometry=floor.odometry,
@@ -92,7 +93,7 @@ def corner_graph(
         heights_m=np.where(seen, np.nan, 0.0),
         turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
     )
-    start = tags_hung(problem, start)
+    start = calibrated(problem, tags_hung(problem, start))
     problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
     return CornerGraph(problem, graph, parameters), start
 
@@ -102,13 +103,16 @@ def _from_corners(chain: Chain) -> BoolArray:
     return np.asarray(np.isfinite(chain.readings.corners_px).all((-1, -2)))
 
 
-def _looks(graph: Graph, parameters: Sequence[Parameter]) -> tuple[Looks, tuple[CameraModel, ...]]:
+def _looks(
+    graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
+) -> tuple[Looks, tuple[CameraModel, ...]]:
+    """Those readings of each chain that have corners, and the cameras."""
     cameras: list[CameraModel] = []
     found = []
     index = {parameter: i for i, parameter in enumerate(parameters)}
     tag_index = {tag: i for i, tag in enumerate(graph.tags)}
-    for chain, first_pose in zip(graph.chains, graph.first_pose.tolist(), strict=True):
-        mask, camera = _from_corners(chain), chain.run.camera
+    for chain, mask, first_pose in zip(graph.chains, masks, graph.first_pose.tolist(), strict=True):
+        camera = chain.run.camera
         if camera is None or not mask.any():
             continue
         if camera not in cameras:
@@ -157,16 +161,16 @@ def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: 
     robot = chain.run.robot
     stamps_ns = chain.stamps_ns[keyframe]
     track = next(each for each in chain.run.stretches if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1])
+    speed, turning = track.twist_at(stamps_ns, robot.wheels.track_m).T
+    twist = np.stack([speed, np.zeros_like(speed), turning], axis=-1)
+    if robot.readout_s == 0.0:  # all rows at once
+        return np.zeros((*corners_px.shape[:-1], 3)), twist
     share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
     rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
     left_m, right_m = (
         at_row - at_stamp[:, None] for at_row, at_stamp in zip(track.at(rows_ns), track.at(stamps_ns), strict=True)
     )
-    speed, turning = track.twist_at(stamps_ns, robot.wheels.track_m).T
-    return (
-        wheels.advance(left_m, right_m, robot.wheels.track_m),
-        np.stack([speed, np.zeros_like(speed), turning], axis=-1),
-    )
+    return wheels.advance(left_m, right_m, robot.wheels.track_m), twist
 
 
 def _height_parameter(chain: Chain) -> Parameter:

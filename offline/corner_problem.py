@@ -78,6 +78,11 @@ class CornerProblem:
         return corner_order(self)
 
     @cached_property
+    def look_order(self) -> IntArray:
+        """(M,) of looks by front, and by tag."""
+        return np.lexsort((self.corners.looks.tag, self.order.kinds[LOOKS].node))
+
+    @cached_property
     def motions(self) -> Odometry:
         """The odometry for compiled functions."""
         return compiled_motions(self.odometry, np.arange(len(self.odometry.first)))
@@ -184,7 +189,7 @@ class CornerProblem:
             _normal(self.readings.linearise(state, columns), DEFAULT_LOSSES.readings)
             if len(self.readings.pose)
             else _NONE,
-            _normal(self.prior.linearise(state, columns), None),
+            prior_normal(self.prior, state, columns),
             _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,
             _normal(distances.linearise(state, columns), None) if len(distances.distance_m) else _NONE,
             _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
@@ -193,7 +198,8 @@ class CornerProblem:
     def _level_looks(self, state: SpatialState, system: System) -> float:
         """Adds looks at level pictures; twice their cost."""
         corners, values = self.corners, spatial_values(state)
-        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, self.order.kinds[LOOKS], system)
+        kind = self.order.kinds[LOOKS]
+        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.look_order, system)
         return cost if np.isfinite(cost) else np.inf
 
     def weighed(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
@@ -286,14 +292,19 @@ _NONE: Final = (Normal(np.zeros((0, 1, 1)), np.zeros((0, 1))), 0.0)
 def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:
     """Normal equations, and the sum of losses."""
     jacobian = np.concatenate([derivative for _, derivative in kind.blocks], axis=-1)
+    heavy, cost = jacobian, 0.0
     if loss is None:
-        weight, cost = np.ones(len(jacobian)), float((kind.residual**2).sum())
+        cost = float((kind.residual**2).sum())
     else:
         losses, weight = losses_and_weights(loss, kind.residual)
-        cost = float(losses.sum())
-    heavy = weight[:, None, None] * jacobian
+        heavy, cost = weight[:, None, None] * jacobian, float(losses.sum())
     transposed = heavy.swapaxes(-1, -2)
     return Normal(transposed @ jacobian, (transposed @ kind.residual[..., None])[..., 0]), cost
+
+
+def prior_normal(prior: CalibrationPrior, state: SpatialState, columns: SpatialColumns) -> tuple[Normal, float]:
+    """Normal equations of what is known of the calibration, and the sum of its squares."""
+    return _normal(prior.linearise(state, columns), None)
 
 
 def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:

@@ -13,7 +13,7 @@ import numpy as np
 from calib.arrays import FloatArray
 from calib.tag_edges import outward
 from offline.corner_factors import CornerFactors, SpatialState, spatial_values
-from offline.corner_kernels import Eye, LookArrays, SpatialValues
+from offline.corner_look_kernels import Eye, LookArrays, SpatialValues
 from offline.corner_start_kernels import eyes_of
 from offline.jit import borrowed, jitted
 from offline.lens_kernels import CENTRE, distorted_at

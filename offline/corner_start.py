@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from calib.arrays import FloatArray, IntArray
 from offline.corner_factors import CornerFactors, SpatialState, spatial_values
 from offline.corner_problem import CORNER_LOSS, CornerProblem
-from offline.corner_start_kernels import POSED_LOOKS, POSES, ByTag, allowed, fit, posed, rays_of
+from offline.corner_start_kernels import POSED_LOOKS, POSES, SAME_RAD, ByTag, allowed, fit, posed, rays_of
 
-_SAME_RAD: Final = 0.01  # fits that end nearer than this are one
+_JUDGING_LOOKS: Final = 8  # of each tag
 
 
 def tags_hung(problem: CornerProblem, state: SpatialState) -> SpatialState:
@@ -42,7 +42,7 @@ def hung_otherwise(problem: CornerProblem, state: SpatialState, tag: int) -> lis
     found: list[SpatialState] = []
     known = [state.turns[tag]]
     for i in np.argsort(losses, kind="stable")[: int(np.isfinite(losses).sum())].tolist():
-        if all(Rotation.from_matrix(turn.T @ turns[i]).magnitude() > _SAME_RAD for turn in known):
+        if all(Rotation.from_matrix(turn.T @ turns[i]).magnitude() > SAME_RAD for turn in known):
             known.append(turns[i])
             found.append(_hung(state, np.array([tag]), places[i : i + 1], turns[i : i + 1]))
     return found
@@ -60,22 +60,39 @@ def _fitted(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, Floa
     They begin where single looks put them, and where they hang in the state if they do.
     """
     tag, values = factors.looks.tag, spatial_values(state)
-    n_looks = np.bincount(tag, minlength=len(state.tags))
-    by_tag = ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_looks)]))
+    by_tag = looks_by_tag(tag, len(state.tags))
     chosen = np.empty((len(state.tags), POSED_LOOKS), dtype=np.int64)
     posed(factors.looks.corners_px, by_tag, chosen)
     chosen = chosen[chosen >= 0]
     places, turns = np.empty((len(chosen), POSES, 3)), np.empty((len(chosen), POSES, 3, 3))
     allowed(factors.arrays, values, chosen, _rays(factors, chosen), places, turns)
-    own = np.flatnonzero((n_looks > 0) & np.isfinite(state.turns).all((-1, -2)) & np.isfinite(state.heights_m))
+    own = np.flatnonzero(
+        (np.diff(by_tag.begin) > 0) & np.isfinite(state.turns).all((-1, -2)) & np.isfinite(state.heights_m)
+    )
     hung = np.column_stack([state.tags, state.heights_m])[own]
     tags = np.concatenate([np.repeat(tag[chosen], POSES), own])
     places, turns = (
         np.concatenate([places.reshape(-1, 3), hung]),
         np.concatenate([turns.reshape(-1, 3, 3), state.turns[own]]),
     )
-    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, by_tag, tags, places, turns)
+    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, judges(by_tag), tags, places, turns)
     return tags, places, turns, losses
+
+
+def looks_by_tag(tag: IntArray, n_tags: int) -> ByTag:
+    """Looks at tags (M,), those of each in their order."""
+    n_looks = np.bincount(tag, minlength=n_tags)
+    return ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_looks)]))
+
+
+def judges(by_tag: ByTag) -> ByTag:
+    """A few looks spread over all of each tag's, or all where there are no more."""
+    n_looks = np.diff(by_tag.begin)
+    share = np.linspace(0.0, 1.0, _JUDGING_LOOKS)
+    at = by_tag.begin[:-1, None] + np.rint(share * (n_looks - 1)[:, None]).astype(np.int64)
+    kept = np.zeros(len(by_tag.order), dtype=np.bool_)
+    kept[at[n_looks > 0]] = True
+    return ByTag(by_tag.order[kept], np.concatenate([[0], np.cumsum(kept)])[by_tag.begin])
 
 
 def _rays(factors: CornerFactors, which: IntArray) -> FloatArray:

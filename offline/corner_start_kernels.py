@@ -4,13 +4,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_kernels import eliminate_columns
-from offline.corner_kernels import Eye, LookArrays, SpatialValues, face
-from offline.corner_step_kernels import turn_by, turned
+from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face
+from offline.corner_step_kernels import turn_by
 from offline.jit import borrowed, inner, jitted
 from offline.lens_kernels import CENTRE, distorted_at
-from offline.linearise_kernels import series
+from offline.linearise_kernels import multiply, series
 from offline.planar_kernels import ray_through, square_poses
 from offline.robust import Loss, loss_and_weight
 
@@ -19,11 +19,13 @@ POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
 # have no planar pose at all.
 _ASIDE_RAD: Final = 0.6
 POSES: Final = 4  # that a look allows: two planar, two upright
-_JUDGING_LOOKS: Final = 8
+SAME_RAD: Final = 0.01  # fits that end nearer than this are one
 _STEPS: Final = 5
 _DAMPING: Final = 1e-6
 # In squared sigmas: which pose is the right one, and the solve that begins there, ask for no more.
 _ARRIVED: Final = 1e-4
+_SETTLED: Final = 0.01  # of the loss, promised by the next step: where the candidate ends all but shows
+_ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fill vectors
 
 
 class ByTag(NamedTuple):
@@ -148,28 +150,33 @@ def fit(
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
-    by_tag: ByTag,
+    judges: ByTag,
     tags: IntArray,
     places: FloatArray,
     turns: FloatArray,
 ) -> FloatArray:
-    """Fits candidates of tags (C,), at places (C, 3) with turns (C, 3, 3), each to looks spread over its tag's.
+    """Fits candidates of tags (C,), at places (C, 3) with turns (C, 3, 3), each to some looks at its tag.
 
-    Robots' poses and the calibration are held. Returns what the looks lose (C,); infinite where they see no such tag.
+    Robots' poses and the calibration are held. Returns what the looks lose (C,); infinite where they see no such tag,
+    and where a candidate is on its way to where one of the same tag before it has settled.
     """
-    looks, values, by_tag = borrowed(looks), borrowed(values), borrowed(by_tag)
-    judges, begin = _judges(by_tag)
-    axes, eyes = _eyes(looks, values, judges)
-    losses, normal = np.full(len(tags), np.inf), np.empty((7, 7))
-    p, R, turn, step = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    looks, values, judges = borrowed(looks), borrowed(values), borrowed(judges)
+    axes, eyes = _eyes(looks, values, judges.order)
+    losses, is_settled = np.full(len(tags), np.inf), np.zeros(len(tags), dtype=np.bool_)
+    normal, rows, step = np.empty((7, _ROW)), np.zeros((8, _ROW)), np.empty(6)
+    p, R, turn = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for c in range(len(tags)):
-        first, end = begin[tags[c]], begin[tags[c] + 1]
         p[:], R[:] = places[c], turns[c]
         for _ in range(_STEPS):
+            if _is_known(tags, turns, is_settled, c, R):
+                losses[c] = np.inf
+                break
             total = 0.0
             normal[:] = 0.0
-            for i in range(first, end):
-                total += _add_look(looks, lenses, loss, values.calibration, judges[i], axes[i], eyes[i], p, R, normal)
+            for i in range(judges.begin[tags[c]], judges.begin[tags[c] + 1]):
+                total += _add_look(
+                    looks, lenses, loss, values.calibration, judges.order[i], axes[i], eyes[i], p, R, rows, normal
+                )
             if not total < losses[c]:
                 break
             losses[c], places[c], turns[c] = total, p, R
@@ -177,18 +184,35 @@ def fit(
                 normal[a, a] *= 1.0 + _DAMPING
             if eliminate_columns(normal, 6) >= 0:
                 break
-            if _back(normal, step) < _ARRIVED:
+            promised = _back(normal, step)
+            is_settled[c] = promised < _SETTLED * total
+            if promised < _ARRIVED:
                 break
             turn_by(step[3], step[4], step[5], turn)
-            turned(turns[c], turn, R)
+            multiply(turns[c], turn, R)
             for a in range(3):
                 p[a] += step[a]
     return losses
 
 
 @inner
+def _is_known(tags: IntArray, turns: FloatArray, is_settled: BoolArray, c: int, R: FloatArray) -> bool:
+    """Whether one before a candidate, of the same tag, has settled where the candidate hangs by now."""
+    for other in range(c - 1, -1, -1):
+        if tags[other] != tags[c]:
+            break
+        square = 0.0  # 8 sin(angle / 2)^2
+        for a in range(3):
+            for b in range(3):
+                square += (R[a, b] - turns[other, a, b]) ** 2
+        if is_settled[other] and square < 2.0 * SAME_RAD * SAME_RAD:
+            return True
+    return False
+
+
+@inner
 def _back(R: FloatArray, step: FloatArray) -> float:
-    """Sets the step (6,) by R (6, 7) of normal equations, their right side along; what it promises of the cost."""
+    """Sets the step (6,) by R of normal equations with their right side (6, 7); what it promises of the cost."""
     promised = 0.0
     for a in range(5, -1, -1):
         left = R[a, 6]
@@ -197,23 +221,6 @@ def _back(R: FloatArray, step: FloatArray) -> float:
             left += R[a, b] * step[b]
         step[a] = -left / R[a, a]
     return promised
-
-
-@inner
-def _judges(by_tag: ByTag) -> tuple[IntArray, IntArray]:
-    """Looks spread over all of each tag's, and where those of each begin."""
-    n_tags = len(by_tag.begin) - 1
-    judges, begin = np.empty(_JUDGING_LOOKS * n_tags, dtype=np.int64), np.zeros(n_tags + 1, dtype=np.int64)
-    end = 0
-    for t in range(n_tags):
-        own, last = by_tag.order[by_tag.begin[t] : by_tag.begin[t + 1]], -1
-        for j in range(_JUDGING_LOOKS if len(own) else 0):
-            at = int(np.rint(j * (len(own) - 1) / (_JUDGING_LOOKS - 1)))
-            if at != last:
-                judges[end] = own[at]
-                end, last = end + 1, at
-        begin[t + 1] = end
-    return judges[:end], begin
 
 
 @inner
@@ -261,10 +268,11 @@ def _add_look(
     eyes: FloatArray,
     p: FloatArray,
     R: FloatArray,
+    rows: FloatArray,
     normal: FloatArray,
 ) -> float:
-    """Adds J^T W J and J^T W r (6, 7) by a tag's place and turn, above the diagonal; returns the loss."""
-    lens, rows = lenses[looks.camera[m]], np.empty((8, 7))
+    """Adds J^T W J and J^T W r (6, 7) by a tag's place and turn; returns the loss. Rows (8, 8): room."""
+    lens = lenses[looks.camera[m]]
     half = 0.5 * looks.side_m[m] * (1.0 + calibration[looks.scale_parameter[m]])
     focal, by_pixel, square = 1.0 + calibration[looks.focal_parameter[m]], 1.0 / looks.sigma_px[m], 0.0
     shift = calibration[looks.edge_parameter[m]]
@@ -299,7 +307,7 @@ def _add_look(
     rho, w = loss_and_weight(loss, square)
     for i in range(8):
         for a in range(6):
-            f = w * rows[i, a]
-            for b in range(a, 7):
-                normal[a, b] += f * rows[i, b]
+            f, row, out = w * rows[i, a], rows[i], normal[a]
+            for b in range(len(row)):
+                out[b] += f * row[b]
     return rho

@@ -3,9 +3,9 @@
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from offline.corner_kernels import SpatialValues
+from offline.corner_look_kernels import SpatialValues
 from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import series, wrapped
+from offline.linearise_kernels import advance, go_along, multiply, series
 
 
 @jitted
@@ -32,29 +32,16 @@ def move(
         out: after.
     """
     values, out = borrowed(values), borrowed(out)
-    turn, product = np.empty((3, 3)), np.empty((3, 3))
+    turn, turned = np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(values.poses)):
-        d0, d1, omega = step[poses[p, 0]], step[poses[p, 1]], step[poses[p, 2]]
-        along, even, _ = series(omega)
-        across = omega * even
-        x, y = along * d0 - across * d1, across * d0 + along * d1
-        cos, sin = np.cos(values.poses[p, 2]), np.sin(values.poses[p, 2])
-        out.poses[p, 0] = values.poses[p, 0] + cos * x - sin * y
-        out.poses[p, 1] = values.poses[p, 1] + sin * x + cos * y
-        out.poses[p, 2] = wrapped(values.poses[p, 2] + omega)
+        advance(values.poses[p], step[poses[p, 0]], step[poses[p, 1]], step[poses[p, 2]], out.poses[p])
     for t in range(len(values.tags)):
-        pose = anchor[t]
-        before, after = values.poses[pose], out.poses[pose]
-        d0, d1, omega = step[poses[pose, 0]], step[poses[pose, 1]], step[poses[pose, 2]]
-        own_0, own_1 = step[tags[t, 0]], step[tags[t, 1]]
-        cos, sin = np.cos(before[2]), np.sin(before[2])
-        dx, dy = values.tags[t, 0] - before[0], values.tags[t, 1] - before[1]
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        # As seen from the anchor it moves by its own step, but for what the anchor's makes of it.
-        x, y = x + (cos * own_0 + sin * own_1 - d0 + omega * y), y + (cos * own_1 - sin * own_0 - d1 - omega * x)
-        cos, sin = np.cos(after[2]), np.sin(after[2])
-        out.tags[t, 0] = after[0] + cos * x - sin * y
-        out.tags[t, 1] = after[1] + sin * x + cos * y
+        at, before, after = poses[anchor[t]], values.poses[anchor[t]], out.poses[anchor[t]]
+        omega = step[at[2]]
+        go_along(
+            values.tags[t], before, after, step[at[0]], step[at[1]], omega, step[tags[t, 0]], step[tags[t, 1]],
+            out.tags[t],
+        )  # fmt: skip
         R = values.turns[t]
         if heights[t] < 0:
             out.heights_m[t] = values.heights_m[t]
@@ -64,20 +51,12 @@ def move(
         # The anchor's turn about map's vertical, and the rest about the tag's own axes.
         turn_by(step[turns[t, 0]] - R[2, 0] * omega, step[turns[t, 1]] - R[2, 1] * omega,
               step[turns[t, 2]] - R[2, 2] * omega, turn)  # fmt: skip
-        turned(R, turn, product)
+        multiply(R, turn, turned)
         cos, sin = np.cos(omega), np.sin(omega)
         for j in range(3):
-            out.turns[t, 0, j] = cos * product[0, j] - sin * product[1, j]
-            out.turns[t, 1, j] = sin * product[0, j] + cos * product[1, j]
-            out.turns[t, 2, j] = product[2, j]
-
-
-@inner
-def turned(R: FloatArray, by: FloatArray, out: FloatArray) -> None:
-    """R (3, 3) about its own axes."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = R[i, 0] * by[0, j] + R[i, 1] * by[1, j] + R[i, 2] * by[2, j]
+            out.turns[t, 0, j] = cos * turned[0, j] - sin * turned[1, j]
+            out.turns[t, 1, j] = sin * turned[0, j] + cos * turned[1, j]
+            out.turns[t, 2, j] = turned[2, j]
 
 
 @inner

@@ -127,20 +127,33 @@ def assemble(kind: Kind, normal: FloatArray, system: System) -> None:
     width = kind.place.shape[1]
     free, place = np.empty(width, dtype=np.uint64), np.empty(width, dtype=np.uint64)
     for m in range(len(normal)):
-        add_matrix(kind, m, normal[m], system, free, place)
+        add_matrix(kind, m, normal[m], 0, width, system, free, place)
 
 
 @inner
-def add_matrix(kind: Kind, m: int, normal: FloatArray, system: System, free: Unsigned, place: Unsigned) -> None:
-    """Adds one factor's normal matrix (k, k); free and place: (k,) room, unsigned to spare a look at each sign."""
-    node, n = kind.node[m], 0
-    begin, end = system.nodes.offset[node], system.nodes.offset[node + 1]
-    front, size = system.entries[begin:end], np.uint64(system.nodes.start[node + 1] - system.nodes.start[node])
-    for a in range(kind.place.shape[1]):
+def add_matrix(
+    kind: Kind,
+    m: int,
+    normal: FloatArray,
+    first: int,
+    last: int,
+    system: System,
+    free: Unsigned,
+    place: Unsigned,
+) -> None:
+    """Adds rows from the first to before the last of one factor's normal matrix (k, k), on and above the diagonal.
+
+    Free and place are (k,) room, unsigned to spare a look at each sign.
+    """
+    node, n, end = kind.node[m], 0, 0
+    begin, beyond = system.nodes.offset[node], system.nodes.offset[node + 1]
+    front, size = system.entries[begin:beyond], np.uint64(system.nodes.start[node + 1] - system.nodes.start[node])
+    for a in range(first, kind.place.shape[1]):
         if kind.place[m, a] >= 0:
             free[n], place[n] = a, kind.place[m, a]
             n += 1
-    for i in range(n):
+            end = n if a < last else end
+    for i in range(end):
         row, own = place[i], normal[free[i]]
         along = row * size
         front[along + row] += own[free[i]]
@@ -194,21 +207,29 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
 
 
 @jitted
-def substitute(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
-    """X (n,) <- H^-1 x."""
+def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
+    """Each row of X (k, n) <- R^-T row. All go through a front while it is at hand."""
     nodes = borrowed(nodes)
-    own = np.empty(_largest(nodes))  # of x, what a front has: in a row
+    own = np.empty(_largest(nodes))  # of a row, what a front has: side by side
     for i in range(len(nodes.parent)):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
-        for k in range(len(columns)):
-            own[k] = x[columns[k]]
-        for k in range(nodes.n_own[i]):
-            own[k] /= front[k, k]
-            value, row, rest = own[k], front[k, k + 1 :], own[k + 1 : len(columns)]
-            for j in range(len(row)):
-                rest[j] -= row[j] * value
-        for k in range(len(columns)):
-            x[columns[k]] = own[k]
+        for c in range(len(X)):
+            for k in range(len(columns)):
+                own[k] = X[c, columns[k]]
+            for k in range(nodes.n_own[i]):
+                own[k] /= front[k, k]
+                value, row, rest = own[k], front[k, k + 1 :], own[k + 1 : len(columns)]
+                for j in range(len(row)):
+                    rest[j] -= row[j] * value
+            for k in range(len(columns)):
+                X[c, columns[k]] = own[k]
+
+
+@jitted
+def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
+    """X (n,) <- R^-1 x."""
+    nodes = borrowed(nodes)
+    own = np.empty(_largest(nodes))
     for i in range(len(nodes.parent) - 1, -1, -1):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
         for k in range(len(columns)):

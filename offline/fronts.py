@@ -22,7 +22,8 @@ from offline.front_kernels import (
     assemble,
     factorise,
     settle,
-    substitute,
+    substitute_down,
+    substitute_up,
     whiten,
 )
 
@@ -120,9 +121,15 @@ class FrontFactor:
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """H^-1 vector (n,)."""
-        x = vector.copy()
-        substitute(self.order.nodes, self.entries, x)
+        x: FloatArray = self.whitened(vector[None])[0]
+        substitute_down(self.order.nodes, self.entries, x)
         return x
+
+    def whitened(self, vectors: FloatArray) -> FloatArray:
+        """R^-T of each of some vectors (k, n): their products with each other are those by H^-1 of the vectors."""
+        Z = vectors.copy()
+        substitute_up(self.order.nodes, self.entries, Z)
+        return Z
 
     def log_determinant(self) -> float:
         """Of H."""

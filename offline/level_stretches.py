@@ -9,6 +9,7 @@ elsewhere has L = 0: they took the slope for their own.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from math import degrees
 from typing import Final, NamedTuple
 
@@ -72,8 +73,8 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
     cut = [each for chain, first in zip(graph.chains, firsts, strict=True) for each in _cut(chain, first, pictures)]
     asked = _show(pictures, cut)
     couplings = [_coupled(pictures, each, solution.problem.columns.n) for each in asked]
-    taken = [np.stack([solution.factor.solve(row) for row in each]) for each in couplings]
-    cross = np.array([[one @ other.T for other in taken] for one in couplings]).reshape(len(asked), len(asked), 3, 3)
+    taken = solution.factor.whitened(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
+    cross = (taken @ taken.T).reshape(len(asked), 3, len(asked), 3).swapaxes(1, 2)
     slope = np.array([pictures.slope[each].sum(axis=0) for each in asked]).reshape(-1, 3)
     left = -cross
     for k, each in enumerate(asked):
@@ -158,7 +159,13 @@ def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel
 def _counts(stretch: _OffLevel, solution: CornerSolution, n: int) -> bool:
     """Whether chance does not explain it, and it is more than the floor is uneven by from picture to picture."""
     beyond = bool((np.abs(stretch.off) > solution.problem.wobble_sigma).any())
-    return beyond and stretch.square > float(chi2.isf(_FALSE_ALARM / n, stretch.freedom))
+    return beyond and stretch.square > _by_chance(n, stretch.freedom)
+
+
+@lru_cache(maxsize=64)
+def _by_chance(n: int, freedom: int) -> float:
+    """Squared sigmas that none of n level stretches reaches, but for a false alarm."""
+    return float(chi2.isf(_FALSE_ALARM / n, freedom))
 
 
 def _sentence(graph: Graph, which: IntArray, stretch: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:

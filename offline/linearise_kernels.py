@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_blocks import System
-from offline.jit import inner, jitted
+from offline.jit import inlined, inner, jitted
 
 
 class Values(NamedTuple):
@@ -143,31 +143,61 @@ def series(omega: float) -> tuple[float, float, float]:
     return np.sin(omega) / omega, (1.0 - np.cos(omega)) / s, (omega - np.sin(omega)) / s
 
 
+@inner
+def multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """Out <- A B, all (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@inlined
+def advance(pose: FloatArray, d0: float, d1: float, omega: float, out: FloatArray) -> None:
+    """Out <- T o exp(d) of a pose (3,)."""
+    along, even, _ = series(omega)
+    across = omega * even
+    x, y = along * d0 - across * d1, across * d0 + along * d1
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    out[0], out[1], out[2] = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrapped(pose[2] + omega)
+
+
+@inlined
+def go_along(
+    tag: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    d0: float,
+    d1: float,
+    omega: float,
+    own_0: float,
+    own_1: float,
+    out: FloatArray,
+) -> None:
+    """Sets the place (2,) of a tag that goes with its anchor, which a step d takes from one pose (3,) to the next.
+
+    As seen from the anchor it moves by its own step, in map, but for what the anchor's makes of it.
+    """
+    cos, sin = np.cos(before[2]), np.sin(before[2])
+    dx, dy = tag[0] - before[0], tag[1] - before[1]
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    x, y = x + (cos * own_0 + sin * own_1 - (d0 - omega * y)), y + (cos * own_1 - sin * own_0 - (d1 + omega * x))
+    cos, sin = np.cos(after[2]), np.sin(after[2])
+    out[0], out[1] = after[0] + cos * x - sin * y, after[1] + sin * x + cos * y
+
+
 @jitted
 def moved(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
     """`solver.Problem.moved` with a step in the arrowhead's order; calibration apart."""
     n_poses = len(values.poses)
     for pose in range(n_poses):
-        d0, d1, omega = step[3 * pose], step[3 * pose + 1], step[3 * pose + 2]
-        along, even, _ = series(omega)
-        across = omega * even
-        x, y = along * d0 - across * d1, across * d0 + along * d1
-        cos, sin = np.cos(values.poses[pose, 2]), np.sin(values.poses[pose, 2])
-        out.poses[pose, 0] = values.poses[pose, 0] + cos * x - sin * y
-        out.poses[pose, 1] = values.poses[pose, 1] + sin * x + cos * y
-        out.poses[pose, 2] = wrapped(values.poses[pose, 2] + omega)
+        at = 3 * pose
+        advance(values.poses[pose], step[at], step[at + 1], step[at + 2], out.poses[pose])
     for tag in range(len(values.tags)):
-        pose, column = anchor[tag], 3 * n_poses + 2 * tag
-        before, after = values.poses[pose], out.poses[pose]
-        cos, sin = np.cos(before[2]), np.sin(before[2])
-        dx, dy = values.tags[tag, 0] - before[0], values.tags[tag, 1] - before[1]
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        own_x = cos * step[column] + sin * step[column + 1] - (step[3 * pose] - step[3 * pose + 2] * y)
-        own_y = cos * step[column + 1] - sin * step[column] - (step[3 * pose + 1] + step[3 * pose + 2] * x)
-        x, y = x + own_x, y + own_y
-        cos, sin = np.cos(after[2]), np.sin(after[2])
-        out.tags[tag, 0] = after[0] + cos * x - sin * y
-        out.tags[tag, 1] = after[1] + sin * x + cos * y
+        at, column, before = 3 * anchor[tag], 3 * n_poses + 2 * tag, values.poses[anchor[tag]]
+        go_along(
+            values.tags[tag], before, out.poses[anchor[tag]], step[at], step[at + 1], step[at + 2], step[column],
+            step[column + 1], out.tags[tag],
+        )  # fmt: skip
 
 
 @jitted

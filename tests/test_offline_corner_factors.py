@@ -10,8 +10,10 @@ from calib import se2
 from calib.arrays import FloatArray, IntArray
 from calib.camera_model import CameraModel
 from offline.corner_factors import CornerFactors, Looks, SpatialColumns, SpatialState
+from offline.corner_floor import guessed_wobble
 from offline.corner_pictures import pictures_at
 from offline.corner_problem import CornerProblem, columns_of
+from offline.corner_solver import solve_corners
 from offline.factors import CalibrationPrior, OdometryFactors, ReadingFactors
 from offline.front_kernels import System
 from offline.fronts import Fronts, Normal, NotPositiveError, build_fronts, common_ancestor
@@ -259,6 +261,15 @@ def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
     assert problem.linearise(behind)[1] == problem.system(behind)[1] == np.inf
 
 
+def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> None:
+    problem, state = made_problem(6)
+    without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
+    few = problem.corners.looks.where(problem.corners.looks.pose < N_POSES - 1)
+    found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, looks=few)), state)
+    assert (found.reason, found.factor) == ("something is not tied down", None)
+    assert not guessed_wobble(found.problem, found.state, found.factor, found.pictures).any()
+
+
 def assembled(order: Fronts, matrices: list[FloatArray]) -> System:
     system = order.empty()
     order.add(system, 0, [Normal(each, np.zeros(each.shape[:2])) for each in matrices])
@@ -289,6 +300,9 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
         factor = order.factorise(assembled(order, normals), extra)
         vector = rng.standard_normal(n)
         np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(whole, vector), rtol=1e-8)
+        some = rng.standard_normal((3, n))
+        whitened = factor.whitened(some)
+        np.testing.assert_allclose(whitened @ whitened.T, some @ np.linalg.solve(whole, some.T), rtol=1e-8)
         wanted = np.array([16, 0, -1, 7, 14])
         inverse = np.linalg.inv(whole)
         expected = inverse[np.ix_(wanted, wanted)] * ((wanted >= 0)[:, None] & (wanted >= 0))

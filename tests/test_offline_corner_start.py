@@ -1,4 +1,6 @@
-"""The compiled start of an estimate on corners against OpenCV's planar poses and the camera model's own rays."""
+"""The start of an estimate on corners: OpenCV's planar poses, the camera model's own rays, a solve that is at hand."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,10 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from calib import se2
 from calib.bundle import planar_poses
+from offline.corner_calibrated_start import calibrated
 from offline.corner_factors import spatial_values
-from offline.corner_start_kernels import POSES, ByTag, allowed, posed, rays_of
+from offline.corner_problem import CORNER_LOSS, columns_of
+from offline.corner_start import judges, looks_by_tag
+from offline.corner_start_kernels import POSES, ByTag, allowed, fit, posed, rays_of
 from offline.tag_pose import UNIT_CORNERS
-from tests.test_offline_corner_factors import CAMERAS, N_LOOKS, N_TAGS, made_problem
+from tests.test_offline_corner_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, made_problem
 
 
 @pytest.mark.parametrize("model", CAMERAS)
@@ -70,3 +75,53 @@ def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_anothe
     chosen = np.zeros((N_TAGS, 2), dtype=np.int64)
     posed(corners_px, by_tag, chosen)
     assert chosen.tolist() == [[4, -1], [-1, -1], [2, 3]]
+
+
+def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
+    tag = np.array([2, 0] * 3 + [0] * 12)
+    few = judges(looks_by_tag(tag, 3))
+    assert [few.order[few.begin[t] : few.begin[t + 1]].tolist() for t in range(3)] == [
+        [1, 5, 7, 9, 11, 13, 15, 17],
+        [],
+        [0, 2, 4],
+    ]
+
+
+def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
+    """Tag 0 as it hangs, nearly so, the other way round, and nearly so again; tag 1 nearly as tag 0 hangs."""
+    problem, state = made_problem(3)
+    factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
+    turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])
+    places = np.repeat(np.append(state.tags[0], state.heights_m[0])[None], 5, axis=0)
+    few = judges(looks_by_tag(factors.looks.tag, N_TAGS))
+    tags = np.array([0, 0, 0, 0, 1])
+    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, spatial_values(state), few, tags, places, turns)
+    np.testing.assert_array_equal(np.isfinite(losses), [True, False, True, False, True])
+    assert losses[2] > 2.0 * losses[0]
+
+
+def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> None:
+    problem, state = made_problem(5)
+    off = replace(state, calibration=state.calibration + 2.0 * SIGMAS, heights_m=state.heights_m + 0.02)
+    found = calibrated(problem, off)
+    np.testing.assert_array_equal(found.poses, state.poses)
+    begun, ended, true = (problem.system(each)[1] for each in (off, found, state))
+    assert ended - true < 0.02 * (begun - true)
+
+
+def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
+    problem, state = made_problem(5)
+    free = np.arange(N_TAGS) > 0
+    corners = replace(problem.corners, looks=problem.corners.looks.where(problem.corners.looks.tag > 0))
+    problem = replace(problem, corners=corners, columns=columns_of(N_POSES, free, SIGMAS))
+    found = calibrated(problem, replace(state, calibration=state.calibration + 2.0 * SIGMAS))
+    np.testing.assert_allclose(found.tags[0], state.tags[0], atol=1e-14)
+    np.testing.assert_array_equal(found.turns[0], state.turns[0])
+    assert np.abs(found.tags[1:] - state.tags[1:]).min() > 1e-6
+
+
+def test_a_start_that_a_step_does_not_better_stays() -> None:
+    """Tags behind the camera, and three times as far off as they are, where squares lead the wrong way."""
+    problem, state = made_problem(6)
+    for off in (replace(state, tags=-state.tags), replace(state, tags=3.0 * state.tags)):
+        assert calibrated(problem, off) is off
