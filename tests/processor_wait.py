@@ -5,6 +5,7 @@ up for as long as it likes. Linux counts that time for each thread (proc(5), /pr
 number), so a test can hold the promise to its seconds on any machine.
 """
 
+import os
 import subprocess
 import threading
 import time
@@ -55,8 +56,9 @@ def _children(pid: int) -> list[str]:
 def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
     """Waits for the end of a process; fails where it takes longer than the limit, waits for a processor aside.
 
-    Then the process is killed and its listener awaited: left alone, that one would go on reading the number of a pipe
-    that is closed, and take the words of whoever gets the number next.
+    It takes as long as it has been seen to run: whoever looks waits for a processor too, and a process that ended
+    meanwhile is not to blame. One over the limit is killed and its listener awaited: left alone, that one would go on
+    reading the number of a pipe that is closed, and take the words of whoever gets the number next.
 
     Returns:
         What it said.
@@ -69,12 +71,24 @@ def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
 
     reader = threading.Thread(target=listen, daemon=True)
     reader.start()
-    while reader.is_alive():
-        wait.look()
+    while True:
         took_s = time.monotonic() - start_s
+        if _has_ended(process.pid):
+            break
+        wait.look()
         if took_s - wait.seconds > limit_s or took_s > _PATIENCE_S:
             process.kill()
             reader.join()
             raise AssertionError(f"{took_s:.1f} s, {wait.seconds:.1f} s of them waiting for a processor")
         reader.join(_LOOK_S)
+    reader.join(_PATIENCE_S)
+    assert said, "it has ended, and a process that it left behind holds its output open"
     return said[0]
+
+
+def _has_ended(pid: int) -> bool:
+    """Of a child of ours, which is left to whoever waits for it."""
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    except ChildProcessError:  # whoever waits for it has been told
+        return True
