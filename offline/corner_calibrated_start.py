@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from calib.arrays import IntArray
+from offline.corner_chosen_looks import judges, looks_by_tag
 from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
 from offline.corner_kernels import add_looks
 from offline.corner_problem import CORNER_LOSS, CornerProblem, columns_of, prior_normal
-from offline.corner_start import judges, looks_by_tag
 from offline.front_kernels import System
 from offline.fronts import Fronts, NotPositiveError, build_fronts
 
@@ -70,6 +70,6 @@ def _system(
     system, corners, kind = order.empty(is_whole=is_whole), problem.corners, order.kinds[_LOOKS]
     values, by_tag = spatial_values(state), np.arange(len(corners.looks))
     cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
-    normal, cost_of_prior = prior_normal(problem.prior, state, problem.columns)
+    normal, cost_of_prior = prior_normal(problem.prior, state)
     order.add(system, _LOOKS + 1, [normal])
     return system, cost + cost_of_prior

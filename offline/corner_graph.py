@@ -95,6 +95,7 @@ def corner_graph(
     )
     start = calibrated(problem, tags_hung(problem, start))
     problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
+    vars(problem)["motions"] = floor.arrowhead.odometry  # where the property has it: they rise by pose in a graph
     return CornerGraph(problem, graph, parameters), start
 
 

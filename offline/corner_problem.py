@@ -189,7 +189,7 @@ class CornerProblem:
             _normal(self.readings.linearise(state, columns), DEFAULT_LOSSES.readings)
             if len(self.readings.pose)
             else _NONE,
-            prior_normal(self.prior, state, columns),
+            prior_normal(self.prior, state),
             _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,
             _normal(distances.linearise(state, columns), None) if len(distances.distance_m) else _NONE,
             _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
@@ -302,9 +302,11 @@ def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:
     return Normal(transposed @ jacobian, (transposed @ kind.residual[..., None])[..., 0]), cost
 
 
-def prior_normal(prior: CalibrationPrior, state: SpatialState, columns: SpatialColumns) -> tuple[Normal, float]:
-    """Normal equations of what is known of the calibration, and the sum of its squares."""
-    return _normal(prior.linearise(state, columns), None)
+def prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, float]:
+    """Normal equations of what is known of the calibration, each number for itself, and the sum of its squares."""
+    residual = prior.residual(state)
+    weight = 1.0 / np.where(prior.sigma > 0.0, prior.sigma, 1.0)
+    return Normal((weight**2)[:, None, None], weight[:, None] * residual), float((residual**2).sum())
 
 
 def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:

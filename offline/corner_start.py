@@ -5,17 +5,15 @@ so each is taken for true in turn, fitted to looks from along the drive with the
 """
 
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import FloatArray, IntArray
+from offline.corner_chosen_looks import POSED_LOOKS, judges, looks_by_tag, posed
 from offline.corner_factors import CornerFactors, SpatialState, spatial_values
 from offline.corner_problem import CORNER_LOSS, CornerProblem
-from offline.corner_start_kernels import POSED_LOOKS, POSES, SAME_RAD, ByTag, allowed, fit, posed, rays_of
-
-_JUDGING_LOOKS: Final = 8  # of each tag
+from offline.corner_start_kernels import POSES, SAME_RAD, allowed, fit, rays_of
 
 
 def tags_hung(problem: CornerProblem, state: SpatialState) -> SpatialState:
@@ -77,22 +75,6 @@ def _fitted(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, Floa
     )
     losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, judges(by_tag), tags, places, turns)
     return tags, places, turns, losses
-
-
-def looks_by_tag(tag: IntArray, n_tags: int) -> ByTag:
-    """Looks at tags (M,), those of each in their order."""
-    n_looks = np.bincount(tag, minlength=n_tags)
-    return ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_looks)]))
-
-
-def judges(by_tag: ByTag) -> ByTag:
-    """A few looks spread over all of each tag's, or all where there are no more."""
-    n_looks = np.diff(by_tag.begin)
-    share = np.linspace(0.0, 1.0, _JUDGING_LOOKS)
-    at = by_tag.begin[:-1, None] + np.rint(share * (n_looks - 1)[:, None]).astype(np.int64)
-    kept = np.zeros(len(by_tag.order), dtype=np.bool_)
-    kept[at[n_looks > 0]] = True
-    return ByTag(by_tag.order[kept], np.concatenate([[0], np.cumsum(kept)])[by_tag.begin])
 
 
 def _rays(factors: CornerFactors, which: IntArray) -> FloatArray:

@@ -1,11 +1,12 @@
 """Compiled parts of `corner_start`: which looks pose a tag, the poses that they allow, and how well looks fit these."""
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_kernels import eliminate_columns
+from offline.corner_chosen_looks import ByTag
 from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face
 from offline.corner_step_kernels import turn_by
 from offline.jit import borrowed, inner, jitted
@@ -14,7 +15,6 @@ from offline.linearise_kernels import multiply, series
 from offline.planar_kernels import ray_through, square_poses
 from offline.robust import Loss, loss_and_weight
 
-POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
 # Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
 # have no planar pose at all.
 _ASIDE_RAD: Final = 0.6
@@ -26,59 +26,6 @@ _DAMPING: Final = 1e-6
 _ARRIVED: Final = 1e-4
 _SETTLED: Final = 0.01  # of the loss, promised by the next step: where the candidate ends all but shows
 _ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fill vectors
-
-
-class ByTag(NamedTuple):
-    """Looks (M,) by their tags: those of one begin at begin (T + 1,)."""
-
-    order: IntArray
-    begin: IntArray
-
-
-@jitted
-def posed(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
-    """Sets (T, 2) of each tag the largest look, and of those half as large the one whose shape differs most.
-
-    -1 where a tag has no look, or no second one.
-    """
-    for t in range(len(out)):
-        own = by_tag.order[by_tag.begin[t] : by_tag.begin[t + 1]]
-        out[t, :] = -1
-        if not len(own):
-            continue
-        largest, most = own[0], -1.0
-        for m in own:
-            size = _size(corners_px[m])
-            if size > most:
-                largest, most = m, size
-        out[t, 0] = largest
-        if len(own) < POSED_LOOKS:
-            continue
-        out[t, 1], farthest = own[0], 0.0
-        for m in own:
-            apart = _apart(corners_px[m], corners_px[largest]) if _size(corners_px[m]) > 0.5 * most else 0.0
-            if apart > farthest:
-                out[t, 1], farthest = m, apart
-
-
-@inner
-def _size(corners: FloatArray) -> float:
-    """Twice the area of a quadrangle (4, 2)."""
-    across_x, across_y = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
-    up_x, up_y = corners[3, 0] - corners[1, 0], corners[3, 1] - corners[1, 1]
-    return abs(float(across_x * up_y - across_y * up_x))
-
-
-@inner
-def _apart(a: FloatArray, b: FloatArray) -> float:
-    """How much two quadrangles differ in shape, each about its middle and by its size."""
-    by_a, by_b, total = 1.0 / np.sqrt(max(_size(a), 1.0)), 1.0 / np.sqrt(max(_size(b), 1.0)), 0.0
-    for i in range(2):
-        middle_a = 0.25 * (a[0, i] + a[1, i] + a[2, i] + a[3, i])
-        middle_b = 0.25 * (b[0, i] + b[1, i] + b[2, i] + b[3, i])
-        for k in range(4):
-            total += abs((a[k, i] - middle_a) * by_a - (b[k, i] - middle_b) * by_b)
-    return total
 
 
 @jitted

@@ -238,12 +238,9 @@ def solve(
         return ended("the cost is no number at the start", converged=False)
     for _ in range(most_steps):
         try:
-            factorisation, used = factorised(arrowhead, system, damping.share, rows, threads)
+            step, expected = _step(arrowhead, system, damping, rows, threads)
         except UnderDeterminedError:
             return ended("a variable is in no factor", converged=False)
-        damping.needed(used)
-        step = -factorisation.solve_in_order(system.gradient)
-        expected = _expected_decrease(system, step, damping.share)
         if expected <= cost_tolerance + relative_tolerance * cost:
             return ended("converged", converged=True)
         taken = take_step(arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
@@ -258,13 +255,32 @@ def solve(
         state, cost, rolled = taken.state, taken.cost, taken.rolled
         system, spare = spare, system
         costs.append(cost)
-        # Where the model is off by a share, the next gradient is that share of this one, what another step could bring
-        # its square. By chance a model is right too early: not for who wants the last digit.
-        left = _SURE * expected * (1.0 - gain) ** 2
-        if relative_tolerance > _COST_ROUNDING and damping.is_least and left <= relative_tolerance * cost:
+        if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
             return ended("converged", converged=True)
         damping.step_taken(gain)
     return ended(f"stopped after {most_steps} steps", converged=False)
+
+
+def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows, threads: int) -> tuple[FloatArray, float]:
+    """The next step, damped as it has to be, and by how much the linear model says that the cost falls.
+
+    Raises:
+        UnderDeterminedError: no damping helps.
+    """
+    factorisation, used = factorised(arrowhead, system, damping.share, rows, threads)
+    damping.needed(used)
+    step = -factorisation.solve_in_order(system.gradient)
+    return step, _expected_decrease(system, step, damping.share)
+
+
+def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cost: float) -> bool:
+    """Whether what a step leaves over is less than the tolerance, for who does not want the last digit.
+
+    Where the model is off by a share, the next gradient is that share of this one, what another step could bring its
+    square. By chance a model is right too early: not for who wants all.
+    """
+    left = _SURE * expected * (1.0 - gain) ** 2
+    return relative_tolerance > _COST_ROUNDING and left <= relative_tolerance * cost
 
 
 def factorised(

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from calib import se2
 from calib.bundle import planar_poses
 from offline.corner_calibrated_start import calibrated
+from offline.corner_chosen_looks import ByTag, judges, looks_by_tag, posed
 from offline.corner_factors import spatial_values
 from offline.corner_problem import CORNER_LOSS, columns_of
-from offline.corner_start import judges, looks_by_tag
-from offline.corner_start_kernels import POSES, ByTag, allowed, fit, posed, rays_of
+from offline.corner_start_kernels import POSES, allowed, fit, rays_of
 from offline.tag_pose import UNIT_CORNERS
 from tests.test_offline_corner_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, made_problem
 

@@ -16,6 +16,7 @@ from calib.noise import NoiseParameters
 from calib.tag_edges import outward
 from fixtures.simulate import TRUTH_FILE, simulate
 from offline import corner_map
+from offline.arrowhead_build import compiled_motions
 from offline.corner_factors import SpatialState
 from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import corner_graph
@@ -249,6 +250,15 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
     expected = facing_as_predicted(corners.problem.corners, start).looks.outward
     np.testing.assert_array_equal(looks.outward, expected)
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
+
+
+def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Path, MapResult, Workings]) -> None:
+    solved = room[2].solved[0]
+    problem = corner_graph(solved.graph, solved.solution.state)[0].problem
+    own = compiled_motions(problem.odometry, np.arange(len(problem.odometry.first)))
+    assert problem.motions is solved.graph.problem.arrowhead.odometry
+    for name in ("first", "motion", "information", "jacobian", "parameters"):  # all that looks at them here
+        np.testing.assert_array_equal(getattr(problem.motions, name), getattr(own, name))
 
 
 def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Workings]) -> None:
