@@ -104,10 +104,7 @@ def look_factor(
     cos_h, sin_h = np.cos(heading), np.sin(heading)
     T, R, mount = values.turns[tag], eye.rotation, eye.mount
     v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
-    along, even, _ = series(-late * omega)
-    across = -late * omega * even
-    back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
-    cos_l, sin_l = 1.0 + late * omega * across, -late * omega * along
+    back_x, back_y, cos_l, sin_l = gone_back(v0, v1, omega, late)
     cos_m, sin_m, cos_t, sin_t, last = 1.0, 0.0, cos_l, sin_l, 0.0
     by_pixel, by_scale = 1.0 / looks.sigma_px[m], 1.0 / scale
     for k in range(4):
@@ -126,22 +123,20 @@ def look_factor(
         rest_y = key_y - (moved[1] + sin_m * back_x + cos_m * back_y)
         base_x, base_y = cos_t * rest_x + sin_t * rest_y, cos_t * rest_y - sin_t * rest_x
         x, y, z = base_x - mount[0], base_y - mount[1], up - mount[2]
-        c0 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
-        c1 = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
-        c2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-        px, py, d00, d01, d11, nx, ny = distorted_at(lens, c0, c1, c2)
-        inverse = 1.0 / c2
+        depth = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        px, py, d00, d01, d11, nx, ny = distorted_at(
+            lens,
+            R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+            R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+            depth,
+        )
         for axis in range(2):
             i = 2 * k + axis
             off = lens[axis] * (px if axis == 0 else py)
             outward = looks.outward[m, k, axis]
             r[i] = by_pixel * (focal * off + lens[CENTRE + axis] + shift * outward - looks.corners_px[m, k, axis])
-            gain = by_pixel * lens[axis] * focal * inverse
-            j0, j1 = gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11)
-            j2 = -(j0 * nx + j1 * ny)
-            b0 = j0 * R[0, 0] + j1 * R[0, 1] + j2 * R[0, 2]
-            b1 = j0 * R[1, 0] + j1 * R[1, 1] + j2 * R[1, 2]
-            b2 = j0 * R[2, 0] + j1 * R[2, 1] + j2 * R[2, 2]
+            gain = by_pixel * lens[axis] * focal / depth
+            b0, b1, b2 = _by_place(R, nx, ny, gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11))
             k0, k1 = b0 * cos_t - b1 * sin_t, b0 * sin_t + b1 * cos_t
             row = J[i]
             row[0], row[1], row[2] = -k0, -k1, k0 * key_y - k1 * key_x
@@ -150,6 +145,30 @@ def look_factor(
             row[15] = b0 * v0 + b1 * v1 - (b0 * base_y - b1 * base_x) * omega
             row[17], row[18] = by_pixel * off, by_pixel * outward
             B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2
+
+
+@inlined
+def gone_back(v0: float, v1: float, omega: float, late: float) -> tuple[float, float, float, float]:
+    """Where a base that drives so was a moment before, in its axes now: x, y, cosine and sine of its heading."""
+    along, even, _ = series(-late * omega)
+    across = -late * omega * even
+    return (
+        -late * (along * v0 - across * v1),
+        -late * (across * v0 + along * v1),
+        1.0 + late * omega * across,
+        -late * omega * along,
+    )
+
+
+@inlined
+def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tuple[float, float, float]:
+    """By where a corner is in base, from the derivative by where it is across the picture, times its depth."""
+    j2 = -(j0 * nx + j1 * ny)
+    return (
+        j0 * R[0, 0] + j1 * R[0, 1] + j2 * R[0, 2],
+        j0 * R[1, 0] + j1 * R[1, 1] + j2 * R[1, 2],
+        j0 * R[2, 0] + j1 * R[2, 1] + j2 * R[2, 2],
+    )
 
 
 @inlined

@@ -7,11 +7,11 @@ import numpy as np
 from calib.arrays import BoolArray, FloatArray, IntArray
 from offline.arrowhead_kernels import eliminate_columns
 from offline.corner_chosen_looks import ByTag
-from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face
+from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, gone_back
 from offline.corner_step_kernels import turn_by
 from offline.jit import borrowed, inner, jitted
 from offline.lens_kernels import CENTRE, distorted_at
-from offline.linearise_kernels import multiply, series
+from offline.linearise_kernels import multiply
 from offline.planar_kernels import ray_through, square_poses
 from offline.robust import Loss, loss_and_weight
 
@@ -188,10 +188,8 @@ def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: Fl
     """
     face(looks, m, values.calibration, eye)
     late = values.calibration[looks.time_parameter[m]]
-    v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
-    along, even, _ = series(-late * omega)
-    across = -late * omega * even
-    back_x, back_y = -late * (along * v0 - across * v1), -late * (across * v0 + along * v1)
+    omega = looks.twist[m, 2]
+    back_x, back_y, _, _ = gone_back(looks.twist[m, 0], looks.twist[m, 1], omega, late)
     pose = values.poses[looks.pose[m]]
     cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
     for k in range(4):
