@@ -27,6 +27,14 @@ from tests.programs import running
 
 LIMIT_S = 5.0
 BOTH_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+# Whoever started the tests, by nohup or in the background, may have had SIGHUP or SIGINT ignored, and the recorder
+# would go by that.
+TOLD_BY_SIGNALS = """
+import signal
+for each in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(each, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""
 # Devices that never come back from a read, and a detection that never answers.
 BLOCKED = """
 import os, signal, time
@@ -71,7 +79,7 @@ def recorder(
     environment: Mapping[str, str] | None = None,
 ) -> AbstractContextManager["subprocess.Popen[str]"]:
     """`groundsbot-onboard record` as a process of its own, working in `folder`."""
-    program = f"import sys\n{before}\nfrom onboard.cli import main\nmain()"
+    program = f"import sys\n{TOLD_BY_SIGNALS}\n{before}\nfrom onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **(environment or {})}
     return running(command, folder=folder, stdout=stdout, environment=environment, own_group=True)
