@@ -6,16 +6,16 @@ reading, since noise cannot be compressed, and recorded ones 200 and more.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from offline.chain import Chain
 from offline.errors import OfflineError
 from offline.inputs import ALONE, Inputs
-from offline.run import Run
-from offline.solver import MAX_STEPS, Problem, Solution
+from offline.solver import MAX_TRIES, Problem, Solution
 
 # Linearising a factor takes as long as so many multiplications in a leaf; those above run in larger blocks.
 _A_FACTOR: Final = 2000.0
@@ -27,8 +27,10 @@ _FREE_WORK: Final = 30e9
 _WORK_AT_A_MIB: Final = 30e9
 # A map takes at least as many steps over the whole log, all its stages together.
 _LEAST_STEPS: Final = 30
-# No solve gets less than this: one from a good start needs no more.
+# No solve gets fewer tries than this: one from a good start needs no more.
 _LEAST_OF_A_SOLVE: Final = 6
+# Building a problem's graph and the order of its elimination takes as long as linearising its factors so many times.
+_A_BUILDING: Final = 3.5
 # What map takes of memory for each keyframe and reading, fronts aside, as measured.
 _BYTES_A_KEYFRAME: Final = 3300.0
 _BYTES_A_READING: Final = 2900.0
@@ -42,7 +44,7 @@ _BYTES_A_PLACE: Final = 5200
 
 @dataclass
 class Effort:
-    """What may be spent on a log, and what is left of it.
+    """What may be spent on a log or on one of its stretches, and what is left of it.
 
     Attributes:
         allowed: work, by the log's size.
@@ -50,6 +52,7 @@ class Effort:
         memory_bytes: that a map of it may take.
         promised: work of one step over all problems that were found to be affordable.
         places: how many tags all stretches may see, each counted anew in each.
+        whole: the log's, where this is a stretch's.
     """
 
     allowed: float
@@ -57,6 +60,7 @@ class Effort:
     memory_bytes: float
     promised: float = 0.0
     places: float = np.inf
+    whole: "Effort | None" = None
 
     @staticmethod
     def of_log(log_bytes: int, inputs: Inputs = ALONE, times: int = 1) -> "Effort":
@@ -71,6 +75,25 @@ class Effort:
             places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
         )
 
+    def parted(self, sizes: Sequence[int]) -> list["Effort"]:
+        """Of stretches, each as much as its share of all their sizes."""
+        allowed = [self.allowed * size / max(1, sum(sizes)) for size in sizes]
+        return [replace(self, allowed=each, left=each, whole=self) for each in allowed]
+
+    def taken(self, share: float) -> "Effort":
+        """A share of what is left, for a part of a stretch that was itself found to be affordable."""
+        work = share * max(self.left, 0.0)
+        self.left -= work
+        return Effort(work, work, self.memory_bytes, promised=-np.inf)
+
+    def give_back(self, taken: "Effort") -> None:
+        """What is left of it, or what it used beyond it."""
+        self.left += taken.left
+
+    def is_spent(self) -> bool:
+        """Whether nothing is left."""
+        return self.left <= 0.0
+
     def suffices(self, problem: Problem) -> bool:
         """Whether some solves of a problem can be paid for."""
         return step_work(problem) <= self.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes
@@ -81,37 +104,52 @@ class Effort:
         Raises:
             OfflineError: naming log and chain, what a step would take, the limit and the way out.
         """
-        self.promised += step_work(problem)
-        self.places -= len(problem.columns.tags)
-        if self.places < 0.0:
+        whole = self.whole or self
+        whole.promised += step_work(problem)
+        whole.places -= len(problem.columns.tags)
+        if whole.places < 0.0:
             raise OfflineError(
                 f"{log}: {name}: the run's stretches see more tags than a log of this size can tell of; "
                 "are the tags' numbers right? leave out some of the looks"
             )
-        if self.promised <= self.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
+        if whole.promised <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
             return
-        work, mib = self.promised / 1e9, memory_bytes_of(problem) / 2**20
+        work, mib = whole.promised / 1e9, memory_bytes_of(problem) / 2**20
         readings = problem.readings
         raise OfflineError(
             f"{log}: {name}: {len(readings.tag)} readings of {len(problem.columns.tags)} tags from "
             f"{len(problem.columns.poses)} keyframes would take {work:.1f}e9 multiplications a step and {mib:.0f} MiB, "
-            f"limit {self.allowed / _LEAST_STEPS / 1e9:.1f}e9 and {self.memory_bytes / 2**20:.0f} MiB for a log of "
+            f"limit {whole.allowed / _LEAST_STEPS / 1e9:.1f}e9 and {self.memory_bytes / 2**20:.0f} MiB for a log of "
             "this size; are the tags' numbers right? leave out some of the looks"
         )
 
-    def steps(self, problem: Problem, share: float, most: int = MAX_STEPS) -> int:
-        """How many steps a share of what is allowed is enough for, or what the solves before have left of it."""
+    def tries(self, problem: Problem, share: float, most: int = MAX_TRIES) -> int:
+        """How many tries a share of what is allowed is enough for, or what the solves before have left of it."""
         work = min(share * self.allowed, max(self.left, 0.0))
         return max(_LEAST_OF_A_SOLVE, min(most, int(work / step_work(problem))))
 
-    def spend(self, solution: Solution) -> None:
-        """Takes off what a solve used."""
+    def spend(self, solution: Solution, *, is_built: bool = False) -> None:
+        """Takes off what a solve used, and what building its problem did where that counts."""
         self.left -= solution.n_linearised * step_work(solution.problem)
+        if is_built:
+            self.left -= _A_BUILDING * _A_FACTOR * _n_factors(solution.problem)
 
 
-def efforts_of(runs: Sequence[Run], times: int = 1) -> dict[str, Effort]:
-    """What each of some runs is worth, by its name, each of the times that a command maps them."""
-    return {run.name: Effort.of_log(run.log_bytes, run.inputs, times) for run in runs}
+def efforts_of(chains: Sequence[Chain], times: int = 1) -> list[Effort]:
+    """What each stretch of some runs is worth of its log, each of the times that a command maps them."""
+    of_run: dict[str, list[Chain]] = {}
+    for chain in chains:
+        of_run.setdefault(chain.run.name, []).append(chain)
+    parts = {
+        name: iter(Effort.of_log(some[0].run.log_bytes, some[0].run.inputs, times).parted([size_of(c) for c in some]))
+        for name, some in of_run.items()
+    }
+    return [next(parts[chain.run.name]) for chain in chains]
+
+
+def size_of(chain: Chain) -> int:
+    """Its keyframes and readings: work grows with them."""
+    return len(chain.stamps_ns) + len(chain.readings)
 
 
 def step_work(problem: Problem) -> float:
@@ -121,8 +159,11 @@ def step_work(problem: Problem) -> float:
     leaf = tree.level == 0
     in_leaves = (3.0 * (tree.end - tree.first) * square)[leaf].sum()
     above = (tree.n_eliminated * square)[~leaf].sum()
-    n_factors = len(problem.odometry.first) + len(problem.readings.tag)
-    return float(_A_FACTOR * n_factors + in_leaves + _IN_BLOCKS * above)
+    return float(_A_FACTOR * _n_factors(problem) + in_leaves + _IN_BLOCKS * above)
+
+
+def _n_factors(problem: Problem) -> int:
+    return len(problem.odometry.first) + len(problem.readings.tag)
 
 
 def memory_bytes_of(problem: Problem) -> float:

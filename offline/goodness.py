@@ -22,7 +22,7 @@ from offline.measured_factors import NOTHING_MEASURED
 from offline.odometry import chained
 from offline.robust import losses_and_weights
 from offline.shared_errors import fit_shared_errors
-from offline.solver import DEFAULT_LOSSES, MAX_STEPS, Losses, Problem, Solution, solve
+from offline.solver import DEFAULT_LOSSES, MAX_TRIES, Losses, Problem, Solution, solve
 
 # Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
@@ -94,7 +94,7 @@ class Windows:
         freedom: what chi-square's degrees of freedom the noise is known like.
         cost: of all windows apart, under that noise.
         n_conditions: how many numbers more the windows have to fit with than the whole.
-        most_steps: of a solve.
+        effort: what the logs are worth, without end where None, and the share of it that a solve of the whole may take.
     """
 
     problem: Problem
@@ -104,12 +104,16 @@ class Windows:
     freedom: float
     cost: float
     n_conditions: int
-    most_steps: int = MAX_STEPS
+    effort: Effort | None = None
+    share: float = 1.0
 
     def judge(self, state: State) -> Goodness:
         """What it costs to join them in the valley of a state."""
         problem = _scaled(self.problem, self.factors[0], self.factors[1] * self.sharing)
-        together = solve(problem, state, losses=self.losses, most_steps=self.most_steps)
+        most_tries = self.effort.tries(problem, self.share) if self.effort else MAX_TRIES
+        together = solve(problem, state, losses=self.losses, most_tries=most_tries)
+        if self.effort:
+            self.effort.spend(together)
         n = self.n_conditions
         quantile = stats.f.isf(FALSE_ALARM, n, self.freedom) if n else 1.0
         return Goodness(
@@ -138,12 +142,12 @@ def fitted_windows(
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
     state = _dead_reckoned(problem, apart)
-    left = effort.steps(apart, share, _MAX_FITS * MAX_STEPS) if effort else _MAX_FITS * MAX_STEPS
+    left = effort.tries(apart, share, _MAX_FITS * MAX_TRIES) if effort else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
     last = np.ones(2)
     for _ in range(_MAX_FITS):
-        solution = _nearly_solved(_scaled(apart, *factors), state, losses, min(left, MAX_STEPS))
-        left -= len(solution.costs)
+        solution = _nearly_solved(_scaled(apart, *factors), state, losses, min(left, MAX_TRIES))
+        left -= solution.n_linearised
         if effort:
             effort.spend(solution)
         squares, redundancy = _left_over(solution)
@@ -160,11 +164,11 @@ def fitted_windows(
     # Drives that only a tape joins have more unknowns together than apart.
     n_conditions = max(0, freedom_of(problem) - freedom_of(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
-    most_steps = max(1, min(left, MAX_STEPS))
+    most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
-        solution = solve(_scaled(apart, *factors), state, losses=losses, most_steps=most_steps)
+        solution = solve(_scaled(apart, *factors), state, losses=losses, most_tries=most_tries)
     else:
-        solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_steps)
+        solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_tries)
         if effort:
             effort.spend(solution)
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
@@ -173,16 +177,17 @@ def fitted_windows(
         state = solution.state
         del solution
         shared = _scaled(apart, factors[0], factors[1] * sharing)
-        solution = solve(shared, state, losses=losses, most_steps=most_steps)
+        solution = solve(shared, state, losses=losses, most_tries=most_tries)
     if effort:
         effort.spend(solution)
-    of_the_whole = effort.steps(problem, share) if effort else MAX_STEPS
-    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, of_the_whole)
+    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, effort, share)
 
 
-def _nearly_solved(problem: Problem, state: State, losses: Losses, most_steps: int) -> Solution:
+def _nearly_solved(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
     """To where its cost is not yet that of the end, but squares of what is left over are."""
-    return solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_steps=most_steps)
+    solution = solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries)
+    problem.arrowhead.without_scratch()  # who looks at what is left over needs as much room again
+    return solution
 
 
 def _affordable_windows(problem: Problem, effort: Effort | None) -> Problem:

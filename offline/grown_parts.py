@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from calib import se2
 from calib.arrays import FloatArray
 from offline.chain import Chain
+from offline.effort import Effort
 from offline.graph import Parameter, build_graph
 from offline.odometry import chained
 from offline.run_tags import TagKey
@@ -35,13 +36,15 @@ class Grown(NamedTuple):
     freedom: int
 
 
-def grown_parts(chain: Chain, *, backwards: bool) -> list[Grown]:
-    """Longer and longer parts of the chain, from one end on."""
+def grown_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]:
+    """Longer and longer parts of the chain, from one end on, as long as there is effort for them."""
     n = len(chain.stamps_ns)
     parts: list[Grown] = []
     for end in _coarse_ends(chain):
+        if effort.is_spent():
+            break
         piece = (n - end, n) if backwards else (0, end)
-        parts.append(_solved(chain, *piece, parts[-1] if parts else None))
+        parts.append(_solved(chain, *piece, parts[-1] if parts else None, effort))
     return parts
 
 
@@ -56,15 +59,15 @@ def noise_factor(grown: Sequence[Sequence[Grown]]) -> float:
     return max(1.0, float(np.median(added))) if added else 1.0
 
 
-def limit_of(chain: Chain, parts: Sequence[Grown], factor: float) -> Grown | None:
-    """The longest part whose readings fit together; None where all of the chain does."""
+def limit_of(chain: Chain, parts: Sequence[Grown], factor: float, effort: Effort) -> Grown | None:
+    """The longest part whose readings fit together, as far as there is effort; None where all of the chain does."""
     for before, after in pairwise(parts):
         if _strains(before, after, factor, len(parts)):
-            return _refined(chain, before, after, factor)
+            return _refined(chain, before, after, factor, effort)
     return None
 
 
-def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float) -> Grown:
+def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
     """Between a part that fits and a longer one that does not, keyframe by keyframe."""
     longest = known
     reading = np.unique(chain.readings.keyframe)
@@ -72,7 +75,9 @@ def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float) -> Grown:
     back = reading[(reading < known.first) & (reading >= beyond.first)][::-1]
     parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
     for part in parts:
-        grown = _solved(chain, *part, longest)
+        if effort.is_spent():
+            break
+        grown = _solved(chain, *part, longest, effort)
         if _strains(known, grown, factor, len(parts)):
             break
         longest = grown
@@ -85,14 +90,15 @@ def _strains(before: Grown, after: Grown, factor: float, n_tests: int) -> bool:
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solved(chain: Chain, first: int, end: int, known: Grown | None) -> Grown:
+def _solved(chain: Chain, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
     """A part of a chain, from what is known of another that has an end in common with it."""
     part = chain.part(first, end)
     graph = build_graph([part])
     wheels = np.zeros(3) if known is None else known.wheels
     poses = _poses(chain, first, end, known, wheels)
     start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
-    solution = solve(graph.problem, start, COST_TOLERANCE)
+    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.tries(graph.problem, 1.0))
+    effort.spend(solution, is_built=True)
     state, problem = solution.state, graph.problem
     freedom = problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
     wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)

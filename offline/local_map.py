@@ -33,12 +33,12 @@ _PIECE_SHARE: Final = 0.01
 # In squared sigmas: a piece is only the next one's start.
 _PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
-# A piece takes three to five steps on any drive.
-_MOST_STEPS_A_PIECE: Final = 20
+# A piece takes three to five steps on any drive, of one try each.
+_MOST_TRIES_A_PIECE: Final = 60
 # Of the effort that a log is worth.
 _BUILDING_SHARE: Final = 0.5
 _WINDOWS_SHARE: Final = 0.2
-_SOLVING_SHARE: Final = 0.1  # in steps; where they lead nowhere each is tried some four times
+_SOLVING_SHARE: Final = 0.1  # it is solved some times
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
 
     Args:
         chain: what was measured.
-        effort: that all stretches of its log share; the whole log's where None.
+        effort: what the stretch is worth; the whole log's where None.
 
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
@@ -104,7 +104,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     for _ in range(1 + _OTHER_STARTS):
         poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        solution = solve(graph.problem, start, most_steps=effort.steps(graph.problem, _SOLVING_SHARE))
+        solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
         if best is None or solution.cost < best.solution.cost:
             best = LocalMap(chain, graph, solution, check.judge(solution))
@@ -159,8 +159,8 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
         graph = build_graph([part])
         poses = _extended(part, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        most_steps = effort.steps(graph.problem, _BUILDING_SHARE, _MOST_STEPS_A_PIECE)
-        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_steps=most_steps)
+        most_tries = effort.tries(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
         effort.spend(solution)
         state = solution.state
         wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)

@@ -63,7 +63,7 @@ def localize(
     chains = [told_apart(chain) for chain in chains_of(run, noise or known.noise)]
     if not any(chain.tags for chain in chains):
         raise OfflineError(f"{run.log}: {run.name} saw no tag, so nothing tells where in {folder} it drove")
-    maps, broken = local_maps_of([run], chains, stages)
+    maps, broken = local_maps_of(chains, stages)
     maps = weighed_as(maps, noise or known.noise, known.noise_fit if noise is None else None)
     found = localize_maps(maps, known, folder, component=component, stages=stages)
     told = [*run.warnings, *broken, *(warning for each in maps for warning in each.chain.warnings), *found.warnings]

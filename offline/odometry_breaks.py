@@ -4,6 +4,9 @@ Only tags tell. From the beginning on the drive is built up as far as its readin
 from its end. What lies between them, the wheels cannot explain; where they overlap, it is that place without whose
 motion the whole costs least. The drive is split there if that pays: the whole costs less by more than chance explains,
 however many places there were to choose from, and two or more tags seen on both sides agree on how the robot moved.
+
+That takes hundreds of solves. They share what the drive's own solve has left of what its log is worth; where it does
+not suffice the drive stays whole, and that is said.
 """
 
 from collections.abc import Sequence
@@ -19,19 +22,23 @@ from calib.arrays import FloatArray
 from offline.alignment import Alignment, align
 from offline.chain import Chain
 from offline.condensed import condense
+from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.factors import State
 from offline.graph import Graph
 from offline.grown_parts import COST_TOLERANCE, FALSE_ALARM, Grown, grown_parts, limit_of, noise_factor
 from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import chained
-from offline.solver import Problem, solve
+from offline.solver import Problem, Solution, solve
 
 _MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
 _MOST_PLACES: Final = 24
 # Half of what chance adds to a place once in a thousand times: with less, readings do not tell which it was.
 _SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
 _IN_A_ROW_M: Final = 2.5
+# Of the effort that is left: for either side of a place solved on its own, and for the first of two parts.
+_SHARE_OF_A_SOLVE: Final = 0.2
+_SHARE_OF_A_PART: Final = 0.5
 _FREED: Final = 1e-4  # of a motion's whitening: metres and turns for nothing
 
 
@@ -70,6 +77,20 @@ class _Place(NamedTuple):
     begin: int
 
 
+class _Split(NamedTuple):
+    """Of a drive.
+
+    Attributes:
+        parts: its stretches.
+        breaks: with the keyframe at which the part begins that each is told of.
+        is_searched: whether the effort sufficed to look for breaks in all of it.
+    """
+
+    parts: list[LocalMap]
+    breaks: list[tuple[int, Break]]
+    is_searched: bool
+
+
 class _Start(NamedTuple):
     """Where to begin a solve with a break."""
 
@@ -77,57 +98,75 @@ class _Start(NamedTuple):
     state: State
 
 
-def split_where_broken(maps: Sequence[LocalMap]) -> Mended:
-    """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own."""
+def split_where_broken(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
+    """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own.
+
+    Args:
+        maps: of the drives.
+        efforts: what is left of what each of them is worth; the whole log's where None.
+    """
     mended, warnings = [], []
-    for whole in maps:
-        parts, breaks = _split(whole, _MOST_BREAKS)
-        mended += parts
-        warnings += [_sentence(whole.chain, each) for each in breaks]
+    for whole, effort in zip(maps, efforts or [_all_of(each) for each in maps], strict=True):
+        split = _split(whole, _MOST_BREAKS, effort)
+        mended += split.parts
+        warnings += [_sentence(whole.chain, each) for each in split.breaks]
+        if not split.is_searched:
+            warnings.append(_not_searched(whole.chain))
     return Mended(_numbered(mended) if warnings else mended, warnings)
 
 
-def find_break(local_map: LocalMap) -> Break | None:
-    """The break that explains most of what does not fit in a drive; None where it fits, or none explains it."""
-    chain = local_map.chain
+def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | None:
+    """The break that explains most of what does not fit in a drive; None where it fits, or none explains it.
+
+    Nor is there one where the effort is spent before it is found; the whole log's where None.
+    """
+    chain, effort = local_map.chain, effort or _all_of(local_map)
     if _fits(local_map):
         return None
-    grown = [grown_parts(chain, backwards=backwards) for backwards in (False, True)]
+    grown = [grown_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
-    ahead, behind = (limit_of(chain, parts, factor) for parts in grown)
+    ahead, behind = (limit_of(chain, parts, factor, effort) for parts in grown)
     if ahead is None or behind is None:
         return None
     places = _places(chain, ahead, behind)
-    if not places:
+    if not places or effort.is_spent():
         return None
     middle = places[len(places) // 2]
     starts = [
         _start(local_map.graph, ahead, behind, place, T_ahead_behind)
-        for T_ahead_behind in _ways_to_align(chain, behind, middle)
+        for T_ahead_behind in _ways_to_align(chain, behind, middle, effort)
         for place in places
     ]
     if not starts:
         return None
-    apart = [solve(_freed(local_map.graph.problem, *start.place), start.state, COST_TOLERANCE) for start in starts]
+    apart = _solved_from(starts, local_map.graph.problem, effort)
+    if effort.is_spent():
+        return None
     costs = np.array([solution.cost for solution in apart])
     equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
     best = max(equal.tolist(), key=lambda i: _seconds_between(chain, starts[i].place))
-    return _judged(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal])
+    return _judged(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
 
 
-def _split(whole: LocalMap, most: int) -> tuple[list[LocalMap], list[tuple[int, Break]]]:
-    """The stretches of a drive, and its breaks with the keyframe at which the part begins that each is told of."""
-    found = find_break(whole) if most else None
+def _all_of(local_map: LocalMap) -> Effort:
+    return Effort.of_log(local_map.chain.run.log_bytes, local_map.chain.run.inputs)
+
+
+def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
+    found = find_break(whole, effort) if most else None
     if found is None:
-        return [whole], []
+        return _Split([whole], [], is_searched=not effort.is_spent() or _fits(whole))
     chain = whole.chain
-    parts: list[LocalMap] = []
-    breaks: list[tuple[int, Break]] = [(0, found)]
-    for first, end in ((0, found.end), (found.begin, len(chain.stamps_ns))):
-        more, inner = _split(solve_local_map(_without_ends(chain.part(first, end), first, end, chain)), most - 1)
-        parts += more
-        breaks += [(first + offset, each) for offset, each in inner]
-    return parts, breaks
+    split = _Split([], [(0, found)], is_searched=True)
+    ends = (0, found.end), (found.begin, len(chain.stamps_ns))
+    left = [_without_ends(chain.part(*each), *each, chain) for each in ends]
+    for (first, _), part in zip(ends, left, strict=True):
+        own = effort.taken(_SHARE_OF_A_PART if part is left[0] else 1.0)
+        inner = _split(solve_local_map(part, own), most - 1, own)
+        effort.give_back(own)
+        breaks = [(first + offset, each) for offset, each in inner.breaks]
+        split = _Split(split.parts + inner.parts, split.breaks + breaks, split.is_searched and inner.is_searched)
+    return split
 
 
 def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
@@ -202,9 +241,9 @@ def _between_readings(chain: Chain, place: _Place) -> _Place:
     return _Place(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
 
 
-def _ways_to_align(chain: Chain, behind: Grown, place: _Place) -> list[FloatArray]:
+def _ways_to_align(chain: Chain, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
     """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
-    apart = _solved_apart(chain, place)
+    apart = _solved_apart(chain, place, effort)
     if apart is None:
         return []
     at_begin = behind.poses[place.begin - behind.first]
@@ -213,15 +252,32 @@ def _ways_to_align(chain: Chain, behind: Grown, place: _Place) -> list[FloatArra
     return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
 
 
-def _solved_apart(chain: Chain, place: _Place) -> tuple[LocalMap, LocalMap] | None:
+def _solved_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> list[Solution]:
+    """With a break, wherever it may be; not from all starts where there is no effort left."""
+    found: list[Solution] = []
+    for start in starts:
+        if effort.is_spent():
+            break
+        freed = _freed(problem, *start.place)
+        found.append(solve(freed, start.state, COST_TOLERANCE, most_tries=effort.tries(freed, 1.0)))
+        effort.spend(found[-1], is_built=True)
+    return found
+
+
+def _solved_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
     """What comes before and what comes after, each on its own; None where one of them cannot be."""
     n = len(chain.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
         return None
-    try:
-        return solve_local_map(chain.part(0, place.end)), solve_local_map(chain.part(place.begin, n))
-    except OfflineError:
-        return None
+    found = []
+    for part in (chain.part(0, place.end), chain.part(place.begin, n)):
+        own = effort.taken(_SHARE_OF_A_SOLVE)
+        try:
+            found.append(solve_local_map(part, own))
+        except OfflineError:
+            return None
+        effort.give_back(own)
+    return found[0], found[1]
 
 
 def _aligned(before: LocalMap, after: LocalMap) -> Alignment | None:
@@ -238,15 +294,19 @@ def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_beh
     return _Start(place, graph.start(poses, tags, ahead.calibration))
 
 
-def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place]) -> Break | None:
+def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort) -> Break | None:
     """The break, if two tags agree on it and it pays to believe in it."""
     chain, problem = local_map.chain, local_map.graph.problem
-    parts = _solved_apart(chain, place)
+    parts = _solved_apart(chain, place, effort)
     alignment = None if parts is None else _aligned(*parts)
     if parts is None or alignment is None or not alignment.is_sure:
         return None
-    apart = solve(_freed(problem, *place), start)
-    joined = min(local_map.solution.cost, solve(problem, apart.state).cost)
+    freed = _freed(problem, *place)
+    apart = solve(freed, start, most_tries=effort.tries(freed, 1.0))
+    effort.spend(apart)
+    together = solve(problem, apart.state, most_tries=effort.tries(problem, 1.0))
+    effort.spend(together)
+    joined = min(local_map.solution.cost, together.cost)
     factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
     reading = np.unique(chain.readings.keyframe)
     # Between two readings all motions are one: freeing the others as well lets nothing else go.
@@ -284,6 +344,14 @@ def _numbered(maps: Sequence[LocalMap]) -> list[LocalMap]:
         chain = replace(each.chain, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
         numbered.append(replace(each, chain=chain, graph=replace(each.graph, chains=(chain,))))
     return numbered
+
+
+def _not_searched(chain: Chain) -> str:
+    return (
+        f"{chain.name}: its readings do not fit together, and where its wheels may have lost the way was not searched "
+        "to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, map what "
+        "was recorded before and after as runs of their own, or leave out some of the looks"
+    )
 
 
 def _sentence(chain: Chain, told: tuple[int, Break]) -> str:

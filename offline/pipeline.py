@@ -123,7 +123,7 @@ def build_map(
     runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
     measurements = _measurements(tape, runs, chains, extending)
     known = _known_maps(extending, stages)
-    maps, broken = local_maps_of(runs, chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
+    maps, broken = local_maps_of(chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
@@ -182,28 +182,25 @@ def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list
     return chains
 
 
-def local_maps_of(
-    runs: Sequence[Run], chains: Sequence[Chain], stages: Stages, times: int = 1
-) -> tuple[list[LocalMap], list[str]]:
+def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> tuple[list[LocalMap], list[str]]:
     """Each chain solved alone, parted where its wheels lost the way, and what to say of that.
 
     Args:
-        runs: of the chains.
-        chains: stretches.
+        chains: stretches of runs.
         stages: told what is being done.
         times: how often the command maps the runs; what they are worth is shared out.
     """
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
-        efforts = efforts_of(runs, times)
-        for chain in chains:
-            maps.append(solve_local_map(chain, efforts[chain.run.name]))
+        efforts = efforts_of(chains, times)
+        for chain, effort in zip(chains, efforts, strict=True):
+            maps.append(solve_local_map(chain, effort))
             done()
     alone = RunsAlone()
     with stages.stage("tags that do not belong"):
         maps = [alone.explained_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
-        maps, broken = split_where_broken(maps)
+        maps, broken = split_where_broken(maps, efforts)
     with stages.stage("tags that do not belong"):
         return [alone.split(each).without_factors() for each in maps], broken
 

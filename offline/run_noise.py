@@ -89,8 +89,8 @@ def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedN
 
 
 def _is_sound(local_map: LocalMap) -> bool:
-    """Whether what a map leaves over is noise."""
-    return len(local_map.chain.tags) > 0 and local_map.goodness.fits
+    """Whether what a map leaves over is noise; where its solve did not come to its end, nobody knows."""
+    return len(local_map.chain.tags) > 0 and local_map.goodness.fits and local_map.solution.converged
 
 
 def _shared(parts: Sequence[FittedPart]) -> tuple[FloatArray, bool]:

@@ -43,8 +43,8 @@ def free_what_is_told(
         names: what to free whether robot.yaml is contradicted or not; where empty what drives contradict.
         corners: the map will be refined on corners, which tell of the focal length too.
     """
-    efforts = efforts_of(runs, TIMES_MAPPED)
-    maps = [solve_local_map(chain, efforts[chain.run.name]) for chain in chains]
+    efforts = efforts_of(chains, TIMES_MAPPED)
+    maps = [solve_local_map(chain, effort).without_factors() for chain, effort in zip(chains, efforts, strict=True)]
     choices = choose(told_by(maps, noise, efforts, corners=corners), names)
     freed = {Owned(each.owner, each.name): LIMITS[each.name] for each in choices if each.is_freed}
     right = _put_right(choices)

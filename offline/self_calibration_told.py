@@ -6,7 +6,7 @@ that estimate less what it was given: no map is needed, no alignment, and a tag 
 The noise is the one that windows of the drive leave over (`goodness`), so that it matters little what was told of it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -31,8 +31,9 @@ from offline.solver import Solution, solve
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
 _STRETCHES: Final = 5
 _FEWEST: Final = 2  # of a short one
-_SOLVING_SHARE: Final = 0.2  # of what a log is worth, for each stretch: they are smaller by as much
-
+# Of what a drive is worth: for its windows, and for each stretch, which are smaller by as much.
+_WINDOWS_SHARE: Final = 0.2
+_SOLVING_SHARE: Final = 0.2
 
 # What a calibration of the camera with a board is good for, where robot.yaml does not say how good its focal length is.
 _FOCAL_SIGMA: Final = 1e-3
@@ -46,22 +47,22 @@ class _Stretch(NamedTuple):
     vector: FloatArray
 
 
-def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Mapping[str, Effort], *, corners: bool) -> Told:
+def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Sequence[Effort], *, corners: bool) -> Told:
     """What all stretches of some runs tell.
 
     Args:
         maps: of the runs, solved alone, with what robot.yaml says of the calibration.
         noise: under which.
-        efforts: what each run is worth, by its name.
+        efforts: what is left of what each of them is worth.
         corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
     """
     stretches: list[_Stretch] = []
     priors: dict[tuple[object, ...], Parameter] = {}
-    for each in maps:
+    for each, effort in zip(maps, efforts, strict=True):
         priors |= {parameter[:3]: parameter for parameter in each.graph.parameters}
-        chain = _under_own_noise(each, noise)
+        chain = _under_own_noise(each, noise, effort)
         for first, end in _cuts(chain):
-            stretch = _told_by_stretch(chain, each, first, end, efforts[chain.run.name], corners=corners)
+            stretch = _told_by_stretch(chain, each, first, end, effort, corners=corners)
             if stretch is not None:
                 stretches.append(stretch)
                 priors = {
@@ -84,9 +85,9 @@ def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=robot.focal_scale_sigma or _FOCAL_SIGMA)
 
 
-def _under_own_noise(local_map: LocalMap, noise: NoiseParameters) -> Chain:
+def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:
     """The chain under the noise that its windows leave over, errors that neighbouring readings share included."""
-    windows = fitted_windows(local_map.graph.problem)
+    windows = fitted_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE)
     of_wheels, of_readings = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
@@ -115,11 +116,12 @@ def _told_by_stretch(
     start = graph.start(
         whole.T_start_base[first:end], whole.tags_m, {p: calibration.get(p[:3], 0.0) for p in graph.parameters}
     )
-    most_steps = effort.steps(graph.problem, _SOLVING_SHARE)
-    solution: Solution | CornerSolution = solve(graph.problem, start, most_steps=most_steps)
+    on_floor = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    effort.spend(on_floor)
+    solution: Solution | CornerSolution = on_floor
     parameters = graph.parameters
     if corners and has_corners(graph):
-        on_corners, spatial = corner_graph(graph, solution.state)
+        on_corners, spatial = corner_graph(graph, on_floor.state)
         solution, parameters = solve_corners(on_corners.problem, spatial), on_corners.parameters
     if not solution.converged:
         return None

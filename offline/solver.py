@@ -28,6 +28,8 @@ from offline.tied_down import Untied, untied_parts
 HUBER_THRESHOLD: Final = 3.0
 
 MAX_STEPS: Final = 100
+# A step linearises once where it goes down as it should, and seven times at most (`take_step`).
+MAX_TRIES: Final = 7 * MAX_STEPS
 # The cost is in squared sigmas: a step that would lower it by this much less is some 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
 _COST_ROUNDING: Final = 1e-14  # relative
@@ -200,6 +202,7 @@ def solve(
     relaxed_steps: int = 0,
     threads: int = 1,
     most_steps: int = MAX_STEPS,
+    most_tries: int = MAX_TRIES,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -208,7 +211,7 @@ def solve(
     - "converged": by its linear model the next step, Gauss-Newton's unless damping was needed up to here, would lower
       the cost by no more than the tolerance. At an optimum that is before the first step.
     - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
-    - "stopped after N steps", where `most_steps` says N.
+    - "stopped after N steps", where `most_steps` or `most_tries` says so.
     - "a variable is in no factor", "the cost is no number at the start".
 
     What nothing ties down stays where it was: damping holds it.
@@ -223,20 +226,22 @@ def solve(
             that a start lies in.
         threads: on how many cores chains are eliminated.
         most_steps: how many to try, relaxed ones aside.
+        most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
     """
     arrowhead = problem.arrowhead
     system, spare, rows = arrowhead.scratch
     state, n_linearised = _relaxed(problem, start, relaxed_steps)
     _, cost = arrowhead.linearise(state, *losses, out=system)
     costs, n_linearised = [cost], n_linearised + 1
-    damping, rolled = Damping(), False
+    last, n_steps, damping, rolled = n_linearised + most_tries, 0, Damping(), False
 
     def ended(reason: str, *, converged: bool) -> Solution:
         return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
 
     if not np.isfinite(cost):
         return ended("the cost is no number at the start", converged=False)
-    for _ in range(most_steps):
+    while n_steps < most_steps and n_linearised < last:
+        n_steps += 1
         try:
             step, expected = _step(arrowhead, system, damping, rows, threads)
         except UnderDeterminedError:
@@ -258,7 +263,7 @@ def solve(
         if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
             return ended("converged", converged=True)
         damping.step_taken(gain)
-    return ended(f"stopped after {most_steps} steps", converged=False)
+    return ended(f"stopped after {n_steps} steps", converged=False)
 
 
 def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows, threads: int) -> tuple[FloatArray, float]:

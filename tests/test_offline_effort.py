@@ -7,12 +7,15 @@ import pytest
 
 from calib.noise import NoiseParameters
 from offline.chain import chains_of
-from offline.effort import Effort, step_work
+from offline.effort import Effort, efforts_of, size_of, step_work
 from offline.errors import OfflineError
 from offline.graph import build_graph
 from offline.local_map import solve_local_map
+from offline.odometry_breaks import split_where_broken
 from offline.run import load_run
-from offline.solver import MAX_STEPS
+from offline.self_calibration_told import told_by
+from offline.solver import MAX_STEPS, Solution, solve
+from tests.benchmarks.breaks_study import broken_drive
 from tests.hostile_logs import MS, observed, resets
 from tests.made_logs import START_NS
 from tests.made_long_drives import made_long_drive, made_town
@@ -123,6 +126,50 @@ def test_stretches_share_what_their_log_is_worth() -> None:
         solve_local_map(chain, effort)
 
 
+def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
+    run = load_run(written(resets(3, 10, 20), tmp_path))
+    chains = [chain.part(0, 5 * (i + 1)) for i, chain in enumerate(chains_of(run, NoiseParameters()))]
+    whole, efforts = Effort.of_log(run.log_bytes), efforts_of(chains)
+    assert sum(each.allowed for each in efforts) == pytest.approx(whole.allowed)
+    assert [each.allowed / efforts[0].allowed for each in efforts] == pytest.approx(
+        [size_of(chain) / size_of(chains[0]) for chain in chains]
+    )
+    assert [each.left for each in efforts] == [each.allowed for each in efforts]
+
+
+def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
+    """A step may take seven, and one that was begun is ended."""
+    (chain,) = chains_of(load_run(written(resets(1, 10, 60), tmp_path)), NoiseParameters())
+    graph = build_graph([chain])
+    start = graph.start(np.zeros((len(chain.stamps_ns), 3)), {}, {})
+    whole, some = solve(graph.problem, start), solve(graph.problem, start, most_tries=5)
+    assert 5 < some.n_linearised <= 1 + 5 + 6 < whole.n_linearised
+    assert some.reason.startswith("stopped after ")
+
+
+def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (chain,) = chains_of(load_run(written(resets(1, 10, 100), tmp_path)), NoiseParameters())
+    effort = Effort(2e9, 2e9, 1e9)
+    found, taken = solve_local_map(chain, effort), list[float]()
+
+    def counted(*args: object, **kwargs: object) -> Solution:
+        solution = solve(*args, **kwargs)  # type: ignore[arg-type]  # as it was called
+        taken.append(solution.n_linearised * step_work(solution.problem))
+        return solution
+
+    monkeypatch.setattr("offline.goodness.solve", counted)
+    told_by([found], NoiseParameters(), [effort], corners=False)
+    assert 0.0 < sum(taken) < 0.5 * effort.allowed
+
+
+def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
+    local_map = solve_local_map(broken_drive("carried", 1).drive.chain)
+    maps, warnings = split_where_broken([local_map], [Effort(1e8, 1e8, 1e9)])
+    assert maps == [local_map]
+    (warning,) = warnings
+    assert "was not searched to the end: that takes more work than a log of this size is worth" in warning
+
+
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
     (chain,) = chains_of(load_run(written(observed(1500, 20), tmp_path)), NoiseParameters())
@@ -143,6 +190,6 @@ def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every:
     assert found.solution.converged
     assert found.goodness.fits
     assert effort.left > 0.5 * effort.allowed
-    assert effort.steps(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
+    assert effort.tries(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
     everything = solve_local_map(chain, Effort.of_log(1 << 30))
     np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)
