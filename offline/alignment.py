@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray
+from offline.alignment_effort import UNLIMITED, AlignmentEffort
 from offline.alignment_rivals import CHANCE_NATS, Rivalry
 from offline.alignment_search import Explanation, explanations, halves, settled, without
 from offline.condensed import CondensedMap
@@ -29,6 +30,7 @@ _DOUBT_NATS: Final = log(1e4)
 # Such choices are of so many tags fewer at most, and of each number so many.
 _MOST_DOUBTED: Final = 6
 _BEAM: Final = 12
+_ROUNDING_NATS: Final = 1e-3
 _AREA_M2: Final = REACH_M**2
 
 
@@ -78,27 +80,42 @@ class Alignment:
         return tuple(tag for tag, fits in zip(self.shared, self.inlier, strict=True) if not fits)
 
 
-def align(a: CondensedMap, b: CondensedMap, placement: Placement | None = None) -> Alignment | None:
+def align(
+    a: CondensedMap,
+    b: CondensedMap,
+    placement: Placement | None = None,
+    effort: AlignmentEffort = UNLIMITED,
+) -> Alignment | None:
     """The transform that explains the shared tags best, or None where no two of them fit together.
 
     Args:
         a: one map.
         b: the other.
         placement: what somebody measured of T_a_b, where the starts of both are.
+        effort: what it may take.
+
+    Raises:
+        AlignmentTooLongError: it takes more.
     """
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:
         return None
-    return _Judge(a, b, shared, placement).verdict()
+    effort.begin()
+    return _Judge(a, b, shared, placement, effort).verdict()
 
 
 class _Judge(Rivalry):
     """Weighs what the shared tags of two maps say."""
 
     def __init__(
-        self, a: CondensedMap, b: CondensedMap, shared: tuple[TagKey, ...], placement: Placement | None
+        self,
+        a: CondensedMap,
+        b: CondensedMap,
+        shared: tuple[TagKey, ...],
+        placement: Placement | None,
+        effort: AlignmentEffort,
     ) -> None:
-        self.fit = JointFit(a.tree(shared), b.tree(shared))
+        self.fit = JointFit(a.tree(shared), b.tree(shared), effort=effort)
         super().__init__(self.fit.places_a, self.fit.places_b)
         self.shared = shared
         self.placement = placement
@@ -113,7 +130,10 @@ class _Judge(Rivalry):
         found = self._united(explained)
         evidence, best = found[0]
         groups = [each for _, each in found]
-        found += self._doubted(evidence, best) + [(self.evidence(each), each) for each in halves(self.fit, best)]
+        found += self._doubted(evidence, best)
+        for each in halves(self.fit, best):
+            found.append((self.evidence(each), each))
+            each.held.without_root()
         each_once = {each.members.tobytes(): (its, each) for its, each in found}
         found = sorted(each_once.values(), key=lambda f: -f[0])
         rivals: list[Explanation] = []
@@ -131,20 +151,34 @@ class _Judge(Rivalry):
         """
         found = last = [(evidence, best)]
         for _ in range(_MOST_DOUBTED):
-            fewer: dict[bytes, tuple[float, Explanation]] = {}
+            fewer: list[tuple[float, Explanation]] = []
+            seen: set[bytes] = set()
             for its, each in last:
                 if each.n < 3:
                     continue
                 held = np.flatnonzero(each.members)
-                for tag in held[each.held.worth_nats() < its - evidence + _DOUBT_NATS]:
+                most_nats = its - evidence + _DOUBT_NATS
+                if each.n == len(self.shared) and self.placement is None:
+                    # Nothing can join instead, and of what is left there are so many choices more.
+                    most_nats -= log(each.n) - _ROUNDING_NATS
+                for tag in held[each.held.worth_nats() < most_nats]:
                     less = without(each, tag)
                     instead = less.joining & ~each.members
                     for other in (less, less.with_more(instead)) if instead.any() else (less,):
-                        if (key := other.members.tobytes()) not in fewer:
-                            fewer[key] = self.evidence(other), other
-            last = sorted((f for f in fewer.values() if f[0] > evidence - _DOUBT_NATS), key=lambda f: -f[0])[:_BEAM]
+                        if (key := other.members.tobytes()) not in seen:
+                            seen.add(key)
+                            fewer.append((self.evidence(other), other))
+                    fewer = self._likeliest(fewer, evidence - _DOUBT_NATS)
+                each.held.without_root()
+            last = fewer
             found = found + last
+        for _, each in found:
+            each.held.without_root()
         return found
+
+    @staticmethod
+    def _likeliest(found: list[tuple[float, Explanation]], least_nats: float) -> list[tuple[float, Explanation]]:
+        return sorted((f for f in found if f[0] > least_nats), key=lambda f: -f[0])[:_BEAM]
 
     def _united(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
         """Best first: what was found, and what becomes of groups of tags far from each other that agree on the place.

@@ -110,7 +110,7 @@ def without(explanation: Explanation, tags: IntArray) -> Explanation:
     return Explanation(members, explanation.linear, hold(explanation.linear, members))
 
 
-def halves(fit: JointFit, explanation: Explanation) -> list[Explanation]:
+def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
     """Both parts of its tags wherever these hang together loosely: where maps bend a part may have moved as one.
 
     By the distances of tags: each link of the tree of the best known ones is cut in turn. Two tags are a part at least.
@@ -122,15 +122,13 @@ def halves(fit: JointFit, explanation: Explanation) -> list[Explanation]:
     weight = np.zeros((len(held), len(held)))
     weight[first, second] = variance + fit.unmodelled_m2
     tree = minimum_spanning_tree(weight).toarray()
-    parts = []
     for link in zip(*np.nonzero(tree > _LOOSE_SIGMA_M**2), strict=True):
         cut = tree.copy()
         cut[link] = 0.0
         _, part = connected_components(cut, directed=False)
-        parts += [
-            without(explanation, held[part == which]) for which in (0, 1) if 2 <= (part == which).sum() <= len(held) - 2
-        ]
-    return parts
+        for which in (0, 1):
+            if 2 <= (part == which).sum() <= len(held) - 2:
+                yield without(explanation, held[part == which])
 
 
 def _draws_needed(share: float) -> float:

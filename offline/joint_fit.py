@@ -17,7 +17,7 @@ leans, which shift a tag by millimetres, by more the more the sides differ that 
 sigma of 1 cm for each tag, which is little against any tag that was moved.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Final
 
@@ -27,6 +27,7 @@ from scipy.stats import chi2
 
 from calib import se2
 from calib.arrays import BoolArray, FloatArray, IntArray
+from offline.alignment_effort import UNLIMITED, AlignmentEffort
 from offline.condensed import AnchorTree, quarter_turned
 from offline.tag_fit import FALSE_ALARM, ill_fitting, worth_nats
 
@@ -57,6 +58,7 @@ class Linear:
         covariance: (2 n, 2 n) of the noise.
         by_transform: (2 n, 3) by a motion (x, y, turn) of map b about `centre`.
         by_a: (2 n, 5 n) by xi_a; by_b by xi_b.
+        effort: that least squares over its tags are taken off.
     """
 
     at: Bend
@@ -66,19 +68,35 @@ class Linear:
     by_transform: FloatArray
     by_a: FloatArray
     by_b: FloatArray
+    effort: AlignmentEffort = field(default_factory=AlignmentEffort)
 
 
 class JointFit:
     """Two maps' trees of the same n tags in the same order."""
 
-    def __init__(self, a: AnchorTree, b: AnchorTree, unmodelled_sigma_m: float = UNMODELLED_SIGMA_M) -> None:
-        """Args: a, b: the trees; unmodelled_sigma_m: of each coordinate, beyond what the covariances say."""
+    def __init__(
+        self,
+        a: AnchorTree,
+        b: AnchorTree,
+        unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
+        effort: AlignmentEffort = UNLIMITED,
+    ) -> None:
+        """Two trees and what may be done with them.
+
+        Args:
+            a: the tree of one map.
+            b: that of the other.
+            unmodelled_sigma_m: of each coordinate, beyond what the covariances say.
+            effort: what it may take.
+        """
         self.a, self.b = a, b
         self.n = len(a.step)
         self.unmodelled_m2 = unmodelled_sigma_m**2
+        self._effort = effort
 
     @cached_property
     def _unbent(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+        self._effort.linearise(self.n)
         none = np.zeros(5 * self.n)
         return _spread(self.a, none), _spread(self.b, none)
 
@@ -109,6 +127,8 @@ class JointFit:
     def linearised(self, bend: Bend) -> Linear:
         """The differences around a bend."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
+        if bent:
+            self._effort.linearise(self.n)
         (f_a, J_a, S_a), (f_b, J_b, S_b) = (
             (_spread(self.a, bend.xi_a), _spread(self.b, bend.xi_b)) if bent else self._unbent
         )
@@ -125,7 +145,7 @@ class JointFit:
         apart = (f_a - in_a).reshape(-1) - J_a @ bend.xi_a - by_b @ bend.xi_b
         covariance = S_a + turned
         covariance[np.diag_indices(2 * self.n)] += self.unmodelled_m2
-        return Linear(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b)
+        return Linear(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
 
     def moved(self, linear: Linear, held: "Held") -> Bend:
         """The bend that the tags held ask for."""
@@ -156,6 +176,7 @@ class Held:
 
     Attributes:
         rows: (2 m,) of theirs.
+        root: (2 m, 2 m) lower triangular, of the covariance.
         motion: (3,) that map b still makes.
         information: (3, 3) of it.
         pull: (2 m,) how strongly each tag pulls.
@@ -165,7 +186,6 @@ class Held:
 
     linear: Linear
     rows: IntArray
-    root: FloatArray  # (2 m, 2 m) lower triangular, of the covariance
     whitened: FloatArray  # (2 m, 3) by_transform
     motion: FloatArray
     information: FloatArray
@@ -190,7 +210,17 @@ class Held:
         """Whether chance explains the rise."""
         return self.rise <= _most_rise(len(self.rows) - 3)
 
-    @property
+    @cached_property
+    def root(self) -> FloatArray:
+        """Worked out again by who asks after `without_root`."""
+        return _root(self.linear, self.rows)
+
+    def without_root(self) -> None:
+        """Lets go of the root, which may be most of an explanation; what it is asked for most stays known."""
+        _ = self.log_determinant
+        vars(self).pop("root", None)
+
+    @cached_property
     def log_determinant(self) -> float:
         """Of the covariance of the differences."""
         return 2.0 * float(np.log(np.diag(self.root)).sum())
@@ -247,10 +277,8 @@ def _most_rise(freedom: int) -> float:
 def hold(linear: Linear, members: BoolArray) -> Held:
     """Least squares over some tags (n,), two at least."""
     rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
-    S = linear.covariance[np.ix_(rows, rows)]
-    # Readings without noise leave rounding only; far below any true sigma.
-    S[np.diag_indices(len(rows))] += 1e-12 * float(np.trace(S)) / len(rows) + 1e-18
-    root = linalg.cholesky(S, lower=True, check_finite=False)
+    linear.effort.hold(len(rows) // 2)
+    root = _root(linear, rows)
     right = np.column_stack([linear.by_transform[rows], linear.apart[rows]])
     right = linalg.solve_triangular(root, right, lower=True, check_finite=False)
     whitened, apart = right[:, :3], right[:, 3]
@@ -258,7 +286,16 @@ def hold(linear: Linear, members: BoolArray) -> Held:
     motion = -np.linalg.solve(information, whitened.T @ apart)
     left = apart + whitened @ motion
     pull = linalg.solve_triangular(root, left, lower=True, trans=1, check_finite=False)
-    return Held(linear, rows, root, whitened, motion, information, pull, left)
+    held = Held(linear, rows, whitened, motion, information, pull, left)
+    vars(held)["root"] = root  # where the property has it
+    return held
+
+
+def _root(linear: Linear, rows: IntArray) -> FloatArray:
+    S = linear.covariance[np.ix_(rows, rows)]
+    # Readings without noise leave rounding only; far below any true sigma.
+    S[np.diag_indices(len(rows))] += 1e-12 * float(np.trace(S)) / len(rows) + 1e-18
+    return np.asarray(linalg.cholesky(S, lower=True, check_finite=False), dtype=np.float64)
 
 
 def _spread(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ import numpy as np
 from calib import se2
 from calib.arrays import FloatArray
 from offline.alignment import Alignment, align
+from offline.alignment_effort import AlignmentEffort, AlignmentTooLongError
 from offline.condensed import CondensedMap, condense
 from offline.cycles import Contradiction, Link, consistent_links, spanning_tree
 from offline.local_map import LocalMap
@@ -31,6 +32,7 @@ class PairAlignment:
         shared: the tags in both.
         alignment: by these; None where no two of them fit together.
         placement: as somebody measured it, of the starts.
+        is_searched: whether what the logs are worth sufficed to look for an alignment.
     """
 
     a: int
@@ -38,6 +40,7 @@ class PairAlignment:
     shared: tuple[TagKey, ...]
     alignment: Alignment | None
     placement: Placement | None = None
+    is_searched: bool = True
 
 
 @dataclass(frozen=True)
@@ -119,17 +122,21 @@ def _aligned_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
+    effort = AlignmentEffort.of_logs(sum({m.chain.run.name: m.chain.run.log_bytes for m in maps}.values()))
     by_name = sorted(range(len(maps)), key=lambda i: maps[i].chain.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
         map_a, map_b = condensed[a], condensed[b]
         shared: tuple[TagKey, ...] = ()
-        alignment = None
+        alignment, is_searched = None, True
         if map_a is not None and map_b is not None:
             shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
-            alignment = align(map_a, map_b, placement)
+            try:
+                alignment = align(map_a, map_b, placement, effort)
+            except AlignmentTooLongError:
+                is_searched = False
         if shared or placement is not None:
-            pairs.append(PairAlignment(a, b, shared, alignment, placement))
+            pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))
     return pairs
 
 

@@ -13,6 +13,9 @@ from offline.run_tags import TagKey
 from offline.tag_joins import TagJoin
 
 _MOST_NAMED = 8
+_TOO_LONG = (
+    "that takes more work than logs of their size are worth; map fewer drives at once and add the others by --extend"
+)
 
 
 def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[AlignmentResult, ...]:
@@ -44,7 +47,7 @@ def merge_warnings(
             warnings += _elsewhere(maps, pair, alignment, named)
         elif component[pair.a] == component[pair.b]:
             warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
-    warnings += _contradictions(maps, merged)
+    warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
     for i, group in enumerate(merged.groups[1:], start=1):
         warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
     return warnings
@@ -71,6 +74,15 @@ def reason_apart(
     return f"{name} shares no tag with the others; drive it past two tags that another run saw"
 
 
+def _not_searched(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
+    left = [pair for pair in merged.pairs if not pair.is_searched]
+    if not left:
+        return []
+    a, b = (maps[m].chain.name for m in (left[0].a, left[0].b))
+    told = f"{len(left)} of {len(merged.pairs)} pairs of drives that share tags were not laid over each other"
+    return [f"{told}, {a} and {b} among them: {_TOO_LONG}"]
+
+
 def _nearness(pair: PairAlignment) -> tuple[float, int]:
     evidence_nats = float("-inf") if pair.alignment is None else pair.alignment.evidence_nats
     return evidence_nats, len(pair.shared)
@@ -81,6 +93,8 @@ def _why_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[
     a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
     if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
         a, b = b, a
+    if not pair.is_searched:
+        return f"{b} shares {len(pair.shared)} tags with {a}, but was not laid over it: {_TOO_LONG}"
     return why_not_joined(a, b, pair.shared, pair.alignment)
 
 

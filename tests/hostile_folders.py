@@ -69,6 +69,11 @@ def _full_runs(count: int, make: Callable[[_Of], bytes]) -> Callable[[Path], Pat
     return _runs(lambda number: make(_Of(run_id=str(number), size_bytes=size_bytes)), count)
 
 
+def _mirrored(of: _Of) -> float:
+    """Tags lie to the left in every second run: each two are as far apart in all, and no three fit."""
+    return 0.5 * (-1) ** int(of["run_id"])
+
+
 def _segments(make: Callable[[int], bytes], count: int = _MANY) -> Callable[[Path], Path]:
     """The folder of one run in so many files."""
 
@@ -97,14 +102,20 @@ FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
     "a thousand copies of a run": _runs(lambda _: _small(_driven(10, 10, 0), "r")),
     "a thousand bombs": _runs(lambda number: _small(_empty_readings(30_000), str(number))),
     "a thousand long robot.yamls": _runs(_long_yaml),
-    "as many runs as may be": _full_runs(44, lambda of: observed(50, 18, 18, 0.041, agree=True, apart_m=0.5, **of)),
-    "as many runs as may be, at odds": _full_runs(44, lambda of: observed(50, 18, 18, **of)),
+    "as many runs as may be": _full_runs(40, lambda of: observed(50, 18, 18, 0.041, agree=True, apart_m=0.5, **of)),
+    "as many runs as may be, at odds": _full_runs(40, lambda of: observed(50, 18, 18, **of)),
+    "as many runs as may be, mirrored": _full_runs(
+        40, lambda of: observed(50, 18, 18, 0.041, agree=True, apart_m=_mirrored(of), **of)
+    ),
     "as many long runs as may be": _full_runs(
-        44, lambda of: observed(230, 18, 4, 0.041, agree=True, apart_m=0.5, **of)
+        40, lambda of: observed(230, 18, 4, 0.041, agree=True, apart_m=0.5, **of)
     ),
     "ten runs past eighty tags": _full_runs(10, lambda of: observed(100, 80, 40, 0.041, agree=True, apart_m=0.5, **of)),
     "two runs past four hundred tags": _full_runs(
         2, lambda of: observed(50, 400, 400, 0.041, agree=True, apart_m=0.5, **of)
+    ),
+    "two runs past four hundred tags, mirrored": _full_runs(
+        2, lambda of: observed(50, 400, 400, 0.041, agree=True, apart_m=_mirrored(of), **of)
     ),
 }
 """Of several runs."""

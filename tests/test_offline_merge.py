@@ -9,6 +9,7 @@ import pytest
 from calib import se2
 from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
+from offline.alignment_effort import AlignmentEffort, AlignmentTooLongError
 from offline.chain import chains_of
 from offline.local_map import LocalMap, solve_local_map
 from offline.measured import Placement
@@ -91,6 +92,26 @@ def test_starts_follow_from_the_strongest_alignments() -> None:
     ]
     ((_, starts),) = joined(maps)
     np.testing.assert_allclose(starts[:3], [STARTS[name] for name in "abc"], atol=1e-6)
+
+
+def test_pairs_that_take_more_than_the_logs_are_worth_are_left_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps = chain_of_maps()
+    monkeypatch.setattr(AlignmentEffort, "of_logs", lambda _: AlignmentEffort(250e6))  # of two pairs
+    merged = merge(maps)
+    assert [pair.is_searched for pair in merged.pairs] == [True, False, False]
+    assert len(merged.groups) == 3
+    warnings = merge_warnings(maps, merged)
+    assert "2 of 3 pairs of drives that share tags were not laid over each other, b_one and c_one among" in warnings[0]
+    assert any("shares 2 tags with" in each and "but was not laid over it" in each for each in warnings[1:])
+
+
+def test_logs_are_worth_more_the_larger_they_are() -> None:
+    small, large = AlignmentEffort.of_logs(1 << 20), AlignmentEffort.of_logs(10 << 20)
+    with pytest.raises(AlignmentTooLongError):
+        small.linearise(1000)
+    large.linearise(1000)
 
 
 def test_a_measured_start_joins_what_no_tag_joins() -> None:
