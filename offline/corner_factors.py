@@ -165,11 +165,6 @@ class CornerFactors:
         block = self.columns(columns), self._jacobian(state, seen)
         return Linearised(self._residual(state, seen), (block,)), whitened
 
-    def by_columns(self, state: SpatialState) -> tuple[FloatArray, FloatArray]:
-        """Residuals (M, 8) and their derivatives (M, 8, 19), in the order of `columns`."""
-        seen = self._seen(state)
-        return self._residual(state, seen), self._jacobian(state, seen)
-
     def _jacobian(self, state: SpatialState, seen: Seen) -> FloatArray:
         looks = self.looks
         turned_rows = _about_up(looks.moved[..., 2] - (self._late(state) * looks.twist[:, 2])[:, None])
