@@ -100,7 +100,9 @@ class Found:
             self.measured += judged(graph, last, measurements, index)
             self.checks += checks_of(graph, solution, index)
             self.metres.append(metre_of(graph, index))
-        if refined is None:  # else the map's sigmas are not those that advice is foretold from
+        is_refined, poses = refined is not None, last.state.poses
+        del solved, refined, last  # the factor on corners, which nothing below asks
+        if not is_refined:  # else the map's sigmas are not those that advice is foretold from
             with stages.stage("advice"):
                 self.advice += advise(graph, solution, index)
         if not solution.converged:
@@ -109,7 +111,7 @@ class Found:
             )
         with stages.stage("checking that it fits"):
             self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
-        return Solved(members, graph, solution, last.state.poses)
+        return Solved(members, graph, solution, poses)
 
 
 def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, solution: Solution) -> list[str]:

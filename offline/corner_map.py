@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from calib.robot import Mount
 from offline.corner_floor import LEVEL, fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import CornerGraph, corner_graph
+from offline.corner_problem import CornerProblem
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.factors import State
 from offline.graph import Graph, Parameter
@@ -19,10 +20,15 @@ from offline.solver import Solution
 
 # Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
 _MOST_OUTLIERS: Final = 0.5
+_NOT_REFINED: Final = "not refined on tag corners: {}; the map is that of tag positions on the floor"
 # Looks that share a picture which may stand off level, ten kilobytes a pair. A drive that sees ten tags in each of its
 # pictures records twice as much for each pair.
 _FREE_PAIRS: Final = 5000
 _BYTES_A_PAIR: Final = 64
+# What a factor on corners may take: a drive through a hall takes a twentieth of it. Beside it joint covariances of the
+# tags take a third as much.
+_FREE_FACTOR_BYTES: Final = 32 << 20
+_FACTOR_BYTES_PER_BYTE: Final = 64
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,8 @@ def refine(
     if not solution.converged:
         return None, []  # the map says so already
     corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
+    if reason := _too_large(graph, corners.problem):
+        return None, [_NOT_REFINED.format(reason)]
     found = solve_corners(corners.problem, start)
     too_many = _too_many_coupled(graph, found)
     sigma = LEVEL if too_many else guessed_wobble(found.problem, found.state, found.factor, found.pictures)
@@ -99,17 +107,30 @@ def refine(
             f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
         )
     if reason:
-        return None, [
-            *off_level,
-            f"not refined on tag corners: {reason}; the map is that of tag positions on the floor",
-        ]
+        return None, [*off_level, _NOT_REFINED.format(reason)]
     return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags) + off_level
+
+
+def _too_large(graph: Graph, problem: CornerProblem) -> str:
+    """Why logs are not worth the memory of refining them, with the way out; else nothing."""
+    n_bytes, factor_bytes = _log_bytes(graph), problem.order.n_bytes
+    most = _FREE_FACTOR_BYTES + _FACTOR_BYTES_PER_BYTE * n_bytes
+    if not n_bytes or factor_bytes <= most:
+        return ""
+    return (
+        f"{len(graph.tags)} tags that pictures tie together would take {factor_bytes >> 20} MiB, limit "
+        f"{most >> 20} MiB for logs of {n_bytes} bytes (are the tags' numbers right?)"
+    )
+
+
+def _log_bytes(graph: Graph) -> int:
+    """Of all logs of a graph."""
+    return sum(run.log_bytes for run in {chain.run.name: chain.run for chain in graph.chains}.values())
 
 
 def _too_many_coupled(graph: Graph, found: CornerSolution) -> list[str]:
     """Why the floor is taken for level, where its logs are not worth the work of asking; no sentence else."""
-    runs = {chain.run.name: chain.run for chain in graph.chains}.values()
-    n_pairs, n_bytes = found.problem.n_coupled, sum(run.log_bytes for run in runs)
+    n_pairs, n_bytes = found.problem.n_coupled, _log_bytes(graph)
     most = _FREE_PAIRS + n_bytes // _BYTES_A_PAIR
     if not n_bytes or n_pairs <= most:
         return []

@@ -81,6 +81,11 @@ class Fronts:
         )
         return total
 
+    @property
+    def n_bytes(self) -> int:
+        """What the entries of a matrix take, or of its factor."""
+        return 8 * int(self.nodes.offset[-1])
+
     def empty(self, *, is_whole: bool = True) -> System:
         """Zeros for factors to be added to; without room for matrices unless all is wanted."""
         return System(self.nodes, np.zeros(self.nodes.offset[-1] if is_whole else 0), np.zeros(self.n))
@@ -154,6 +159,8 @@ class FrontFactor:
         Z = np.zeros((len(rows), len(free)))
         Z[row[columns[free]], np.arange(len(free))] = 1.0
         whiten(nodes, self.entries, np.flatnonzero(on_path), row, Z)
+        if len(free) == len(columns):
+            return np.asarray(Z.T @ Z)
         covariance = np.zeros((len(columns), len(columns)))
         covariance[np.ix_(free, free)] = Z.T @ Z
         return covariance

@@ -134,10 +134,11 @@ def build_map(
         maps, measurements, stages, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad
     )
     workings.maps += maps
-    found = Found()
-    workings.solved += [found.take(maps, each, measurements, stages) for each in components]
-    found.measured += unused(measurements, found.measured)
     joined = join_results(components, joins)
+    found = Found()
+    while components:  # each is let go of where it has told its part: a factor on corners may take 100 MiB
+        workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
+    found.measured += unused(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     return MapResult(

@@ -20,6 +20,7 @@ from offline.arrowhead_build import compiled_motions
 from offline.corner_factors import SpatialState
 from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import corner_graph
+from offline.corner_map import refine
 from offline.corner_problem import CornerProblem
 from offline.corner_sides import facing_as_predicted
 from offline.corner_solver import CornerSolution, solve_corners
@@ -240,6 +241,19 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
     np.testing.assert_allclose(se2.compose(poses[edges.first], edges.motion)[:, :2], poses[edges.first + 1, :2])
     floor = edges_of(workings.solved[0].graph, workings.solved[0].solution)
     np.testing.assert_array_equal(edges.place_information, floor.place_information)
+
+
+def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
+    room: tuple[Path, MapResult, Workings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = room[2].solved[0]
+    assert refine(solved.graph, solved.solution)[0] is not None
+    monkeypatch.setattr(corner_map, "_FREE_FACTOR_BYTES", 1 << 20)
+    monkeypatch.setattr(corner_map, "_FACTOR_BYTES_PER_BYTE", 0)
+    refined, (sentence,) = refine(solved.graph, solved.solution)
+    assert refined is None
+    assert "limit 1 MiB" in sentence
+    assert "the map is that of tag positions on the floor" in sentence
 
 
 def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Workings]) -> None:
