@@ -12,6 +12,7 @@ from offline.corner_floor import LEVEL, fitted_wobble, guessed_wobble, with_wobb
 from offline.corner_graph import CornerGraph, corner_graph
 from offline.corner_problem import CornerProblem
 from offline.corner_solver import CornerSolution, solve_corners
+from offline.corner_start import tags_rehung
 from offline.factors import State
 from offline.graph import Graph, Parameter
 from offline.level_stretches import stretches_off_level
@@ -98,6 +99,7 @@ def refine(
     sigma = LEVEL if too_many else guessed_wobble(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
+        found = solve_corners(found.problem, tags_rehung(found.problem, found.state))
         sigma = fitted_wobble(found.problem, found.state)
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
     off_level = [*too_many, *stretches_off_level(graph, found)]

@@ -224,6 +224,12 @@ class CornerProblem:
             losses, weight = losses_and_weights(CORNER_LOSS, residual)
         return Weighed(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
 
+    def looks_cost(self, state: SpatialState) -> float:
+        """Twice the cost of the looks alone; infinite where a lens has no image of a corner."""
+        linearised, wobble = self.corners.linearise(state, self.columns)
+        cost = self.weighed(linearised.residual, wobble).cost
+        return cost if np.isfinite(cost) else np.inf
+
     def log_spread(self, state: SpatialState) -> float:
         """Logarithm of the determinant of the whitened corners' covariance I + J S J^T; 0 where all is level."""
         linearised, wobble = self.corners.linearise(state, self.columns)
