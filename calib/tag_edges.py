@@ -14,7 +14,6 @@ from calib.arrays import FloatArray
 
 _NEXT: Final = np.array([1, 2, 3, 0])
 _LAST: Final = np.array([3, 0, 1, 2])
-_TURNED: Final = np.array([1.0, -1.0])  # (x, y) to (y, -x)
 
 
 def outward(corners_px: FloatArray) -> FloatArray:
@@ -27,11 +26,15 @@ def outward(corners_px: FloatArray) -> FloatArray:
         corners_px: (..., 4, 2) clockwise as seen in the picture (y down), as `groundsbot.proto` has them; where two of
             them coincide the result is no number.
     """
+    x, y = corners_px[..., 0], corners_px[..., 1]
+    moved: FloatArray = np.empty_like(corners_px)
     with np.errstate(all="ignore"):
-        side = corners_px[..., _NEXT, :] - corners_px
-        normal = side[..., ::-1] * _TURNED / np.sqrt((side**2).sum(axis=-1, keepdims=True))
-        before = normal[..., _LAST, :]
-        moved: FloatArray = (normal + before) / (1.0 + (normal * before).sum(axis=-1, keepdims=True))
+        along_x, along_y = x[..., _NEXT] - x, y[..., _NEXT] - y
+        length = np.sqrt(along_x**2 + along_y**2)
+        n_x, n_y = along_y / length, -along_x / length
+        m_x, m_y = n_x[..., _LAST], n_y[..., _LAST]
+        parallel = 1.0 + (n_x * m_x + n_y * m_y)
+        moved[..., 0], moved[..., 1] = (n_x + m_x) / parallel, (n_y + m_y) / parallel
     return moved
 
 

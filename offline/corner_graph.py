@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,11 +16,13 @@ from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Loo
 from offline.corner_problem import CornerProblem, columns_of
 from offline.corner_sides import facing_as_predicted
 from offline.corner_start import tags_hung
-from offline.factors import CalibrationPrior, ReadingFactors, State
-from offline.graph import Graph, Parameter, camera_parameters_of, mount_parameters_of, scale_parameter_of
+from offline.factors import MOUNT_PARAMETERS, CalibrationPrior, ReadingFactors, State
+from offline.graph import Graph, Parameter
+from offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
 from offline.upright import NOTHING_UPRIGHT, UprightFactors
 
 _CORNER_NOISE: Final = "sigma_corner_px"
+_HEIGHT: Final = "mount_z_m"
 
 
 @dataclass(frozen=True)
@@ -108,50 +110,78 @@ def _looks(
     graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
 ) -> tuple[Looks, tuple[CameraModel, ...]]:
     """Those readings of each chain that have corners, and the cameras."""
+    floor = _readings_where(graph.problem.readings, np.concatenate(masks))
     cameras: list[CameraModel] = []
-    found = []
-    index = {parameter: i for i, parameter in enumerate(parameters)}
-    tag_index = {tag: i for i, tag in enumerate(graph.tags)}
-    for chain, mask, first_pose in zip(graph.chains, masks, graph.first_pose.tolist(), strict=True):
+    shown: list[_Shown] = []
+    of_chain: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
+    for chain, mask in zip(graph.chains, masks, strict=True):
         camera = chain.run.camera
         if camera is None or not mask.any():
             continue
         if camera not in cameras:
             cameras.append(camera)
-        robot, readings = chain.run.robot, chain.readings.where(mask)
-        n = len(readings)
-        x, y, yaw = mount_parameters_of(robot)
-        roll, pitch, time, edges = camera_parameters_of(chain)
-        mount = [index[p] for p in (x, y, _height_parameter(chain), roll, pitch, yaw)]
-        scales = np.array([index[scale_parameter_of(chain, tag)] for tag in chain.tags], dtype=np.int64)
-        sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
-        own_tags = np.array([tag_index[tag] for tag in chain.tags], dtype=np.int64)
-        unit = readings.parts.of((_CORNER_NOISE,))[0]
-        by_corners = readings.covariance - readings.parts.rest
-        variance = np.trace(by_corners, axis1=1, axis2=2) / np.trace(unit, axis1=1, axis2=2)
-        moved, twist = _moved(chain, readings.keyframe, readings.corners_px, camera.height_px)
-        nominal = [getattr(robot.mount, name.removeprefix("mount_")) for name in CORNER_MOUNT]
-        found.append(
-            Looks(
-                pose=first_pose + readings.keyframe,
-                tag=own_tags[readings.tag],
-                corners_px=readings.corners_px,
-                sigma_px=np.sqrt(variance) * readings.corner_sigmas,
-                side_m=sides_m[readings.tag],
-                camera=np.full(n, cameras.index(camera)),
-                moved=moved,
-                twist=twist,
-                mount=np.tile(nominal, (n, 1)),
-                mount_parameters=np.tile(mount, (n, 1)),
-                time_parameter=np.full(n, index[time]),
-                scale_parameter=scales[readings.tag],
-                focal_parameter=np.full(n, index[_focal_parameter(chain)]),
-                edge_parameter=np.full(n, index[edges]),
-                outward=outward(readings.corners_px),
-            )
-        )
-    whole = Looks(*(np.concatenate([getattr(each, field.name) for each in found]) for field in fields(Looks)))
-    return whole, tuple(cameras)
+        own = [parameters.index(each) for each in (_height_parameter(chain), _focal_parameter(chain))]
+        of_chain.append((own[0], own[1], cameras.index(camera)))
+        shown.append(_shown(chain, mask, camera.height_px))
+    found = _Shown(*(np.concatenate(each) for each in zip(*shown, strict=True)))
+    heights, focal, camera_of = np.repeat(of_chain, [len(each.sigma_px) for each in shown], axis=0).T
+    index: dict[str, IntArray] = {
+        **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
+        **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
+        _HEIGHT: heights,
+    }
+    looks = Looks(
+        pose=floor.pose,
+        tag=floor.tag,
+        corners_px=found.corners_px,
+        sigma_px=found.sigma_px,
+        side_m=found.side_m,
+        camera=camera_of,
+        moved=found.moved,
+        twist=found.twist,
+        mount=found.mount,
+        mount_parameters=np.column_stack([index[name] for name in CORNER_MOUNT]),
+        time_parameter=index[TIME_OFFSET],
+        scale_parameter=floor.scale_parameter,
+        focal_parameter=focal,
+        edge_parameter=index[EDGE_SHIFT],
+        outward=outward(found.corners_px),
+    )
+    return looks, tuple(cameras)
+
+
+class _Shown(NamedTuple):
+    """What the floor knows nothing of: arrays of `Looks` with the same names."""
+
+    corners_px: FloatArray
+    sigma_px: FloatArray
+    side_m: FloatArray
+    moved: FloatArray
+    twist: FloatArray
+    mount: FloatArray
+
+
+def _shown(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
+    """Of those readings of one chain that have corners."""
+    robot, readings = chain.run.robot, chain.readings
+    corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
+    unit = parts.of((_CORNER_NOISE,))[0]
+    variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
+    sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
+    moved, twist = _moved(chain, readings.keyframe[mask], corners_px, height_px)
+    return _Shown(
+        corners_px,
+        np.sqrt(variance) * readings.corner_sigmas[mask],
+        sides_m[readings.tag[mask]],
+        moved,
+        twist,
+        np.tile([getattr(robot.mount, name.removeprefix("mount_")) for name in CORNER_MOUNT], (len(corners_px), 1)),
+    )
+
+
+def _trace(matrices: FloatArray) -> FloatArray:
+    """(M,) of (M, 2, 2); numpy's own takes five times as long."""
+    return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
 
 
 def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: int) -> tuple[FloatArray, FloatArray]:
@@ -176,7 +206,7 @@ def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: 
 
 def _height_parameter(chain: Chain) -> Parameter:
     mount = chain.run.robot.mount
-    return Parameter(chain.run.robot_id, "mount_z_m", (mount.z_m,), mount.z_m_sigma)
+    return Parameter(chain.run.robot_id, _HEIGHT, (mount.z_m,), mount.z_m_sigma)
 
 
 def _focal_parameter(chain: Chain) -> Parameter:

@@ -9,7 +9,7 @@ from offline.arrowhead_kernels import eliminate_columns
 from offline.corner_chosen_looks import ByTag
 from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, gone_back
 from offline.corner_step_kernels import turn_by
-from offline.jit import borrowed, inner, jitted
+from offline.jit import borrowed, inlined, inner, jitted
 from offline.lens_kernels import CENTRE, distorted_at
 from offline.linearise_kernels import multiply
 from offline.planar_kernels import ray_through, square_poses
@@ -180,7 +180,7 @@ def _eyes(looks: LookArrays, values: SpatialValues, which: IntArray) -> tuple[Fl
     return axes, places
 
 
-@inner
+@inlined
 def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: FloatArray, places: FloatArray) -> None:
     """Sets R_camera_map (4, 3, 3) and the camera's places (4, 3) when each corner's row of one look was read out.
 
@@ -193,7 +193,13 @@ def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: Fl
     pose = values.poses[looks.pose[m]]
     cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
     for k in range(4):
-        moved = looks.moved[m, k]
+        moved, last = looks.moved[m, k], looks.moved[m, max(k - 1, 0)]
+        if k > 0 and moved[0] == last[0] and moved[1] == last[1] and moved[2] == last[2]:  # all rows at once
+            for a in range(3):
+                places[k, a] = places[k - 1, a]
+                for b in range(3):
+                    axes[k, a, b] = axes[k - 1, a, b]
+            continue
         cos_m, sin_m = np.cos(moved[2]), np.sin(moved[2])
         x, y = moved[0] + cos_m * back_x - sin_m * back_y, moved[1] + sin_m * back_x + cos_m * back_y
         _camera_at(

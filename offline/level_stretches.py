@@ -10,6 +10,7 @@ elsewhere has L = 0: they took the slope for their own.
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import pairwise
 from math import degrees
 from typing import Final, NamedTuple
 
@@ -114,26 +115,27 @@ def _pictures(solution: CornerSolution) -> _Pictures:
     return _Pictures(pose, slope, spread @ found.own, picture, spread[picture] @ found.coupled, columns, range_m)
 
 
-def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[IntArray]:
+def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[slice]:
     """Pictures of a chain, cut by the way driven and by what was turned."""
     steps = np.maximum(chain.odometry.distance_m / _STRETCH_M, np.abs(chain.odometry.motion[:, 2]) / _STRETCH_RAD)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     begin, end = np.searchsorted(pictures.pose, [first, first + len(along)]).tolist()
     cell = along[pictures.pose[begin:end] - first].astype(np.int64)
-    return np.split(np.arange(begin, end), np.flatnonzero(np.diff(cell)) + 1) if end > begin else []
+    bounds = [begin, *(begin + 1 + np.flatnonzero(np.diff(cell))).tolist(), end]
+    return [slice(*each) for each in pairwise(bounds)] if end > begin else []
 
 
-def _show(pictures: _Pictures, cut: Sequence[IntArray]) -> list[IntArray]:
+def _show(pictures: _Pictures, cut: Sequence[slice]) -> list[slice]:
     """Stretches that might be off: as good as certain poses and tags are not, they can only look less so."""
-    first = [each[0] for each in cut]  # each picture is of one stretch
+    first = [each.start for each in cut]  # each picture is of one stretch
     slope, information = np.add.reduceat(pictures.slope, first), np.add.reduceat(pictures.information, first)
     square = np.einsum("ci,cij,cj->c", slope, np.linalg.pinv(information, hermitian=True), slope)
     return [cut[c] for c in np.flatnonzero(square > _MAY_BE).tolist()]
 
 
-def _coupled(pictures: _Pictures, which: IntArray, n: int) -> FloatArray:
+def _coupled(pictures: _Pictures, which: slice, n: int) -> FloatArray:
     """C (3, n) of a stretch."""
-    looks = np.flatnonzero(np.isin(pictures.look_picture, which))
+    looks = np.flatnonzero((pictures.look_picture >= which.start) & (pictures.look_picture < which.stop))
     coupled = np.zeros((3, n + 1))  # the last takes what is held
     for k in range(3):
         np.add.at(coupled[k], pictures.columns[looks], pictures.coupled[looks, k])
@@ -168,11 +170,12 @@ def _by_chance(n: int, freedom: int) -> float:
     return float(chi2.isf(_FALSE_ALARM / n, freedom))
 
 
-def _sentence(graph: Graph, which: IntArray, stretch: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:
-    index = int(np.searchsorted(graph.first_pose, pictures.pose[which[0]], side="right")) - 1
+def _sentence(graph: Graph, which: slice, stretch: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:
+    poses = pictures.pose[which]
+    index = int(np.searchsorted(graph.first_pose, poses[0], side="right")) - 1
     chain, first = graph.chains[index], int(graph.first_pose[index])
-    begin_s, end_s = ((chain.stamps_ns[pictures.pose[k] - first] - chain.stamps_ns[0]) * 1e-9 for k in which[[0, -1]])
-    x_m, y_m = solution.state.poses[pictures.pose[which], :2].mean(axis=0)
+    begin_s, end_s = (chain.stamps_ns[poses[[0, -1]] - first] - chain.stamps_ns[0]) * 1e-9
+    x_m, y_m = solution.state.poses[poses, :2].mean(axis=0)
     (roll, pitch, height_m), (d_roll, d_pitch, d_height_m) = stretch.off, stretch.sigma
     return (
         f"{chain.name} is not level with the rest from {begin_s:.0f} to {end_s:.0f} s, about ({x_m:.1f}, {y_m:.1f}) m: "

@@ -5,6 +5,7 @@ keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -55,16 +56,21 @@ class WheelTrack:
     quantum_m: float = 0.0
     covariance: FloatArray | None = None
 
+    @cached_property
+    def _since_first_s(self) -> FloatArray:
+        """(N,) of the readings."""
+        return _seconds(self.stamps_ns, self.stamps_ns[0])
+
     def at(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Cumulative (left_m, right_m) at other times: speeds are constant between readings."""
-        times, readings = _seconds(stamps_ns, self.stamps_ns[0]), _seconds(self.stamps_ns, self.stamps_ns[0])
-        return np.interp(times, readings, self.left_m), np.interp(times, readings, self.right_m)
+        times = _seconds(stamps_ns, self.stamps_ns[0])
+        return np.interp(times, self._since_first_s, self.left_m), np.interp(times, self._since_first_s, self.right_m)
 
     def twist_at(self, stamps_ns: IntArray, track_m: float) -> FloatArray:
         """(K, 2) speed in m/s and turning rate in rad/s about some times, by differences over a short while."""
         before = np.maximum(stamps_ns - _WHILE_NS, self.stamps_ns[0])
         after = np.minimum(stamps_ns + _WHILE_NS, self.stamps_ns[-1])
-        left_m, right_m = (b - a for a, b in zip(self.at(before), self.at(after), strict=True))
+        left_m, right_m = (m[1] - m[0] for m in self.at(np.stack([before, after])))
         seconds = np.maximum(after - before, 1) * 1e-9
         speed_m_s, turning_rad_s = 0.5 * (left_m + right_m) / seconds, (right_m - left_m) / (track_m * seconds)
         return np.stack([speed_m_s, turning_rad_s], axis=-1)

@@ -14,9 +14,11 @@ from offline.covariance_parts import CovarianceParts, concatenated
 
 # How many pixels too far out the sides of tags are seen.
 EDGE_SHIFT: Final = "edge_shift_px"
+# By how much pictures' stamps are late.
+TIME_OFFSET: Final = "time_offset_s"
 # What a robot's camera adds to its readings besides place and yaw of the mount, to first order: how its corners are
 # read with another roll or pitch, where its tags were when the stamps are late, and what tags look too large by.
-CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", "time_offset_s", EDGE_SHIFT)
+CAMERA_PARAMETERS: Final = ("mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, EDGE_SHIFT)
 
 
 @dataclass(frozen=True)

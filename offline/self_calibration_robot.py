@@ -9,10 +9,9 @@ from offline.corner_factors import FOCAL_SCALE
 from offline.factors import MOUNT_PARAMETERS
 from offline.graph import IMPORTED_BATCH, TAG_SCALE
 from offline.odometry import WHEEL_PARAMETERS
-from offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT
+from offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
 
 _WHEEL_SCALE, _WHEEL_RATIO, _TRACK_SCALE = WHEEL_PARAMETERS
-_TIME_OFFSET: Final = "time_offset_s"
 _MOUNT: Final = "mount_"
 
 # What may be freed, and how far off a robot can be at all: what lies beyond is no error of calibration but the file of
@@ -24,7 +23,7 @@ LIMITS: Final[Mapping[str, float]] = MappingProxyType(
         **dict.fromkeys((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), 0.2),  # rad; 11 degrees
         "mount_x_m": 0.2,
         "mount_y_m": 0.2,
-        _TIME_OFFSET: 0.2,
+        TIME_OFFSET: 0.2,
         EDGE_SHIFT: 1.0,
         TAG_SCALE: 0.3,
         FOCAL_SCALE: 0.1,
@@ -64,7 +63,7 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
         update={
             "wheels": wheels.model_copy(update=changed),
             "mount": mount.model_copy(update=of_mount),
-            "time_offset_s_sigma": sigma(_TIME_OFFSET) or robot.time_offset_s_sigma,
+            "time_offset_s_sigma": sigma(TIME_OFFSET) or robot.time_offset_s_sigma,
             "edge_shift_px_sigma": sigma(EDGE_SHIFT) or robot.edge_shift_px_sigma,
             "focal_scale_sigma": sigma(FOCAL_SCALE) or robot.focal_scale_sigma,
             "tags": [_opened_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
@@ -94,7 +93,7 @@ def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
         "mount": _corrected_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
         "tags": [_corrected_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
     }
-    if late := of(_TIME_OFFSET):
+    if late := of(TIME_OFFSET):
         changed |= {"time_offset_s": robot.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
     if shift := of(EDGE_SHIFT):
         changed |= {"edge_shift_px": robot.edge_shift_px + shift.value, "edge_shift_px_sigma": shift.sigma}
