@@ -59,6 +59,7 @@ class Case:
     angle_deg: float = 20.0
     smear_px: float = 0.0  # of motion during the exposure
     wall: float = 0.6  # brightness of what the tag hangs on
+    lit: float = 0.0  # share by which light grows from the tag's left side to its right
     off_axis_px: float = 0.0  # that the picture is cut out of a larger one, down and right of the lens's axis
     settings: dict[str, float] = field(default_factory=dict)  # of fixtures.world.Pictures
 
@@ -72,6 +73,7 @@ CASES: Final = (
     Case("gamma 1.1", settings={"gamma": 1.1}),
     Case("overexposed, blooming", settings={"white": 1.3, "bloom": 0.3}),
     Case("dim", wall=0.15, settings={"white": 0.2, "black": 0.012, "full_well_electrons": 3000.0}),
+    Case("lit from one side", lit=0.1),
     Case("off the lens's axis", off_axis_px=400.0),
     Case("the same, side 160 px", side_px=160.0, off_axis_px=400.0),
 )
@@ -124,8 +126,18 @@ def pictures_of(case: Case, n: int, seed: int = 0) -> tuple[CameraModel, list[tu
     taken = []
     for _ in range(n):
         drive = _drive(case, rng, settings.exposure_s)
-        taken.append((renderer.picture(drive, _NS // 2, rng), _true_corners(tags, eye, drive)))
+        taken.append((_lit(renderer.picture(drive, _NS // 2, rng), case), _true_corners(tags, eye, drive)))
     return camera, taken
+
+
+def _lit(grey: Grey, case: Case) -> Grey:
+    """With the light of a lamp to the right."""
+    if not case.lit:
+        return grey
+    off_middle_px = np.arange(grey.shape[1]) - 0.5 * (grey.shape[1] - 1)
+    light = (1.0 + case.lit / case.side_px * off_middle_px) / (1.0 + 0.5 * case.lit / case.side_px * grey.shape[1])
+    lit: Grey = np.rint(grey * light).astype(np.uint8)
+    return lit
 
 
 def _camera(case: Case) -> CameraModel:
