@@ -13,7 +13,7 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.errors import OfflineError
 from offline.map_errors import ComponentErrors, MapErrors, StartError, TagError
-from offline.nees import errors_along_arcs, nees_per_dim, turns_rad
+from offline.nees import nees_per_dim, tangent_errors
 from offline.result import Component, MapResult, RunResult, TagResult
 from offline.truth import TrueRun, Truth
 
@@ -68,7 +68,7 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
     world = np.array([truth.tags_m[_name(tag)] for tag in tags]).reshape(-1, 2)
     true = se2.apply(se2.inverse(T_world_map), world)
     errors = found - true
-    nees_start, nees_tags = _nees(component, truth, T_world_map, places, known, true)
+    nees_start, nees_tags = _nees(component, places, known, true)
     for name, value, wanted in (("tags", nees_tags, len(tags)), ("start", nees_start, len(starts))):
         if wanted and value is None:
             notes.append(f"nees_{name}_per_dim: the covariance is not positive definite, so there is no figure")
@@ -114,8 +114,6 @@ def _start_places(
 
 def _nees(
     component: Component,
-    truth: Truth,
-    T_world_map: FloatArray,
     places: Mapping[str, tuple[FloatArray, FloatArray]],
     known: Sequence[int],
     true_tags_m: FloatArray,
@@ -130,7 +128,7 @@ def _nees(
     true_m = np.concatenate([np.array([places[name][1] for name in starts]).reshape(-1, 2), true_tags_m])
     if not len(rows) or not np.isfinite(covariance).all():
         return None, None
-    errors = errors_along_arcs(found_m, true_m, turns_rad(component, truth, T_world_map, found_m), covariance)
+    errors = tangent_errors(found_m, true_m, covariance)
     n = len(starts)
     return (
         nees_per_dim(errors[:n].reshape(-1), covariance[: 2 * n, : 2 * n]),

@@ -45,9 +45,6 @@ def test_tag_figures_are_those_worked_out_by_hand() -> None:
     errors = evaluate(made_map(moved(component, off, np.zeros(2))), made_truth(component)).components[0]
     assert errors.tags_rmse_m == pytest.approx(0.13 / np.sqrt(3))  # sqrt((0.05^2 + 0.12^2) / 3)
     assert [tag.error_m for tag in errors.tags] == pytest.approx([0.05, 0.0, 0.12])
-    e = off.reshape(-1)
-    wanted = e @ np.linalg.inv(component.joint_covariance[6:, 6:]) @ e / 6
-    assert errors.nees_tags_per_dim == pytest.approx(wanted)
     assert errors.tags[0].sigma_m == pytest.approx(np.trace(component.joint_covariance[6:8, 6:8]) ** 0.5)
 
 
@@ -61,8 +58,16 @@ def test_start_figures_are_those_worked_out_by_hand() -> None:
     assert pair.true_distance_m == pytest.approx(np.hypot(10, 2))
     assert pair.distance_error_m == pytest.approx(np.hypot(10.3, 1.6) - np.hypot(10, 2))
     assert pair.percent == pytest.approx(100 * pair.distance_error_m / np.hypot(10, 2))
-    wanted = d @ np.linalg.inv(component.joint_covariance[3:5, 3:5]) @ d / 2
-    assert errors.nees_start_per_dim == pytest.approx(wanted)
+
+
+def test_nees_of_small_errors_is_that_worked_out_by_hand() -> None:
+    """Of large ones lengths and directions count (test_offline_nees)."""
+    component = made_component()
+    off, d = 1e-4 * np.array([[3.0, 4.0], [0.0, 0.0], [0.0, -12.0]]), 1e-4 * np.array([3.0, -4.0])
+    errors = evaluate(made_map(moved(component, off, d)), made_truth(component)).components[0]
+    for name, rows, error in (("tags", slice(6, 12), off.reshape(-1)), ("start", slice(3, 5), d)):
+        wanted = error @ np.linalg.inv(component.joint_covariance[rows, rows]) @ error / len(error)
+        assert getattr(errors, f"nees_{name}_per_dim") == pytest.approx(wanted, rel=1e-3), name
 
 
 def test_errors_drawn_from_the_covariance_have_a_nees_of_one() -> None:
