@@ -15,6 +15,9 @@ from offline.front_kernels import System
 from offline.fronts import FrontFactor, NotPositiveError
 
 _MOST_STEPS: Final = 40
+# What is tried of a step, the most first. What hangs loose is swung by metres on an arc that a whole step overshoots;
+# damping that holds it back lets it only creep from then on.
+_SHARES: Final = (1.0, 0.5, 0.2)
 # In squared sigmas: a step that brings less is 1e-4 sigma long. It is taken, and what it leaves over is
 # smaller still by far.
 _COST_TOLERANCE: Final = 1e-8
@@ -66,11 +69,21 @@ class CornerSolution:
 
 
 class _Step(NamedTuple):
-    """By a factor of H; what it promises of the cost; where it leads."""
+    """By a factor of H; (n,) in the tangent vector; what it promises of the cost; where it leads."""
 
     factor: FrontFactor
+    by: FloatArray
     expected: float
     state: SpatialState
+
+
+class _Taken(NamedTuple):
+    """What came of a step: where it led, and what it brought as a share of what it promised."""
+
+    state: SpatialState
+    system: System
+    cost: float
+    gain: float
 
 
 class _ClosedIn(NamedTuple):
@@ -109,10 +122,10 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
                 state = closed_in.state
                 costs += closed_in.costs
                 return ended("converged", step.factor)
-        tried, tried_cost = problem.system(step.state)
-        if tried_cost < cost:
-            damping.step_taken((cost - tried_cost) / step.expected)
-            state, system, cost = step.state, tried, tried_cost
+        taken = _taken(problem, state, step, cost)
+        if taken is not None:
+            damping.step_taken(taken.gain)
+            state, system, cost = taken.state, taken.system, taken.cost
             costs.append(cost)
             continue
         damping.step_rejected()
@@ -130,7 +143,17 @@ def _step(problem: CornerProblem, system: System, state: SpatialState, share: fl
     expected = -0.5 * float(system.gradient @ step)
     if raised is not None:
         expected += 0.5 * float((raised * step**2).sum())
-    return _Step(factor, expected, problem.moved(state, step))
+    return _Step(factor, step, expected, problem.moved(state, step))
+
+
+def _taken(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _Taken | None:
+    """The step, or less of it; None where none of that goes down."""
+    for share in _SHARES:
+        there = step.state if share == 1.0 else problem.moved(state, share * step.by)
+        system, found = problem.system(there)
+        if found < cost:
+            return _Taken(there, system, found, (cost - found) / (share * (2.0 - share) * step.expected))
+    return None
 
 
 def _closed_in(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | None:
