@@ -1,13 +1,15 @@
 """Corners of detected tags, sharpened on the picture: each side of the black border fitted to the light about it.
 
-Across a side the light is taken for a blurred step, a + h erf(d / (sqrt(2) s)), d being a pixel's distance from it. The
-side is straight in the world, so in the picture it is bent as the lens bends it; where it runs is told by its distance
-from the detector's line at both ends. These two, a, h and s are fitted to the pixels along the side (Gauss-Newton, all
-sides of a picture at once), and corners are where neighbouring sides meet.
+Across a side the light is taken for a blurred step, a + h erf(d / (sqrt(2) s)), d being a pixel's distance from it;
+along the side it grows or wanes evenly, white and black by the same share: lamps, and lenses that darken towards the
+picture's edge, light one end better, which would pass for a side that lies askew. The side is straight in the world, so
+in the picture it is bent as the lens bends it; where it runs is told by its distance from the detector's line at both
+ends. These two, a, h, s and the share by which the light grows are fitted to the pixels along the side (Gauss-Newton,
+all sides of a picture at once), and corners are where neighbouring sides meet.
 
-Pixels count from one cell inside the border to one cell outside, since a white margin of one cell surrounds a tag, and
-clear of the corners, where another side is near. A tag one of whose sides does not look like this (hidden, out of the
-picture, in a shadow's edge) keeps the detector's corners.
+Pixels count within a cell of the border, since a white margin of one cell surrounds a tag, but not where the blur of
+the next cell's light is, and clear of the corners, where another side is near. A tag one of whose sides does not look
+like this (hidden, out of the picture, in a shadow's edge) keeps the detector's corners.
 """
 
 from typing import Final
@@ -25,23 +27,25 @@ _ROUNDS: Final = 6
 _ARRIVED_PX: Final = 2e-3
 _LONGEST_STEP: Final = 0.5  # px, and of the blur's logarithm
 # What is summed over pixels: the derivatives by the distance at the side's begin, at its end and by the blur's
-# logarithm, each over a factor that a side's pixels have in common; those by a and by h; and the light.
-_BEGIN, _END, _BLUR, _ONE, _EDGE, _LIGHT = range(6)
-_N: Final = 5  # unknowns
+# logarithm, each over a factor that a side's pixels have in common; those by the share by which the light grows along
+# the side, by a and by h; and the light.
+_BEGIN, _END, _BLUR, _SHADE, _ONE, _EDGE, _LIGHT = range(7)
+_N: Final = 6  # unknowns
+_MIDDLE_GREY: Final = 128.0  # about as much light above it as below: sums lose fewer digits
 # Of a tag's corners, the one that follows each, and the two opposite the side that begins there.
 _NEXT: Final = (1, 2, 3, 0)
 _BEFORE: Final = (3, 0, 1, 2)
 _OPPOSITE: Final = ((2, 3), (3, 0), (0, 1), (1, 2))
 _FIRST_BLUR_PX: Final = 0.7
 _LOG_BLUR: Final = (np.log(0.2), np.log(3.0))  # of px
-_CLEAR_PX: Final = 0.3  # before a cell is over and the next one's light comes in
-_LEAST_BAND_PX: Final = 1.2
+_CLEAR_PX: Final = 2.0  # before a cell is over, and the blur of the next one's light comes in
+_LEAST_BAND_PX: Final = 2.0
 _CLEAR_OF_CORNER_PX: Final = 2.0
 _FARTHEST_PX: Final = 1.5  # that a side may lie from where the detector saw it
 _LEAST_CONTRAST: Final = 10.0  # grey levels: twice h
 # Residuals' RMS over the contrast, 0.02 for an edge under a sensor's noise: beyond, something else is there too.
 _ROUGHEST: Final = 0.1
-_LEAST_PIXELS: Final = 25  # five for each parameter
+_LEAST_PIXELS: Final = 30  # five for each parameter
 # How far from its side an array's place is taken for that holds no pixel: there the blur's slope is 0, and erf 1.
 _NOWHERE_PX: Final = 1e3
 _NOT_FOUND_PX: Final = 1e9  # where sides do not meet
@@ -105,8 +109,8 @@ class _Sides:
         self._share[taken], self._distance[taken] = share.take(pixels), distance.take(pixels)
         self._rows = np.zeros((len(taken), _N + 1, taken.shape[1]))
         self._rows[:, _ONE] = taken
-        # About as much light above 0 as below: sums lose fewer digits.
-        self._rows[:, _LIGHT][taken] = grey.take(index.take(pixels)) - 128.0
+        self._rows[:, _LIGHT][taken] = grey.take(index.take(pixels)) - _MIDDLE_GREY
+        self._off_middle = (self._share - 0.5) * taken
         self._n_nowhere = taken.shape[1] - self._count
 
     def _depth(self, corners_px: FloatArray) -> FloatArray:
@@ -169,22 +173,28 @@ class _Sides:
 
     def fitted(self) -> tuple[FloatArray, BoolArray]:
         """(S, 2) how far each side lies from the detector's at both ends; (T,) of which tags all four look right."""
-        p = np.zeros((len(self._begin), 3))  # distance at the side's begin, at its end, logarithm of s
-        p[:, 2] = np.log(_FIRST_BLUR_PX)
+        # Distance at the side's begin and at its end, logarithm of s, and by what share the light grows along it.
+        p = np.zeros((len(self._begin), 4))
+        p[:, _BLUR] = np.log(_FIRST_BLUR_PX)
+        fit: _Fit | None = None
         rounds = 0
         while True:
             rounds += 1
-            rate = np.exp(-p[:, 2]) / np.sqrt(2.0)  # of the model's change with the distance: 1 / (sqrt(2) s)
-            fit = _Fit(self._sums(p, rate), rate)
+            rate = np.exp(-p[:, _BLUR]) / np.sqrt(2.0)  # of the model's change with the distance: 1 / (sqrt(2) s)
+            fit = _Fit(self._sums(p, rate, fit), rate, p[:, _SHADE])
             step = fit.step()
-            p[:, :2] -= step[:, :2]
-            p[:, 2] = np.maximum(np.minimum(p[:, 2] - step[:, 2], _LOG_BLUR[1]), _LOG_BLUR[0])
-            if rounds == _ROUNDS or np.abs(step[:, :2]).max() < _ARRIVED_PX:
+            p -= step
+            p[:, _BLUR] = np.maximum(np.minimum(p[:, _BLUR], _LOG_BLUR[1]), _LOG_BLUR[0])
+            # The first round knows no light yet that could grow.
+            if rounds == _ROUNDS or (rounds > 1 and np.abs(step[:, :2]).max() < _ARRIVED_PX):
                 break
         return p[:, :2], np.asarray(self._looks_right(p, fit).reshape(-1, 4).all(axis=1))
 
-    def _sums(self, p: FloatArray, rate: FloatArray) -> FloatArray:
-        """(S, 6, 6) sums over the pixels of the products of each two of _BEGIN, ..., _LIGHT."""
+    def _sums(self, p: FloatArray, rate: FloatArray, before: "_Fit | None") -> FloatArray:
+        """(S, 7, 7) sums over the pixels of the products of each two of _BEGIN, ..., _LIGHT.
+
+        Light and contrast, of which a share is what grows along a side, are those of the round before.
+        """
         scaled = self._distance * rate[:, None]
         scaled -= self._share * ((p[:, 1] - p[:, 0]) * rate)[:, None]
         scaled -= (p[:, 0] * rate)[:, None]
@@ -195,6 +205,10 @@ class _Sides:
         np.multiply(slope, self._share, out=rows[:, _END])
         np.subtract(slope, rows[:, _END], out=rows[:, _BEGIN])
         np.multiply(slope, scaled, out=rows[:, _BLUR])
+        if before is not None:
+            light = np.multiply(rows[:, _EDGE], before.h[:, None], out=rows[:, _SHADE])
+            light += (before.a + _MIDDLE_GREY)[:, None]
+            light *= self._off_middle
         sums = rows @ rows.swapaxes(-1, -2)
         sums[:, _EDGE, _EDGE] -= self._n_nowhere
         return np.asarray(sums)
@@ -206,7 +220,7 @@ class _Sides:
         one_way = np.repeat(np.abs(np.sign(fit.h).reshape(-1, 4).sum(axis=1)) == 4.0, 4)
         good = (self._count >= _LEAST_PIXELS) & (contrast > _LEAST_CONTRAST) & (rms < _ROUGHEST * contrast) & one_way
         # A blur at its limit is one that light and blur trade places in: too few pixels tell them apart.
-        good &= p[:, 2] < _LOG_BLUR[1] - 1e-6
+        good &= p[:, _BLUR] < _LOG_BLUR[1] - 1e-6
         return np.asarray(good & (np.abs(p[:, :2]).max(axis=1) < _FARTHEST_PX))
 
     def corners(self, moved: FloatArray) -> FloatArray:
@@ -228,29 +242,35 @@ class _Fit:
     """How well the model fits S sides for the sums over their pixels, and where it would fit better.
 
     Attributes:
-        h: (S,) half the contrast, by linear least squares.
+        a: (S,) light on the side itself, over the middle grey; h: (S,) half the contrast: by linear least squares.
         square: (S,) sum of the squared residuals.
     """
 
-    def __init__(self, sums: FloatArray, rate: FloatArray) -> None:
-        """Takes what `_Sides` sums, and (S,) 1 / (sqrt(2) s)."""
+    def __init__(self, sums: FloatArray, rate: FloatArray, shade: FloatArray) -> None:
+        """Takes what `_Sides` sums, (S,) 1 / (sqrt(2) s), and (S,) the share by which the light grows."""
         n = np.maximum(sums[:, _ONE, _ONE], 1.0)
-        mean_edge, mean_light = sums[:, _ONE, _EDGE] / n, sums[:, _ONE, _LIGHT] / n
+        even = sums[:, :, _LIGHT] - shade[:, None] * sums[:, :, _SHADE]  # sums with the light without what grows
+        mean_edge, mean_light = sums[:, _ONE, _EDGE] / n, even[:, _ONE] / n
         spread = sums[:, _EDGE, _EDGE] - n * mean_edge**2
-        self.h = (sums[:, _EDGE, _LIGHT] - n * mean_edge * mean_light) / np.maximum(spread, 1e-9)
+        self.h = (even[:, _EDGE] - n * mean_edge * mean_light) / np.maximum(spread, 1e-9)
+        self.a = mean_light - self.h * mean_edge
         residual = np.zeros((len(sums), _N + 1))  # as a sum of rows
-        residual[:, _ONE], residual[:, _EDGE], residual[:, _LIGHT] = mean_light - self.h * mean_edge, self.h, -1.0
+        residual[:, _ONE], residual[:, _EDGE], residual[:, _LIGHT] = self.a, self.h, -1.0
+        residual[:, _SHADE] = shade
         self._sums, self._rate = sums, rate
         self._products = (sums @ residual[..., None])[..., 0]  # of the residual with each row
         self.square = (self._products * residual).sum(axis=-1)
 
     def step(self) -> FloatArray:
-        """(S, 3) of Gauss-Newton in the distances at both ends and the blur's logarithm; a and h go along in it."""
+        """(S, 4) of Gauss-Newton in the distances at both ends, the blur's logarithm and the share of the light.
+
+        a and h go along in it.
+        """
         factor = np.ones((len(self._sums), _N))  # by which a row is the derivative
         factor[:, _BLUR] = (-2.0 / np.sqrt(np.pi)) * self.h
         factor[:, _BEGIN] = factor[:, _END] = factor[:, _BLUR] * self._rate
         normal = factor[:, :, None] * self._sums[:, :_N, :_N] * factor[:, None]
         diagonal = np.einsum("sii->si", normal)
         diagonal += 1e-3 * diagonal + 1e-6
-        step = np.linalg.solve(normal, (factor * self._products[:, :_N])[..., None])[:, : _BLUR + 1, 0]
+        step = np.linalg.solve(normal, (factor * self._products[:, :_N])[..., None])[:, : _SHADE + 1, 0]
         return np.asarray(np.maximum(np.minimum(step, _LONGEST_STEP), -_LONGEST_STEP))

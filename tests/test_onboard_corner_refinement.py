@@ -39,6 +39,27 @@ def test_corners_come_to_lie_where_they_are() -> None:
     np.testing.assert_allclose(turned[0, ::-1], np.roll(found[0], 1, axis=0), atol=5e-3)
 
 
+@pytest.mark.parametrize("blur_px", [0.5, 1.0])
+def test_light_from_one_side_is_not_taken_for_sides_that_lie_askew(blur_px: float) -> None:
+    light = np.linspace(0.5, 1.0, 640)  # a sixth brighter at one end of the tag than at the other
+    lit = cv2.GaussianBlur(picture(), (0, 0), blur_px) * light
+    found, good = refined_corners(lit.astype(np.uint8), near_the_truth()[None], CELLS)
+    assert good.tolist() == [True]
+    assert np.sqrt(np.mean((found[0] - LEANING) ** 2)) < 0.03
+
+
+def test_small_tags_are_not_moved_by_the_cells_beside_their_border() -> None:
+    small = LEANING.mean(axis=0) + 0.28 * (LEANING - LEANING.mean(axis=0))  # cells of 4.5 px
+    errors = []
+    for shift_px in np.random.default_rng(2).uniform(-0.5, 0.5, (6, 2)):
+        true_px = small + shift_px
+        blurred = cv2.GaussianBlur(draw_tag("tag36h11", 17, true_px), (0, 0), 0.9)
+        found, good = refined_corners(blurred.astype(np.uint8), true_px[None], CELLS)
+        assert good.tolist() == [True]
+        errors.append(found[0] - true_px)
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.02
+
+
 def test_each_tag_of_a_picture_on_its_own() -> None:
     off = near_the_truth()
     elsewhere = off + np.array([40.0, 30.0])  # where no tag is
