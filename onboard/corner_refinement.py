@@ -38,13 +38,20 @@ _BEFORE: Final = (3, 0, 1, 2)
 _OPPOSITE: Final = ((2, 3), (3, 0), (0, 1), (1, 2))
 _FIRST_BLUR_PX: Final = 0.7
 _LOG_BLUR: Final = (np.log(0.2), np.log(3.0))  # of px
-_CLEAR_PX: Final = 2.0  # before a cell is over, and the blur of the next one's light comes in
-_LEAST_BAND_PX: Final = 2.0
+# Before a cell is over: where the blur of the next one's light comes in; and for small tags, that need all of a cell.
+_CLEAR_PX: Final = 2.0
+_LEAST_CLEAR_PX: Final = 0.3
+_LEAST_BAND_PX: Final = 1.2
+_ENOUGH_BAND_PX: Final = 2.0
 _CLEAR_OF_CORNER_PX: Final = 2.0
 _FARTHEST_PX: Final = 1.5  # that a side may lie from where the detector saw it
 _LEAST_CONTRAST: Final = 10.0  # grey levels: twice h
 # Residuals' RMS over the contrast, 0.02 for an edge under a sensor's noise: beyond, something else is there too.
 _ROUGHEST: Final = 0.1
+# Sigma of the share by which the light grows, for each pixel of a side, against pixels that err by so many grey levels:
+# lenses and lamps stay within it, and short sides do not tell it from a slope.
+_SHADE_PER_PX: Final = 1e-3
+_NOISE_GREY: Final = 4.0
 _LEAST_PIXELS: Final = 30  # five for each parameter
 # How far from its side an array's place is taken for that holds no pixel: there the blur's slope is 0, and erf 1.
 _NOWHERE_PX: Final = 1e3
@@ -84,6 +91,12 @@ def _sagitta(corners_px: FloatArray, across: FloatArray, camera: CameraModel) ->
     return np.where(np.isfinite(bend), bend, 0.0)
 
 
+def _band_px(cell_px: FloatArray) -> FloatArray:
+    """(S,) how far from a side pixels count, by how wide a cell is across it."""
+    enough = np.minimum(cell_px - _LEAST_CLEAR_PX, _ENOUGH_BAND_PX)
+    return np.minimum(np.maximum(np.maximum(cell_px - _CLEAR_PX, enough), _LEAST_BAND_PX), _ACROSS)
+
+
 class _Sides:
     """The pixels about the four sides of T tags: S = 4 T sides, at most P pixels each."""
 
@@ -95,8 +108,7 @@ class _Sides:
         self._length = np.maximum(np.hypot(self._along[:, 0], self._along[:, 1]), 1e-9)
         self._across = self._along[:, ::-1] * (-1.0, 1.0) / self._length[:, None]  # turned from x towards y
         self._sagitta = np.zeros(len(self._begin)) if camera is None else _sagitta(corners_px, self._across, camera)
-        band_px = np.clip(self._depth(corners_px) / np.repeat(cells, 4) - _CLEAR_PX, _LEAST_BAND_PX, _ACROSS)
-        self._take(grey, *self._pixels(grey, band_px))
+        self._take(grey, *self._pixels(grey, _band_px(self._depth(corners_px) / np.repeat(cells, 4))))
 
     def _take(
         self, grey: NDArray[np.uint8], index: IntArray, share: FloatArray, distance: FloatArray, seen: BoolArray
@@ -176,13 +188,14 @@ class _Sides:
         # Distance at the side's begin and at its end, logarithm of s, and by what share the light grows along it.
         p = np.zeros((len(self._begin), 4))
         p[:, _BLUR] = np.log(_FIRST_BLUR_PX)
+        stiffness = (_NOISE_GREY / (_SHADE_PER_PX * self._length)) ** 2
         fit: _Fit | None = None
         rounds = 0
         while True:
             rounds += 1
             rate = np.exp(-p[:, _BLUR]) / np.sqrt(2.0)  # of the model's change with the distance: 1 / (sqrt(2) s)
             fit = _Fit(self._sums(p, rate, fit), rate, p[:, _SHADE])
-            step = fit.step()
+            step = fit.step(stiffness)
             p -= step
             p[:, _BLUR] = np.maximum(np.minimum(p[:, _BLUR], _LOG_BLUR[1]), _LOG_BLUR[0])
             # The first round knows no light yet that could grow.
@@ -257,20 +270,23 @@ class _Fit:
         residual = np.zeros((len(sums), _N + 1))  # as a sum of rows
         residual[:, _ONE], residual[:, _EDGE], residual[:, _LIGHT] = self.a, self.h, -1.0
         residual[:, _SHADE] = shade
-        self._sums, self._rate = sums, rate
+        self._sums, self._rate, self._shade = sums, rate, shade
         self._products = (sums @ residual[..., None])[..., 0]  # of the residual with each row
         self.square = (self._products * residual).sum(axis=-1)
 
-    def step(self) -> FloatArray:
+    def step(self, stiffness: FloatArray) -> FloatArray:
         """(S, 4) of Gauss-Newton in the distances at both ends, the blur's logarithm and the share of the light.
 
-        a and h go along in it.
+        a and h go along in it. The prior of that share has the weight (S,) `stiffness`.
         """
         factor = np.ones((len(self._sums), _N))  # by which a row is the derivative
         factor[:, _BLUR] = (-2.0 / np.sqrt(np.pi)) * self.h
         factor[:, _BEGIN] = factor[:, _END] = factor[:, _BLUR] * self._rate
         normal = factor[:, :, None] * self._sums[:, :_N, :_N] * factor[:, None]
         diagonal = np.einsum("sii->si", normal)
+        diagonal[:, _SHADE] += stiffness
         diagonal += 1e-3 * diagonal + 1e-6
-        step = np.linalg.solve(normal, (factor * self._products[:, :_N])[..., None])[:, : _SHADE + 1, 0]
+        slope = factor * self._products[:, :_N]
+        slope[:, _SHADE] += stiffness * self._shade
+        step = np.linalg.solve(normal, slope[..., None])[:, : _SHADE + 1, 0]
         return np.asarray(np.maximum(np.minimum(step, _LONGEST_STEP), -_LONGEST_STEP))
