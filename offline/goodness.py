@@ -126,7 +126,11 @@ class Windows:
 
 
 def fitted_windows(
-    problem: Problem, losses: Losses = DEFAULT_LOSSES, effort: Effort | None = None, share: float = 1.0
+    problem: Problem,
+    losses: Losses = DEFAULT_LOSSES,
+    effort: Effort | None = None,
+    share: float = 1.0,
+    least_shared: FloatArray | None = None,
 ) -> Windows:
     """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
 
@@ -138,6 +142,7 @@ def fitted_windows(
         effort: what the logs are worth, of which a share is for this; without end where None. Where it does not suffice
             windows are longer, or not solved to their end: the whole then seems to fit better than it does.
         share: of it.
+        least_shared: (M,) variance that a reading shares with its neighbours at least, as a multiple of the told one.
     """
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
@@ -173,7 +178,8 @@ def fitted_windows(
             effort.spend(solution)
         cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
         errors = fit_shared_errors(solution, cell)
-        sharing, freedom = errors.factors(cell), min(freedom, errors.freedom(cell))
+        least = None if least_shared is None else least_shared / factors[1] ** 2
+        sharing, freedom = errors.factors(cell, least), min(freedom, errors.freedom(cell))
         state = solution.state
         del solution
         shared = _scaled(apart, factors[0], factors[1] * sharing)

@@ -18,6 +18,7 @@ from calib import se2
 from calib.arrays import FloatArray
 from offline.chain import Chain
 from offline.coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
+from offline.corner_noise import least_shared
 from offline.effort import Effort
 from offline.goodness import Goodness, Windows, fitted_windows
 from offline.graph import Graph, Parameter, build_graph
@@ -126,8 +127,11 @@ class _Check:
         (chain,) = graph.chains
         self._keyframes = telling_keyframes(chain)
         if len(self._keyframes) < len(chain.stamps_ns):
-            graph = build_graph([coarsened(chain, self._keyframes)])
-        self._windows: Windows = fitted_windows(graph.problem, effort=effort, share=_WINDOWS_SHARE)
+            chain = coarsened(chain, self._keyframes)
+            graph = build_graph([chain])
+        self._windows: Windows = fitted_windows(
+            graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least_shared(chain.readings)
+        )
 
     def judge(self, solution: Solution) -> Goodness:
         state = solution.state

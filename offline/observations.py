@@ -13,6 +13,7 @@ from calib.errors import CalibError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
 from offline.askew import FALSE_ALARM, UPRIGHT_DOF, askew, doubted, level_of, with_common_turn
+from offline.corner_noise import refined_bias_px
 from offline.covariance_parts import CovarianceParts
 from offline.errors import OfflineError
 from offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
@@ -70,8 +71,10 @@ def read_detections(
         return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
     sides_m = _sides_m(run, tag)
     at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
-    found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, noise.sigma_corner_px)
-    good = _good(found, is_askew, level)
+    bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros(len(tag))
+    sigmas_px = np.hypot(noise.sigma_corner_px, bias_px)
+    found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
+    good = _good(found, is_askew, level * (noise.sigma_corner_px / sigmas_px) ** 2)
     n, kept = int(good.sum()), found.where(good)
     by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
     by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
@@ -82,21 +85,28 @@ def read_detections(
         tag=tag[good],
         value=np.stack([kept.range_bearing[:, 0], bearing_rad], axis=-1),
         covariance=kept.covariance + by_floor,
-        parts=_corner_parts(kept, noise.sigma_corner_px, by_floor),
+        parts=_corner_parts(kept, noise.sigma_corner_px, sigmas_px[good], by_floor),
         by_camera=_by_camera(run.robot, kept, twist[keyframe[good]]),
         polar=np.ones(n, dtype=np.bool_),
         in_camera=np.ones(n, dtype=np.bool_),
         corners_px=corners_px[good],
+        corner_bias_px=bias_px[good],
         corner_sigmas=np.ones(n),
     )
     return readings, _told(run, tag[is_askew], good)
 
 
-def _good(found: TagReadings, is_askew: BoolArray, level: float) -> BoolArray:
-    """(M,) readings of tags that are near and large enough for their range to have no bias beside its sigma."""
+def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArray:
+    """(M,) readings of tags that are near and large enough for their range to have no bias beside its sigma.
+
+    Args:
+        found: the readings.
+        is_askew: (M,) whose range is trusted to little as it is.
+        level: (M,) how many times the variance said random errors of corners have.
+    """
     range_m = found.range_bearing[:, 0]
     with np.errstate(invalid="ignore"):
-        sure = min(level, 1.0) * found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
+        sure = np.minimum(level, 1.0) * found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
         return np.asarray(found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew))
 
 
@@ -112,7 +122,7 @@ def _told(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
 
 
 def _upright_or_askew(
-    run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigma_corner_px: float
+    run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigmas_px: FloatArray
 ) -> tuple[TagReadings, BoolArray, float, float]:
     """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
 
@@ -121,7 +131,7 @@ def _upright_or_askew(
     camera, mount = run.camera, run.robot.mount
     assert camera is not None  # it saw them
     rotation = mount.T_base_camera.rotation.as_matrix()
-    upright = upright_readings(corners_px, sides_m, camera, rotation, sigma_corner_px)
+    upright = upright_readings(corners_px, sides_m, camera, rotation, sigmas_px)
     level, camera_m = max(level_of(upright.chi2), 1.0), np.array([mount.x_m, mount.y_m])
     tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
     if tilt_rad:
@@ -131,7 +141,8 @@ def _upright_or_askew(
     level = level_of(chi2)
     is_doubted = np.isin(tag, doubted(tag, chi2 / min(level, 1.0)))
     general = upright.replaced(
-        is_doubted, general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigma_corner_px)
+        is_doubted,
+        general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
     )
     is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
     spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
@@ -177,6 +188,7 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
         positions.polar | unknown,
         positions.in_camera,
         corners_px=np.full((len(value), 4, 2), np.nan),
+        corner_bias_px=np.zeros(len(value)),
         corner_sigmas=np.ones(len(value)),
     )
     if good.all():
@@ -225,10 +237,14 @@ def _mount_axes(robot: Robot) -> FloatArray:
     )
 
 
-def _corner_parts(found: TagReadings, sigma_corner_px: float, by_floor: FloatArray) -> CovarianceParts:
-    return CovarianceParts(
-        ("sigma_corner_px",), (found.covariance - found.rest)[None] / sigma_corner_px**2, found.rest + by_floor
-    )
+def _corner_parts(
+    found: TagReadings, sigma_corner_px: float, sigmas_px: FloatArray, by_floor: FloatArray
+) -> CovarianceParts:
+    """By the noise model's sigma, which is fitted; the rest is by the floor, and by what (M,) corners err by alike."""
+    by_corners = found.covariance - found.rest
+    unit = by_corners / sigmas_px[:, None, None] ** 2
+    rest = found.rest + by_floor + by_corners - unit * sigma_corner_px**2
+    return CovarianceParts(("sigma_corner_px",), unit[None], rest)
 
 
 def _position_parts(range_m: FloatArray, modelled: BoolArray, covariance: FloatArray) -> CovarianceParts:

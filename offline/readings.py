@@ -35,6 +35,7 @@ class Readings:
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
         corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
+        corner_bias_px: (M,) sigma of what such corners err by alike in neighbouring readings, whatever noise they have.
         corner_sigmas: (M,) how many times the noise's sigma such corners count with.
     """
 
@@ -47,6 +48,7 @@ class Readings:
     polar: BoolArray
     in_camera: BoolArray
     corners_px: FloatArray
+    corner_bias_px: FloatArray
     corner_sigmas: FloatArray
 
     def __len__(self) -> int:
@@ -65,6 +67,7 @@ class Readings:
             self.polar[mask],
             self.in_camera[mask],
             self.corners_px[mask],
+            self.corner_bias_px[mask],
             self.corner_sigmas[mask],
         )
 
@@ -98,6 +101,7 @@ def joined(a: Readings, b: Readings) -> Readings:
         np.concatenate([a.polar, b.polar]),
         np.concatenate([a.in_camera, b.in_camera]),
         np.concatenate([a.corners_px, b.corners_px]),
+        np.concatenate([a.corner_bias_px, b.corner_bias_px]),
         np.concatenate([a.corner_sigmas, b.corner_sigmas]),
     )
     return both.where(np.argsort(both.keyframe, kind="stable"))
@@ -110,7 +114,8 @@ def no_readings() -> Readings:
     none = np.zeros((0, 2, 2))
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
     by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
-    corners_px, sigmas = np.zeros((0, 4, 2)), np.zeros(0)
+    corners_px, no_sigmas = np.zeros((0, 4, 2)), np.zeros(0)
     return Readings(
-        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, sigmas
-    )
+        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, no_sigmas,
+        no_sigmas,
+    )  # fmt: skip

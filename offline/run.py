@@ -58,6 +58,7 @@ class Run:
         log_bytes: of the log; how much work it is worth.
         inputs: the logs that were read together with it, itself included.
         lost: what of the log cannot be read, in words; empty where all can.
+        corners_refined: the corners in it were sharpened on the picture, all of them.
         events: what the recorder told, in order of their stamps.
     """
 
@@ -76,6 +77,7 @@ class Run:
     log_bytes: int = 0
     inputs: Inputs = ALONE
     lost: str = ""
+    corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
 
 
@@ -199,6 +201,7 @@ def load_run(
         log_bytes=log_bytes,
         inputs=inputs,
         lost=losses.in_words,
+        corners_refined=read.corners_refined,
         events=tuple(sorted(collected.events)),
     )
 

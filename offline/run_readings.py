@@ -15,6 +15,7 @@ import numpy as np
 from calib.arrays import IntArray
 from offline.errors import OfflineError
 from offline.run_tags import Detections, Positions, TagKey
+from onboard.corner_refinement import REFINED_CORNERS
 from onboard.messages import TagDetections, TagObservations
 
 
@@ -27,6 +28,7 @@ class Gathered(NamedTuple):
         detections: in pixels.
         positions: in metres.
         every: one look of so many is used.
+        corners_refined: those of all detections were sharpened on the picture.
     """
 
     tags: tuple[TagKey, ...]
@@ -34,6 +36,7 @@ class Gathered(NamedTuple):
     detections: Detections
     positions: Positions
     every: int
+    corners_refined: bool
 
 
 # Readings with corrected bits are the ones that turn out to be phantoms.
@@ -59,6 +62,7 @@ class RunReadings:
         self._pictures_ns = array("q")
         self._detected = array("q")  # stamp, tag
         self._corners_px = array("d")
+        self._as_detected = False  # some corners, as a library had them
         self._placed = array("q")  # stamp, tag, polar, in camera
         self._places = array("d")  # value, covariance
 
@@ -75,6 +79,7 @@ class RunReadings:
     def add_detections(self, message: TagDetections) -> None:
         """Takes one picture's, but for those with corrected bits."""
         self._pictures_ns.append(message.stamp_ns)
+        self._as_detected |= REFINED_CORNERS not in message.detector_settings
         for each in message.detections:
             if each.hamming <= MAX_HAMMING and len(each.corners_px) == 8:
                 self._detected.extend((message.stamp_ns, self._number(each.family, each.tag_id)))
@@ -140,7 +145,8 @@ class RunReadings:
             pictures_ns = np.intersect1d(pictures_ns, used_ns)
             detections = detections.where(np.isin(detections.stamps_ns, used_ns))
             positions = positions.where(np.isin(positions.stamps_ns, used_ns))
-        return Gathered(tags, pictures_ns, detections, positions, every)
+        corners_refined = self.in_pixels and not self._as_detected
+        return Gathered(tags, pictures_ns, detections, positions, every, corners_refined)
 
     def _number(self, family: str, tag_id: int) -> int:
         key = TagKey(family, tag_id)

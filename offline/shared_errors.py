@@ -43,9 +43,15 @@ class SharedErrors:
     shared: FloatArray
     shared_redundancy: FloatArray
 
-    def factors(self, cell: IntArray) -> FloatArray:
-        """(M, 2) factors on the sigmas of readings in cells (M,), with which they tell as much as independent ones."""
-        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * self.shared)
+    def factors(self, cell: IntArray, least_shared: FloatArray | None = None) -> FloatArray:
+        """(M, 2) factors on the sigmas of readings in cells (M,), with which they tell as much as independent ones.
+
+        Args:
+            cell: of each reading.
+            least_shared: (M,) variance that they are known to share, whatever was fitted; None: none.
+        """
+        shared = self.shared if least_shared is None else np.maximum(self.shared, least_shared[:, None])
+        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * shared)
 
     def freedom(self, cell: IntArray) -> float:
         """What chi-square's degrees of freedom the variance of readings so weighed is known like.

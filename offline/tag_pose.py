@@ -83,7 +83,7 @@ class TagReadings:
 
 
 def upright_readings(
-    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigma_corner_px: float
+    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
 ) -> TagReadings:
     """Readings of tags that hang upright.
 
@@ -92,7 +92,7 @@ def upright_readings(
         sides_m: (M,) side of each tag.
         camera: the camera that saw them.
         R_base_camera: (3, 3) how the camera is mounted.
-        sigma_corner_px: noise of each corner coordinate.
+        sigmas_px: (M,) noise of each corner coordinate of each tag.
     """
     with np.errstate(all="ignore"):
         parameters = _start(corners_px, sides_m, camera, R_base_camera)
@@ -116,16 +116,16 @@ def upright_readings(
         by_turn = by_residual @ held_by_turn
         # Sides seen g too far out: the corners should lie g times that further in, hence the residuals further out.
         by_edge = by_residual[:, :3] @ outward(corners_px).reshape(-1, 8, 1)
-        covariance = inverse[:, :3, :3] * sigma_corner_px**2
-        chi2 = (residual**2).sum(-1) / sigma_corner_px**2
+        covariance = inverse[:, :3, :3] * sigmas_px[:, None, None] ** 2
+        chi2 = (residual**2).sum(-1) / sigmas_px**2
         nothing = np.zeros_like(covariance)
         found = _polar(parameters[:, :3], covariance, nothing, by_turn[:, :3], by_edge[..., 0], chi2)
         left = held_by_turn + jacobian @ by_turn
-        return replace(found, misfit=residual / sigma_corner_px, misfit_by_turn=left / sigma_corner_px)
+        return replace(found, misfit=residual / sigmas_px[:, None], misfit_by_turn=left / sigmas_px[:, None, None])
 
 
 def general_readings(
-    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigma_corner_px: float
+    corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
 ) -> TagReadings:
     """Readings of tags at any tilt: the better of the two planar poses, with a range sigma that covers its bias.
 
@@ -142,11 +142,11 @@ def general_readings(
             rotation, centre = pose
             centres[i] = R_base_camera @ centre
             missed_px = camera.project(corners_m @ rotation.T + centre) - corners_px[i]
-            chi2[i] = float((missed_px**2).sum()) / sigma_corner_px**2
+            chi2[i] = float((missed_px**2).sum()) / sigmas_px[i] ** 2
     with np.errstate(all="ignore"):
         distance_m = np.linalg.norm(centres, axis=-1)
         direction = centres / distance_m[:, None]
-        across = (_GENERAL_ACROSS * distance_m * sigma_corner_px / camera.fx_px) ** 2
+        across = (_GENERAL_ACROSS * distance_m * sigmas_px / camera.fx_px) ** 2
         along = (_GENERAL_ALONG * distance_m) ** 2
         sight = direction[:, :, None] * direction[:, None, :]
         rest = along[:, None, None] * sight

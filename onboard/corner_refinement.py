@@ -21,6 +21,8 @@ from scipy.special import erf
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera_model import CameraModel
 
+# In the detector settings of pictures whose tags had their corners sharpened; ",lens" follows where the lens was known.
+REFINED_CORNERS: Final = "corners=sides"
 _ALONG: Final = 20  # pixels along a side
 _ACROSS: Final = 4  # pixels to both of its sides
 _ROUNDS: Final = 6

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib.arrays import FloatArray
 from calib.camera_model import CameraModel
 from calib.tag_family import tag_bits
-from onboard.corner_refinement import refined_corners
+from onboard.corner_refinement import REFINED_CORNERS, refined_corners
 from onboard.errors import OnboardError
 
 SMALLEST_SIDE_PX: Final = 32  # the libraries crash on empty and tiny pictures
@@ -75,10 +75,8 @@ class TagDetector:
             raise OnboardError(f"recorder.families: {unknown or 'none'} cannot be detected; use {', '.join(_FAMILIES)}")
         name = _installed(library)
         self.library = f"{name} {importlib.metadata.version(name)}"
-        corners = "library" if not refine else "sides" if camera is None else "sides,lens"
-        self.settings = (
-            f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads} corners={corners}"
-        )
+        corners = "corners=library" if not refine else REFINED_CORNERS if camera is None else f"{REFINED_CORNERS},lens"
+        self.settings = f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads} {corners}"
         self._camera, self._refine = camera, refine
         # One for each family: given several, pupil-apriltags looks for the first only.
         self._detectors = [(family, _kept_detector(name, family, quad_decimate, threads)) for family in families]

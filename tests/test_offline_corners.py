@@ -21,6 +21,7 @@ from offline.corner_factors import SpatialState
 from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
 from offline.corner_graph import corner_graph
 from offline.corner_map import refine
+from offline.corner_noise import refined_bias_px
 from offline.corner_problem import CornerProblem
 from offline.corner_sides import facing_as_predicted
 from offline.corner_solver import CornerSolution, solve_corners
@@ -28,6 +29,7 @@ from offline.corner_start import hung_otherwise, tags_rehung
 from offline.edges import edges_of
 from offline.evaluation import evaluate
 from offline.global_map import component_of
+from offline.graph import Graph
 from offline.map_io import read_map, write_map
 from offline.map_model import MapModel
 from offline.pipeline import build_map, read_runs
@@ -265,6 +267,24 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
     expected = facing_as_predicted(corners.problem.corners, start).looks.outward
     np.testing.assert_array_equal(looks.outward, expected)
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
+
+
+def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Workings]) -> None:
+    solved = room[2].solved[0]
+
+    def sigmas_px(graph: Graph) -> FloatArray:
+        return corner_graph(graph, solved.solution.state)[0].problem.corners.looks.sigma_px
+
+    biased = [
+        replace(chain.readings, corner_bias_px=refined_bias_px(chain.readings.corners_px))
+        for chain in solved.graph.chains
+    ]
+    chains = [replace(chain, readings=each) for chain, each in zip(solved.graph.chains, biased, strict=True)]
+    times = np.concatenate([each.corner_sigmas for each in biased])
+    bias_px = np.concatenate([each.corner_bias_px for each in biased])
+    wanted = np.hypot(sigmas_px(solved.graph), times * bias_px)
+    np.testing.assert_allclose(sigmas_px(replace(solved.graph, chains=tuple(chains))), wanted, rtol=1e-12)
+    assert bias_px.max() > 1.5 * bias_px.min()
 
 
 def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Path, MapResult, Workings]) -> None:

@@ -11,6 +11,7 @@ from calib.arrays import FloatArray
 from calib.noise import NoiseParameters
 from offline import goodness, pipeline
 from offline.chain import Chain, chains_of
+from offline.covariance_parts import CovarianceParts
 from offline.effort import Effort
 from offline.goodness import Goodness, fitted_windows, in_windows
 from offline.graph import build_graph
@@ -96,6 +97,18 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
     graph = build_graph([with_a_moved_tag(drive)])
     best = solve(graph.problem, drive.true_state(graph))
     assert not fitted_windows(graph.problem).judge(best.state).fits
+
+
+@pytest.mark.parametrize("bias_px", [0.0, 5.0])
+def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
+    """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
+    chain = with_a_moved_tag(made_long_drive(5, LENGTH_M))
+    readings = chain.readings
+    parts = CovarianceParts(
+        ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
+    )
+    biased = replace(readings, parts=parts, corner_bias_px=np.full(len(readings), bias_px))
+    assert judged(replace(chain, readings=biased)).fits is (bias_px > 0.0)
 
 
 def test_windows_share_neither_poses_nor_tags() -> None:

@@ -14,7 +14,7 @@ from offline.local_map import LocalMap, solve_local_map
 from offline.odometry import ODOMETRY_NOISE
 from offline.pipeline import build_map, read_runs
 from offline.run import load_run
-from offline.run_noise import NOT_NEEDED, fit_and_weigh
+from offline.run_noise import NOT_NEEDED, fit_and_weigh, weighed_as
 from onboard.log_reader import find_logs
 from tests.benchmarks.noise_study import Mapped, study_seed, summary
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
@@ -153,6 +153,23 @@ def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) 
         spread = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
         assert np.median(spread) > 2.0
         np.testing.assert_allclose(after.chain.readings.parts.under(bad.noise), after.chain.readings.covariance)
+
+
+@pytest.mark.parametrize("prior", [PRIOR, NoiseParameters(sigma_corner_px=0.05)])
+def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap], prior: NoiseParameters) -> None:
+    """Of m readings of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
+    plain = [solve_local_map(each.chain.weighed(prior)) for each in maps]
+    refined = []
+    for each in plain:
+        bias_px = np.full(len(each.chain.readings), 0.1)
+        chain = replace(each.chain, readings=replace(each.chain.readings, corner_bias_px=bias_px))
+        refined.append(replace(each, chain=chain))
+    for before, after in zip(weighed_as(plain, prior, None), weighed_as(refined, prior, None), strict=True):
+        assert (before.chain.readings.corner_sigmas == 1.0).all()
+        m = (after.chain.readings.corner_sigmas**2 - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
+        np.testing.assert_allclose(m, np.rint(m), rtol=1e-9)
+        assert m.min() >= 1.0
+        assert m.max() > 5.0
 
 
 def test_readings_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:

@@ -12,6 +12,7 @@ from calib.errors import GroundsbotError
 from calib.noise import NoiseParameters
 from calib.robot import Robot
 from calib.tag_edges import moved_out
+from offline.corner_noise import refined_bias_px
 from offline.observations import check_tag_sizes, read_detections, read_positions
 from offline.readings import Readings
 from offline.run import Run
@@ -80,6 +81,23 @@ def test_readings_are_free_of_bias_after_all_gates() -> None:
         bias = ((mine.value - in_camera(tag)) / sigma).mean(axis=0)
         # 0.15 is the bound for the truth; the mean of 500 is off by another 0.045 by chance.
         assert (np.abs(bias) < 0.15 + 0.045).all(), (tag, bias)
+
+
+def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_by_far() -> None:
+    """Of 60, 24 and 16 px, in front of the camera: the same noise model, and what they err by alike besides."""
+    sides_px, noise = np.array([60.0, 24.0, 16.0]), NoiseParameters(sigma_corner_px=0.04)
+    tags = [MadeTag(i, (0.2 + x_m, 0.05, 0.4), np.pi, size_m=0.15) for i, x_m in enumerate(900.0 * 0.15 / sides_px)]
+    corners_px = np.array([corners_of(tag) for tag in tags])
+    np.testing.assert_allclose(np.ptp(corners_px, axis=1), sides_px[:, None] * np.ones(2), rtol=0.03)
+    run, detections = run_of(tags), detections_of(corners_px, [0, 1, 2])
+    readings, _ = read_detections(replace(run, corners_refined=True), detections, np.arange(3), NO_TWIST, noise)
+    beside = readings.parts.rest[:, 0, 0] / readings.parts.of(("sigma_corner_px",))[0, :, 0, 0]
+    np.testing.assert_allclose(np.sqrt(beside), refined_bias_px(corners_px), rtol=1e-9)
+    np.testing.assert_allclose(readings.corner_bias_px, [0.02, np.hypot(0.02, 0.04), np.hypot(0.02, 0.2)], rtol=0.05)
+    np.testing.assert_allclose(readings.parts.under(noise), readings.covariance, rtol=1e-12)
+    as_detected, _ = read_detections(run, detections, np.arange(3), NO_TWIST, noise)
+    assert not as_detected.corner_bias_px.any()
+    assert (as_detected.covariance[:, 0, 0] < readings.covariance[:, 0, 0]).all()
 
 
 def test_a_small_tag_is_left_out_rather_than_biased() -> None:

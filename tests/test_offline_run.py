@@ -148,6 +148,24 @@ def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> No
     np.testing.assert_allclose(run.detections.corners_px, plain + 0.25 * outward(plain))
 
 
+@pytest.mark.parametrize(
+    ("settings", "refined"),
+    [
+        (["corners=sides,lens", "corners=sides"], True),
+        (["corners=sides,lens", "corners=library"], False),
+        ([""], False),
+        ([], False),
+    ],
+)
+def test_whether_corners_were_refined_is_in_the_detector_settings(
+    tmp_path: Path, settings: list[str], refined: bool
+) -> None:
+    pictures = [picture(0.01 * (i + 1), tag(7)) for i in range(len(settings))]
+    for (_, message), each in zip(pictures, settings, strict=True):
+        message.detector_settings = f"families={FAMILY} {each}"
+    assert load_run(write_log(tmp_path, [*TWO_READINGS, *pictures])).corners_refined is refined
+
+
 def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:
     seen = picture(0.01, tag(7, hamming=1), tag(8), tag(9, corners=CORNERS[:6]))
     run = load_run(write_log(tmp_path, [*TWO_READINGS, seen]))

@@ -43,9 +43,14 @@ def exact_corners(tag: MadeTag, robot: Robot, camera: CameraModel) -> FloatArray
     return corners
 
 
+def sized(n: int, camera: CameraModel, rotation: FloatArray) -> tuple[FloatArray, CameraModel, FloatArray, FloatArray]:
+    """The rest of what a reader of so many tags takes."""
+    return np.full(n, SIZE_M), camera, rotation, np.full(n, SIGMA_PX)
+
+
 def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAMERA) -> TagReadings:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    return upright_readings(corners_px, np.full(len(corners_px), SIZE_M), camera, rotation, SIGMA_PX)
+    return upright_readings(corners_px, *sized(len(corners_px), camera, rotation))
 
 
 def used(found: TagReadings) -> BoolArray:
@@ -101,7 +106,7 @@ def test_the_full_pose_would_not_do() -> None:
     tag = placed(4.0, 5.0, 0.0, 0.0)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 0)
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    full = general_readings(corners_px, np.full(N, SIZE_M), CAMERA, rotation, SIGMA_PX)
+    full = general_readings(corners_px, *sized(N, CAMERA, rotation))
     error_m = full.range_bearing[:, 0] - truth(tag)[0]
     assert abs(error_m.mean()) > 0.15 * error_m.std()
 
@@ -147,7 +152,7 @@ def test_general_readings_of_tags_on_the_ceiling_are_within_their_sigma(x_m: flo
 def _general_reading_is_honest(corners_px: FloatArray, true: FloatArray, robot: Robot) -> None:
     """Its sigma is meant to cover the pose's bias many times over, so there is no lower bound on the errors."""
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    found = general_readings(corners_px, np.full(len(corners_px), SIZE_M), CAMERA, rotation, SIGMA_PX)
+    found = general_readings(corners_px, *sized(len(corners_px), CAMERA, rotation))
     assert found.valid.all()
     in_sigmas = (found.range_bearing - true) / np.sqrt(np.einsum("mii->mi", found.covariance))
     assert (np.abs(in_sigmas.mean(axis=0)) < 0.15).all(), in_sigmas.mean(axis=0)
@@ -165,10 +170,10 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
         good[[0, 2, 1, 3]],
     ]
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    found = reader(np.array([*bad, good]), np.full(len(bad) + 1, SIZE_M), CAMERA, rotation, SIGMA_PX)
+    found = reader(np.array([*bad, good]), *sized(len(bad) + 1, CAMERA, rotation))
     assert not found.valid[: len(bad) - 1].any()
     assert found.valid[-1]
-    alone = reader(good[None], np.full(1, SIZE_M), CAMERA, rotation, SIGMA_PX)
+    alone = reader(good[None], *sized(1, CAMERA, rotation))
     # All points are taken through the lens until the last is still, which may move a still one by its last bit.
     np.testing.assert_allclose(found.range_bearing[-1], alone.range_bearing[0], rtol=1e-14)
     assert not found.valid[len(bad) - 1] or found.chi2[len(bad) - 1] > 100.0
@@ -176,7 +181,7 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
 
 def test_no_readings_are_none() -> None:
     for reader in (upright_readings, general_readings):
-        found = reader(np.zeros((0, 4, 2)), np.zeros(0), CAMERA, np.eye(3), SIGMA_PX)
+        found = reader(np.zeros((0, 4, 2)), *sized(0, CAMERA, np.eye(3)))
         assert found.range_bearing.shape == (0, 2)
 
 
@@ -189,7 +194,7 @@ def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Cal
 
     def turned(w: FloatArray) -> TagReadings:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
-        return reader(corners_px, np.full(3, SIZE_M), CAMERA, R_base_camera, SIGMA_PX)
+        return reader(corners_px, *sized(3, CAMERA, R_base_camera))
 
     found = turned(np.zeros(3))
     for axis, turn in enumerate(1e-5 * np.eye(3)):
@@ -203,7 +208,7 @@ def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
 
     def turned(w: FloatArray) -> TagReadings:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
-        return upright_readings(corners_px, np.full(1, SIZE_M), CAMERA, R_base_camera, SIGMA_PX)
+        return upright_readings(corners_px, *sized(1, CAMERA, R_base_camera))
 
     by_turn = turned(np.zeros(3)).misfit_by_turn[0]
     for axis, turn in enumerate(1e-5 * np.eye(3)):

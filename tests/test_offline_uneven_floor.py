@@ -47,7 +47,8 @@ def driven_past(tilt_rad: float, seed: int) -> tuple[FloatArray, IntArray, IntAr
 
 def read(corners_px: FloatArray) -> TagReadings:
     rotation = ROBOT.mount.T_base_camera.rotation.as_matrix()
-    return upright_readings(corners_px, np.full(len(corners_px), 0.15), CAMERA, rotation, SIGMA_PX)
+    n = len(corners_px)
+    return upright_readings(corners_px, np.full(n, 0.15), CAMERA, rotation, np.full(n, SIGMA_PX))
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -1,0 +1,37 @@
+"""What corners that were refined on the picture err by in the same way in look after look.
+
+The scatter of refined corners does not tell how far off they are: what blur, light and the cells beside a border do to
+a tag's sides is the same in one picture as in the next, and no number of looks averages it out.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from calib.arrays import FloatArray
+from offline.readings import Readings
+
+# Of tags of any size, measured on rendered drives as is what follows (docs/estimate.md).
+_BIAS_PX: Final = 0.02
+# A cell of the tag's border is three pixels wide where its side has this many. Below, the blur of one cell reaches into
+# the next, sides can often not be told from the picture, and tags look smaller than they are.
+_SMALL_PX: Final = 24.0
+_SMALL_BIAS_PX: Final = 0.04
+_POWER: Final = 4
+_LEAST_PX: Final = 3.0  # nothing is detected that is so small
+
+
+def refined_bias_px(corners_px: FloatArray) -> FloatArray:
+    """(M,) sigma of what the coordinates of each tag's refined corners (M, 4, 2) err by alike, by its area."""
+    (ax, ay), (bx, by) = ((corners_px[:, i + 2] - corners_px[:, i]).T for i in (0, 1))
+    side_px = np.sqrt(0.5 * np.abs(ax * by - ay * bx))  # of a square as large
+    return np.asarray(np.hypot(_BIAS_PX, _SMALL_BIAS_PX * (_SMALL_PX / np.maximum(side_px, _LEAST_PX)) ** _POWER))
+
+
+def least_shared(readings: Readings) -> FloatArray:
+    """(M,) variance that readings share with their neighbours at least, as a multiple of their own."""
+    if not readings.corner_bias_px.any():
+        return np.zeros(len(readings))
+    unit = readings.parts.of(("sigma_corner_px",))[0]
+    by_pixel = np.trace(unit, axis1=1, axis2=2) / np.trace(readings.covariance, axis1=1, axis2=2)
+    return np.asarray(by_pixel * readings.corner_bias_px**2)
