@@ -171,7 +171,7 @@ def _shown(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
     moved, twist = _moved(chain, readings.keyframe[mask], corners_px, height_px)
     return _Shown(
         corners_px,
-        np.hypot(np.sqrt(variance), readings.corner_bias_px[mask]) * readings.corner_sigmas[mask],
+        np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
         sides_m[readings.tag[mask]],
         moved,
         twist,

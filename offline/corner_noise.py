@@ -11,8 +11,11 @@ import numpy as np
 from calib.arrays import FloatArray
 from offline.readings import Readings
 
-# Of tags of any size, measured on rendered drives as is what follows (docs/estimate.md).
-_BIAS_PX: Final = 0.02
+# Measured on rendered drives, as is what follows (docs/estimate.md). Up and down tags of any size are seen right to
+# less than this, and that alone is what ranges come from. Left and right sides are those beside half hidden margins,
+# and those that smear when the robot turns.
+_UPRIGHT_PX: Final = 0.01
+_ANYHOW_PX: Final = 0.02
 # A cell of the tag's border is three pixels wide where its side has this many. Below, the blur of one cell reaches into
 # the next, sides can often not be told from the picture, and tags look smaller than they are.
 _SMALL_PX: Final = 24.0
@@ -22,10 +25,11 @@ _LEAST_PX: Final = 3.0  # nothing is detected that is so small
 
 
 def refined_bias_px(corners_px: FloatArray) -> FloatArray:
-    """(M,) sigma of what the coordinates of each tag's refined corners (M, 4, 2) err by alike, by its area."""
+    """(M, 2) sigmas of what each tag's refined corners (M, 4, 2) err by alike: up and down, and in all ways."""
     (ax, ay), (bx, by) = ((corners_px[:, i + 2] - corners_px[:, i]).T for i in (0, 1))
     side_px = np.sqrt(0.5 * np.abs(ax * by - ay * bx))  # of a square as large
-    return np.asarray(np.hypot(_BIAS_PX, _SMALL_BIAS_PX * (_SMALL_PX / np.maximum(side_px, _LEAST_PX)) ** _POWER))
+    small_px = _SMALL_BIAS_PX * (_SMALL_PX / np.maximum(side_px, _LEAST_PX)) ** _POWER
+    return np.asarray(np.hypot(small_px[:, None], (_UPRIGHT_PX, _ANYHOW_PX)))
 
 
 def least_shared(readings: Readings) -> FloatArray:
@@ -34,4 +38,10 @@ def least_shared(readings: Readings) -> FloatArray:
         return np.zeros(len(readings))
     unit = readings.parts.of(("sigma_corner_px",))[0]
     by_pixel = np.trace(unit, axis1=1, axis2=2) / np.trace(readings.covariance, axis1=1, axis2=2)
-    return np.asarray(by_pixel * readings.corner_bias_px**2)
+    return np.asarray(by_pixel * readings.corner_bias_px[:, 0] ** 2)
+
+
+def least_shared_by_corners(readings: Readings, sigma_corner_px: float) -> FloatArray:
+    """(M,) the same of the corners themselves, whose noise beside has this sigma."""
+    variance = readings.corner_bias_px[:, 1] ** 2
+    return np.asarray(variance / (sigma_corner_px**2 + variance))

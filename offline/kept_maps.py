@@ -128,7 +128,7 @@ def measured_chain(
         polar,
         in_camera,
         corners_px=np.full((n, 4, 2), np.nan),
-        corner_bias_px=np.zeros(n),
+        corner_bias_px=np.zeros((n, 2)),
         corner_sigmas=np.ones(n),
     )
     return Chain(run.name, run, stamps_ns, odometry, tags, readings)

@@ -71,8 +71,8 @@ def read_detections(
         return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
     sides_m = _sides_m(run, tag)
     at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
-    bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros(len(tag))
-    sigmas_px = np.hypot(noise.sigma_corner_px, bias_px)
+    bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros((len(tag), 2))
+    sigmas_px = np.hypot(noise.sigma_corner_px, bias_px[:, 0])
     found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
     good = _good(found, is_askew, level * (noise.sigma_corner_px / sigmas_px) ** 2)
     n, kept = int(good.sum()), found.where(good)
@@ -188,7 +188,7 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
         positions.polar | unknown,
         positions.in_camera,
         corners_px=np.full((len(value), 4, 2), np.nan),
-        corner_bias_px=np.zeros(len(value)),
+        corner_bias_px=np.zeros((len(value), 2)),
         corner_sigmas=np.ones(len(value)),
     )
     if good.all():

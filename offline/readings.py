@@ -35,7 +35,8 @@ class Readings:
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
         corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
-        corner_bias_px: (M,) sigma of what such corners err by alike in neighbouring readings, whatever noise they have.
+        corner_bias_px: (M, 2) sigmas of what such corners err by alike in neighbouring readings, whatever noise they
+            have: up and down, which is what the value errs by, and in all ways.
         corner_sigmas: (M,) how many times the noise's sigma such corners count with.
     """
 
@@ -75,8 +76,11 @@ class Readings:
         """The same readings under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
-    def spread(self, sigmas: FloatArray) -> "Readings":
-        """The same readings with the sigmas of their whitened components (M, 2) so many times as large."""
+    def spread(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Readings":
+        """The same readings with the sigmas of their whitened components (M, 2) so many times as large.
+
+        Those of the corners (M,) grow by what is given for them, else like the larger of the two.
+        """
         root = np.linalg.cholesky(self.covariance)
         turn = root @ (sigmas[..., None] * np.linalg.inv(root))
         back = turn.swapaxes(-1, -2)
@@ -85,7 +89,7 @@ class Readings:
             self,
             covariance=turn @ self.covariance @ back,
             parts=parts,
-            corner_sigmas=self.corner_sigmas * sigmas.max(axis=-1),
+            corner_sigmas=self.corner_sigmas * (sigmas.max(axis=-1) if of_corners is None else of_corners),
         )
 
 
@@ -114,8 +118,8 @@ def no_readings() -> Readings:
     none = np.zeros((0, 2, 2))
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
     by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
-    corners_px, no_sigmas = np.zeros((0, 4, 2)), np.zeros(0)
+    corners_px, bias_px, sigmas = np.zeros((0, 4, 2)), np.zeros((0, 2)), np.zeros(0)
     return Readings(
-        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, no_sigmas,
-        no_sigmas,
+        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
+        sigmas,
     )  # fmt: skip

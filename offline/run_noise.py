@@ -17,7 +17,7 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from calib.noise import NoiseParameters
 from offline.chain import Chain
-from offline.corner_noise import least_shared
+from offline.corner_noise import least_shared, least_shared_by_corners
 from offline.factors import State, whitening
 from offline.local_map import LocalMap
 from offline.noise_fit import FittedPart, FittedSigma, fit_noise
@@ -117,15 +117,15 @@ def _under(
     local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters, near: State | None = None
 ) -> LocalMap:
     """The map solved under other noise and with readings that share errors; the fit may have ended near that."""
-    least = least_shared(local_map.chain.readings)
-    if noise == prior and not shared.any() and not least.any():
+    if noise == prior and not shared.any() and not local_map.chain.readings.corner_bias_px.any():
         return local_map
     chain = local_map.chain.weighed(noise)
     if len(chain.readings):
-        cell = _cells(chain)
-        at_least = np.maximum(shared, least_shared(chain.readings)[:, None])
-        sigmas = np.sqrt(1.0 + np.bincount(cell)[cell][:, None] * at_least)
-        chain = replace(chain, readings=chain.readings.spread(sigmas))
+        readings, cell = chain.readings, _cells(chain)
+        in_cell = np.bincount(cell)[cell]
+        sigmas = np.sqrt(1.0 + in_cell[:, None] * np.maximum(shared, least_shared(readings)[:, None]))
+        of_corners = np.maximum(shared.max(), least_shared_by_corners(readings, noise.sigma_corner_px))
+        chain = replace(chain, readings=readings.spread(sigmas, np.sqrt(1.0 + in_cell * of_corners)))
     weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
     graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))
     goodness = local_map.goodness

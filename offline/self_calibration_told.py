@@ -18,6 +18,7 @@ from calib.robot import Robot
 from offline.chain import Chain
 from offline.corner_factors import FOCAL_SCALE
 from offline.corner_graph import corner_graph, has_corners
+from offline.corner_noise import least_shared
 from offline.corner_solver import CornerSolution, solve_corners
 from offline.effort import Effort
 from offline.goodness import WINDOW_M, fitted_windows
@@ -87,7 +88,8 @@ def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
 
 def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:
     """The chain under the noise that its windows leave over, errors that neighbouring readings share included."""
-    windows = fitted_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE)
+    least = least_shared(local_map.chain.readings)
+    windows = fitted_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_readings = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})

@@ -281,7 +281,7 @@ def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResu
     ]
     chains = [replace(chain, readings=each) for chain, each in zip(solved.graph.chains, biased, strict=True)]
     times = np.concatenate([each.corner_sigmas for each in biased])
-    bias_px = np.concatenate([each.corner_bias_px for each in biased])
+    bias_px = np.concatenate([each.corner_bias_px[:, 1] for each in biased])
     wanted = np.hypot(sigmas_px(solved.graph), times * bias_px)
     np.testing.assert_allclose(sigmas_px(replace(solved.graph, chains=tuple(chains))), wanted, rtol=1e-12)
     assert bias_px.max() > 1.5 * bias_px.min()

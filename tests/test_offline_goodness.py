@@ -107,7 +107,7 @@ def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: flo
     parts = CovarianceParts(
         ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
     )
-    biased = replace(readings, parts=parts, corner_bias_px=np.full(len(readings), bias_px))
+    biased = replace(readings, parts=parts, corner_bias_px=np.full((len(readings), 2), bias_px))
     assert judged(replace(chain, readings=biased)).fits is (bias_px > 0.0)
 
 

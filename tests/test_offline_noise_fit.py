@@ -161,13 +161,16 @@ def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap
     plain = [solve_local_map(each.chain.weighed(prior)) for each in maps]
     refined = []
     for each in plain:
-        bias_px = np.full(len(each.chain.readings), 0.1)
+        bias_px = np.tile([0.1, 0.2], (len(each.chain.readings), 1))
         chain = replace(each.chain, readings=replace(each.chain.readings, corner_bias_px=bias_px))
         refined.append(replace(each, chain=chain))
     for before, after in zip(weighed_as(plain, prior, None), weighed_as(refined, prior, None), strict=True):
         assert (before.chain.readings.corner_sigmas == 1.0).all()
-        m = (after.chain.readings.corner_sigmas**2 - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
-        np.testing.assert_allclose(m, np.rint(m), rtol=1e-9)
+        times = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
+        m = (times - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
+        np.testing.assert_allclose(m, np.rint(m), rtol=1e-6)
+        of_corners = m * 0.2**2 / (prior.sigma_corner_px**2 + 0.2**2)
+        np.testing.assert_allclose(after.chain.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
         assert m.min() >= 1.0
         assert m.max() > 5.0
 

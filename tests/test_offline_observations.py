@@ -92,8 +92,9 @@ def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_b
     run, detections = run_of(tags), detections_of(corners_px, [0, 1, 2])
     readings, _ = read_detections(replace(run, corners_refined=True), detections, np.arange(3), NO_TWIST, noise)
     beside = readings.parts.rest[:, 0, 0] / readings.parts.of(("sigma_corner_px",))[0, :, 0, 0]
-    np.testing.assert_allclose(np.sqrt(beside), refined_bias_px(corners_px), rtol=1e-9)
-    np.testing.assert_allclose(readings.corner_bias_px, [0.02, np.hypot(0.02, 0.04), np.hypot(0.02, 0.2)], rtol=0.05)
+    np.testing.assert_allclose(np.sqrt(beside), refined_bias_px(corners_px)[:, 0], rtol=1e-9)
+    small_px = np.array([[0.0], [0.04], [0.2]])
+    np.testing.assert_allclose(readings.corner_bias_px, np.hypot(small_px, [0.01, 0.02]), rtol=0.05)
     np.testing.assert_allclose(readings.parts.under(noise), readings.covariance, rtol=1e-12)
     as_detected, _ = read_detections(run, detections, np.arange(3), NO_TWIST, noise)
     assert not as_detected.corner_bias_px.any()

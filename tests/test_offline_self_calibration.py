@@ -13,18 +13,22 @@ from calib.noise import NoiseParameters
 from calib.robot import Robot, read_robot_yaml, write_robot_yaml
 from fixtures.simulate import TRUTH_FILE, simulate
 from fixtures.world import load_world
+from offline.chain import chains_of
 from offline.corner_factors import FOCAL_SCALE
+from offline.effort import Effort
 from offline.errors import OfflineError
 from offline.graph import TAG_SCALE, Parameter, parameters_of_wheels
+from offline.local_map import solve_local_map
 from offline.map_io import read_map, write_map
 from offline.odometry import WHEEL_PARAMETERS
 from offline.parameter_results import CalibrationChoice
 from offline.pipeline import build_map, read_runs
 from offline.result import MapResult
-from offline.run import RobotFile, read_robot_file
+from offline.run import RobotFile, load_run, read_robot_file
 from offline.self_calibration_gate import TELLS_LESS, Told, choose
 from offline.self_calibration_option import NAMES, Calibrate, parse_calibrate
 from offline.self_calibration_robot import LIMITS, Learnt, Owned, all_open, corrected, opened
+from offline.self_calibration_told import told_by
 from offline.self_calibration_words import DRIVES, freed_lines
 from onboard.log_reader import find_logs
 from tests.benchmarks.accuracy import with_wide_priors
@@ -61,6 +65,16 @@ def driven(folder: Path, name: str, legs: Sequence[tuple[float, float, float]]) 
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
     return driven(folder, "a", LEGS)
+
+
+def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path) -> None:
+    (chain,) = chains_of(load_run(log), NOISE)
+    found = solve_local_map(chain)
+    readings = replace(chain.readings, corner_bias_px=np.full((len(chain.readings), 2), 0.2))
+    biased = replace(found, chain=replace(chain, readings=readings))
+    plain, less = (told_by([each], NOISE, [Effort(1e11, 1e11, 1e9)], corners=False) for each in (found, biased))
+    (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
+    assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
 
 
 def mistaken(**changes: float) -> Robot:
