@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+from fixtures.world import load_world
 from tests.benchmarks.gating_study import Pair, study_seed, summary
 
 GOOD = Pair("room", 0, 1.0, (0.1, 0.2), (0.1, 0.2), ())
 
 
 def test_a_seed_of_the_room() -> None:
-    (pair,) = study_seed("room", 0, factors=(1.0,))
+    (pair,) = study_seed(load_world("room"), 0, factors=(1.0,))
     assert isinstance(pair, Pair)
     assert pair.freed == ()
     assert pair.auto == pair.off

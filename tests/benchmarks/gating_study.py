@@ -1,6 +1,6 @@
 """Whether self-calibration spoils a map whose robot.yaml is right, seed by seed.
 
-    python -m tests.benchmarks.gating_study --worlds room,nsh --seeds 0-99
+    python -m tests.benchmarks.gating_study --worlds room,nsh,nsh_flat,nsh_rough --seeds 0-99
 
 Drives without rendering, calibration drawn from the priors of robot.yaml; each is mapped with `--calibrate off` and
 `auto`, under the true noise and under one three times too small and too large. A row a map: RMSE of the starts and of
@@ -20,10 +20,12 @@ import numpy as np
 
 from calib.noise import NoiseParameters
 from fixtures.simulate import TRUTH_FILE, simulate
+from fixtures.world import World
 from offline.pipeline import build_map, read_runs
 from offline.self_calibration_option import Calibrate
 from offline.truth import read_truth
 from onboard.log_reader import find_logs
+from tests.benchmarks.accuracy import study_worlds
 from tests.benchmarks.accuracy_study import figures_of
 from tests.benchmarks.command_line import say, seeds_of
 
@@ -44,7 +46,7 @@ class Pair:
     freed: tuple[str, ...]
 
 
-def study_seed(world: str, seed: int, factors: Sequence[float] = FACTORS) -> list[Pair | str]:
+def study_seed(world: World, seed: int, factors: Sequence[float] = FACTORS) -> list[Pair | str]:
     """A pair for each noise, or why there is none."""
     true, rows = NoiseParameters(), list[Pair | str]()
     with tempfile.TemporaryDirectory() as folder:
@@ -59,10 +61,10 @@ def study_seed(world: str, seed: int, factors: Sequence[float] = FACTORS) -> lis
                     (f.start_rmse_m, f.tags_rmse_m) for f in (figures_of(seed, each, truth) for each in (off, auto))
                 ]
             except ValueError as error:
-                rows.append(f"{world}, seed {seed}, noise {factor:.2g} times: {error}")
+                rows.append(f"{world.name}, seed {seed}, noise {factor:.2g} times: {error}")
                 continue
             freed = tuple(f"{each.name} of {each.owner}" for each in auto.choices if each.is_freed)
-            rows.append(Pair(world, seed, factor, errors[0], errors[1], freed))
+            rows.append(Pair(world.name, seed, factor, errors[0], errors[1], freed))
     return rows
 
 
@@ -86,13 +88,14 @@ def summary(pairs: Sequence[Pair]) -> tuple[list[str], bool]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script: 0 where every bound holds, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", default="room,nsh", help="[room,nsh]")
+    known = study_worlds()
+    parser.add_argument("--worlds", default=",".join(known), help=f"[{','.join(known)}]")
     parser.add_argument("--seeds", type=seeds_of, default="0-99", help="FIRST-LAST or one seed [0-99]")
     given = parser.parse_args(arguments)
     pairs, failed = [], False
-    for world in given.worlds.split(","):
+    for name in given.worlds.split(","):
         for seed in given.seeds:
-            for row in study_seed(world, seed):
+            for row in study_seed(known[name], seed):
                 say(str(row))
                 failed |= isinstance(row, str)
                 pairs += [row] if isinstance(row, Pair) else []
