@@ -27,18 +27,19 @@ _LEAST_PX: Final = 3.0  # nothing is detected that is so small
 def refined_bias_px(corners_px: FloatArray) -> FloatArray:
     """(M, 2) sigmas of what each tag's refined corners (M, 4, 2) err by alike: up and down, and in all ways."""
     (ax, ay), (bx, by) = ((corners_px[:, i + 2] - corners_px[:, i]).T for i in (0, 1))
-    side_px = np.sqrt(0.5 * np.abs(ax * by - ay * bx))  # of a square as large
+    with np.errstate(over="ignore", invalid="ignore"):  # corners that are no tag's
+        side_px = np.sqrt(0.5 * np.abs(ax * by - ay * bx))  # of a square as large
     small_px = _SMALL_BIAS_PX * (_SMALL_PX / np.maximum(side_px, _LEAST_PX)) ** _POWER
     return np.asarray(np.hypot(small_px[:, None], (_UPRIGHT_PX, _ANYHOW_PX)))
 
 
 def least_shared(readings: Readings) -> FloatArray:
-    """(M,) variance that readings share with their neighbours at least, as a multiple of their own."""
+    """(M, 2) variance that readings share with their neighbours at least, as a multiple of their own, by component."""
     if not readings.corner_bias_px.any():
-        return np.zeros(len(readings))
+        return np.zeros((len(readings), 2))
     unit = readings.parts.of(("sigma_corner_px",))[0]
-    by_pixel = np.trace(unit, axis1=1, axis2=2) / np.trace(readings.covariance, axis1=1, axis2=2)
-    return np.asarray(by_pixel * readings.corner_bias_px[:, 0] ** 2)
+    by_pixel = np.einsum("mii->mi", unit) / np.einsum("mii->mi", readings.covariance)
+    return np.asarray(by_pixel * readings.corner_bias_px[:, :1] ** 2)
 
 
 def least_shared_by_corners(readings: Readings, sigma_corner_px: float) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Least squares on tag corners: Gauss-Newton steps while they work, damped where one would raise the cost."""
+"""Least squares on tag corners: Gauss-Newton steps while they work, less of one or damped ones else."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -69,12 +69,17 @@ class CornerSolution:
 
 
 class _Step(NamedTuple):
-    """By a factor of H; (n,) in the tangent vector; what it promises of the cost; where it leads."""
+    """By a factor of H; (n,) in the tangent vector; what it promises of the cost, and by the slope alone; its end."""
 
     factor: FrontFactor
     by: FloatArray
     expected: float
+    by_slope: float
     state: SpatialState
+
+    def promised(self, share: float) -> float:
+        """By how much the cost falls with a share of it, by the linear model: evenly, but for a square."""
+        return share * self.by_slope - share**2 * (self.by_slope - self.expected)
 
 
 class _Taken(NamedTuple):
@@ -140,10 +145,11 @@ def _step(problem: CornerProblem, system: System, state: SpatialState, share: fl
     raised = share * problem.order.diagonal_of(system) if share else None
     factor = problem.order.factorise(system, raised)
     step = -factor.solve(system.gradient)
-    expected = -0.5 * float(system.gradient @ step)
+    by_slope = -float(system.gradient @ step)
+    expected = 0.5 * by_slope
     if raised is not None:
         expected += 0.5 * float((raised * step**2).sum())
-    return _Step(factor, step, expected, problem.moved(state, step))
+    return _Step(factor, step, expected, by_slope, problem.moved(state, step))
 
 
 def _taken(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _Taken | None:
@@ -152,7 +158,7 @@ def _taken(problem: CornerProblem, state: SpatialState, step: _Step, cost: float
         there = step.state if share == 1.0 else problem.moved(state, share * step.by)
         system, found = problem.system(there)
         if found < cost:
-            return _Taken(there, system, found, (cost - found) / (share * (2.0 - share) * step.expected))
+            return _Taken(there, system, found, (cost - found) / step.promised(share))
     return None
 
 

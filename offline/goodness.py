@@ -142,7 +142,8 @@ def fitted_windows(
         effort: what the logs are worth, of which a share is for this; without end where None. Where it does not suffice
             windows are longer, or not solved to their end: the whole then seems to fit better than it does.
         share: of it.
-        least_shared: (M,) variance that a reading shares with its neighbours at least, as a multiple of the told one.
+        least_shared: (M, 2) variance that a reading shares with its neighbours at least, as a multiple of the told one,
+            by component.
     """
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)

@@ -42,8 +42,9 @@ def tangent_errors(found_m: FloatArray, true_m: FloatArray, covariance: FloatArr
     found, true = (np.concatenate([places, np.zeros((1, 2))]) for places in (found_m, true_m))
     along, across = _variances(found, covariance)
     length = np.linalg.norm(found[:, None] - found[None], axis=-1)
-    # Of places that may well be one, in a direction from each other that nobody knows, the difference counts as it is.
-    has_direction = length**2 > across
+    # Of places that may well be one the difference counts as it is. Lengths and directions are for those whose distance
+    # is known to a quarter and whose direction to a radian: what is swung far round still has a length.
+    has_direction = (length**2 > 16.0 * along) & (length**2 > across)
     errors = np.zeros_like(found)
     for child, parent in _tree(np.where(has_direction, along, along + across)):
         difference = found[child] - found[parent], true[child] - true[parent]
@@ -54,11 +55,13 @@ def tangent_errors(found_m: FloatArray, true_m: FloatArray, covariance: FloatArr
 
 def _polar_error(found: FloatArray, true: FloatArray) -> FloatArray:
     """(2,) what is wrong in the length and in the direction of a difference (2,), along and across the one found."""
-    length = float(np.linalg.norm(found))
+    length, true_length = float(np.linalg.norm(found)), float(np.linalg.norm(true))
+    if not true_length:
+        return found  # no direction at all
     along = found / length
     across = np.array([-along[1], along[0]])
     turn = se2.wrap_angle(np.arctan2(found[1], found[0]) - np.arctan2(true[1], true[0]))
-    error: FloatArray = (length - np.linalg.norm(true)) * along + length * turn * across
+    error: FloatArray = (length - true_length) * along + length * turn * across
     return error
 
 
@@ -79,8 +82,8 @@ def _variances(places_m: FloatArray, covariance: FloatArray) -> tuple[FloatArray
 
 def _tree(variance: FloatArray) -> list[tuple[int, int]]:
     """(child, parent) for each place but the last one, parents first: the tree from there with the least variances."""
-    # Two places that are one, as far as the map can tell, would be no link at all.
-    sigma = np.sqrt(np.maximum(variance, max(1e-12 * float(variance.max()), 1e-300)))
+    # Two places that are one, as far as the map can tell, would be no link at all, and no more so what is below 1e-8.
+    sigma = np.sqrt(np.maximum(variance / max(float(variance.max()), 1e-300), 1e-12))
     np.fill_diagonal(sigma, 0.0)
     order, parents = breadth_first_order(minimum_spanning_tree(sigma), len(sigma) - 1, directed=False)
     return [(int(child), int(parents[child])) for child in order[1:]]

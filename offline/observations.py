@@ -74,7 +74,7 @@ def read_detections(
     bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros((len(tag), 2))
     sigmas_px = np.hypot(noise.sigma_corner_px, bias_px[:, 0])
     found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
-    good = _good(found, is_askew, level * (noise.sigma_corner_px / sigmas_px) ** 2)
+    good = _good(found, is_askew, level)
     n, kept = int(good.sum()), found.where(good)
     by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
     by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
@@ -102,7 +102,7 @@ def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArr
     Args:
         found: the readings.
         is_askew: (M,) whose range is trusted to little as it is.
-        level: (M,) how many times the variance said random errors of corners have.
+        level: (M,) how many times random errors of corners have the variance that is told.
     """
     range_m = found.range_bearing[:, 0]
     with np.errstate(invalid="ignore"):
@@ -123,10 +123,11 @@ def _told(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
 
 def _upright_or_askew(
     run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigmas_px: FloatArray
-) -> tuple[TagReadings, BoolArray, float, float]:
+) -> tuple[TagReadings, BoolArray, FloatArray, float]:
     """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
 
-    Besides how many times the corners' variance is what it is said to be, and the sigma by which the floor tilts base.
+    Besides (M,) how many times the corners' random errors have the variance that is told of all their errors, and the
+    sigma by which the floor tilts base.
     """
     camera, mount = run.camera, run.robot.mount
     assert camera is not None  # it saw them
@@ -147,7 +148,9 @@ def _upright_or_askew(
     is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
     spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
     found = upright.replaced(is_askew, general.where(is_askew))
-    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, level, tilt_rad
+    least_px = sigmas_px.min()
+    random = level_of(chi2 * (sigmas_px / least_px) ** 2) * (least_px / sigmas_px) ** 2
+    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, random, tilt_rad
 
 
 def _sides_m(run: Run, tag: IntArray) -> FloatArray:

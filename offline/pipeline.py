@@ -127,7 +127,7 @@ def build_map(
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
-    elif known:
+    else:
         maps = known + weighed_as(maps, noise, noise_fit)
     kept = tuple(kept_of(each) for each in maps)
     maps, merged, components, joins = _solved_together(

@@ -113,6 +113,24 @@ def _cells(chain: Chain) -> IntArray:
     return np.asarray(cell, dtype=np.int64)
 
 
+def _in_cell(chain: Chain) -> IntArray:
+    """(M,) how many readings are in the cell of each."""
+    cell = _cells(chain)
+    return np.asarray(np.bincount(cell)[cell])
+
+
+def spread_of_corners(chain: Chain, sigma_corner_px: float, shared: float = 0.0) -> FloatArray:
+    """(M,) how many times their sigma corners count with, for what neighbouring readings share.
+
+    Args:
+        chain: with one reading at least.
+        sigma_corner_px: of the corners' noise.
+        shared: variance that readings were found to share, as a multiple of their own.
+    """
+    at_least = np.maximum(shared, least_shared_by_corners(chain.readings, sigma_corner_px))
+    return np.asarray(np.sqrt(1.0 + _in_cell(chain) * at_least))
+
+
 def _under(
     local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters, near: State | None = None
 ) -> LocalMap:
@@ -121,11 +139,9 @@ def _under(
         return local_map
     chain = local_map.chain.weighed(noise)
     if len(chain.readings):
-        readings, cell = chain.readings, _cells(chain)
-        in_cell = np.bincount(cell)[cell]
-        sigmas = np.sqrt(1.0 + in_cell[:, None] * np.maximum(shared, least_shared(readings)[:, None]))
-        of_corners = np.maximum(shared.max(), least_shared_by_corners(readings, noise.sigma_corner_px))
-        chain = replace(chain, readings=readings.spread(sigmas, np.sqrt(1.0 + in_cell * of_corners)))
+        sigmas = np.sqrt(1.0 + _in_cell(chain)[:, None] * np.maximum(shared, least_shared(chain.readings)))
+        of_corners = spread_of_corners(chain, noise.sigma_corner_px, float(shared.max()))
+        chain = replace(chain, readings=chain.readings.spread(sigmas, of_corners))
     weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
     graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))
     goodness = local_map.goodness

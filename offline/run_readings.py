@@ -79,11 +79,11 @@ class RunReadings:
     def add_detections(self, message: TagDetections) -> None:
         """Takes one picture's, but for those with corrected bits."""
         self._pictures_ns.append(message.stamp_ns)
-        self._as_detected |= REFINED_CORNERS not in message.detector_settings
         for each in message.detections:
             if each.hamming <= MAX_HAMMING and len(each.corners_px) == 8:
                 self._detected.extend((message.stamp_ns, self._number(each.family, each.tag_id)))
                 self._corners_px.extend(each.corners_px)
+                self._as_detected |= REFINED_CORNERS not in message.detector_settings
 
     def add_observations(self, message: TagObservations) -> None:
         """Takes one look's."""

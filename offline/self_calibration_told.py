@@ -25,6 +25,7 @@ from offline.goodness import WINDOW_M, fitted_windows
 from offline.graph import Parameter, build_graph
 from offline.local_map import LocalMap
 from offline.odometry import ODOMETRY_NOISE
+from offline.run_noise import spread_of_corners
 from offline.self_calibration_gate import Told
 from offline.self_calibration_robot import all_open
 from offline.solver import Solution, solve
@@ -94,7 +95,10 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
     chain = local_map.chain.weighed(own)
-    return replace(chain, readings=chain.readings.spread(windows.sharing)) if len(chain.readings) else chain
+    if not len(chain.readings):
+        return chain
+    of_corners = np.maximum(windows.sharing.max(axis=-1), spread_of_corners(chain, own.sigma_corner_px))
+    return replace(chain, readings=chain.readings.spread(windows.sharing, of_corners))
 
 
 def _cuts(chain: Chain) -> list[tuple[int, int]]:

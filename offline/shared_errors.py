@@ -48,9 +48,9 @@ class SharedErrors:
 
         Args:
             cell: of each reading.
-            least_shared: (M,) variance that they are known to share, whatever was fitted; None: none.
+            least_shared: (M, 2) variance that they are known to share, whatever was fitted; None: none.
         """
-        shared = self.shared if least_shared is None else np.maximum(self.shared, least_shared[:, None])
+        shared = self.shared if least_shared is None else np.maximum(self.shared, least_shared)
         return np.sqrt(self.own + _n_in_cell(cell)[:, None] * shared)
 
     def freedom(self, cell: IntArray) -> float:

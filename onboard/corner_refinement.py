@@ -27,7 +27,7 @@ _ALONG: Final = 20  # pixels along a side
 _ACROSS: Final = 4  # pixels to both of its sides
 _ROUNDS: Final = 6
 _ARRIVED_PX: Final = 2e-3
-_LONGEST_STEP: Final = 0.5  # px, and of the blur's logarithm
+_LONGEST_STEP: Final = 0.5  # px, of the blur's logarithm, and of the share by which the light grows
 # What is summed over pixels: the derivatives by the distance at the side's begin, at its end and by the blur's
 # logarithm, each over a factor that a side's pixels have in common; those by the share by which the light grows along
 # the side, by a and by h; and the light.

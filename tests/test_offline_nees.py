@@ -118,6 +118,25 @@ def test_small_errors_stand_as_they_are() -> None:
     assert errors == pytest.approx(found - small, abs=1e-3 * np.abs(found - small).max())
 
 
+@pytest.mark.parametrize("sigmas_apart", [0.0, 0.5, 1.0, 2.0, 6.0])
+def test_two_runs_that_start_side_by_side_are_honest(sigmas_apart: float) -> None:
+    """Nearer to each other than they are known, too: there a length and a direction would not do."""
+    rng = np.random.default_rng(9)
+    true = np.array([[0.01 * sigmas_apart, 0.0]])
+    nees = [
+        _nees(tangent_errors(true + 0.01 * rng.standard_normal((1, 2)), true, 1e-4 * np.eye(2)), 1e-4 * np.eye(2))
+        for _ in range(400)
+    ]
+    assert _honest(nees, 2)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e6])
+def test_units_do_not_matter(scale: float) -> None:
+    found, true, covariance = _drawn(np.random.default_rng(10))
+    errors = tangent_errors(scale * found, scale * true, scale**2 * covariance)
+    assert errors == pytest.approx(scale * tangent_errors(found, true, covariance), rel=1e-6)
+
+
 def test_places_that_may_be_one_have_no_direction() -> None:
     """A run that started where the frame did, and a tag beside it known to 10 cm: differences count as they are."""
     found, true = np.array([[0.0, 0.0], [0.02, 0.0]]), np.array([[0.003, -0.004], [-0.05, 0.01]])

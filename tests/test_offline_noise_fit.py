@@ -15,6 +15,7 @@ from offline.odometry import ODOMETRY_NOISE
 from offline.pipeline import build_map, read_runs
 from offline.run import load_run
 from offline.run_noise import NOT_NEEDED, fit_and_weigh, weighed_as
+from offline.workings import Workings
 from onboard.log_reader import find_logs
 from tests.benchmarks.noise_study import Mapped, study_seed, summary
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
@@ -173,6 +174,20 @@ def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap
         np.testing.assert_allclose(after.chain.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
         assert m.min() >= 1.0
         assert m.max() > 5.0
+
+
+@pytest.mark.parametrize("noise", [None, NoiseParameters(sigma_corner_px=0.05)])
+def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
+    room: Path, noise: NoiseParameters | None
+) -> None:
+    runs = read_runs(find_logs([room]))
+    times = []
+    for refined in (False, True):
+        workings = Workings()
+        build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
+        chains = [each.chain for each in workings.maps]
+        times.append(np.concatenate([chain.readings.corner_sigmas for chain in chains]).max())
+    assert times[1] > 1.2 * times[0]
 
 
 def test_readings_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:

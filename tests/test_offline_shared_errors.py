@@ -91,7 +91,7 @@ def test_factors_and_freedom_follow_from_the_parts() -> None:
     errors = SharedErrors(np.array([1.0, 0.5]), np.array([100.0, 100.0]), np.array([2.0, 0.0]), np.array([5.0, 5.0]))
     cell = np.array([0, 1, 1, 1])
     np.testing.assert_allclose(errors.factors(cell) ** 2, [[3.0, 0.5], [7.0, 0.5], [7.0, 0.5], [7.0, 0.5]])
-    known = np.array([0.0, 1.0, 3.0, 0.0])  # what is known to be shared, reading by reading, in both components
+    known = np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0], [0.0, 0.0]])  # to be shared, reading by reading
     wanted = [[3.0, 0.5], [7.0, 3.5], [10.0, 9.5], [7.0, 0.5]]
     np.testing.assert_allclose(errors.factors(cell, known) ** 2, wanted)
     # Sums over readings: own 4 and 2, shared 2 (1 + 3 + 3 + 3) = 20.
