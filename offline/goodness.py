@@ -130,7 +130,7 @@ def fitted_windows(
     losses: Losses = DEFAULT_LOSSES,
     effort: Effort | None = None,
     share: float = 1.0,
-    least_shared: FloatArray | None = None,
+    least_shared: FloatArray | float = 0.0,
 ) -> Windows:
     """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
 
@@ -177,17 +177,21 @@ def fitted_windows(
         solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_tries)
         if effort:
             effort.spend(solution)
-        cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
-        errors = fit_shared_errors(solution, cell)
-        least = None if least_shared is None else least_shared / factors[1] ** 2
-        sharing, freedom = errors.factors(cell, least), min(freedom, errors.freedom(cell))
-        state = solution.state
+        sharing, known_like = _sharing(problem, solution, least_shared / factors[1] ** 2)
+        freedom, state = min(freedom, known_like), solution.state
         del solution
         shared = _scaled(apart, factors[0], factors[1] * sharing)
         solution = solve(shared, state, losses=losses, most_tries=most_tries)
     if effort:
         effort.spend(solution)
     return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, effort, share)
+
+
+def _sharing(problem: Problem, solution: Solution, least_shared: FloatArray | float) -> tuple[FloatArray, float]:
+    """Factors on the sigmas of readings, for what neighbours share, and what freedom their variance is known like."""
+    cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
+    errors = fit_shared_errors(solution, cell)
+    return errors.factors(cell, least_shared), errors.freedom(cell)
 
 
 def _nearly_solved(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:

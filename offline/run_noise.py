@@ -113,22 +113,23 @@ def _cells(chain: Chain) -> IntArray:
     return np.asarray(cell, dtype=np.int64)
 
 
-def _in_cell(chain: Chain) -> IntArray:
+def in_cell(chain: Chain) -> IntArray:
     """(M,) how many readings are in the cell of each."""
     cell = _cells(chain)
     return np.asarray(np.bincount(cell)[cell])
 
 
-def spread_of_corners(chain: Chain, sigma_corner_px: float, shared: float = 0.0) -> FloatArray:
+def spread_of_corners(chain: Chain, n_in_cell: IntArray, sigma_corner_px: float, shared: float = 0.0) -> FloatArray:
     """(M,) how many times their sigma corners count with, for what neighbouring readings share.
 
     Args:
         chain: with one reading at least.
+        n_in_cell: (M,) as of `in_cell`.
         sigma_corner_px: of the corners' noise.
         shared: variance that readings were found to share, as a multiple of their own.
     """
     at_least = np.maximum(shared, least_shared_by_corners(chain.readings, sigma_corner_px))
-    return np.asarray(np.sqrt(1.0 + _in_cell(chain) * at_least))
+    return np.asarray(np.sqrt(1.0 + n_in_cell * at_least))
 
 
 def _under(
@@ -139,8 +140,9 @@ def _under(
         return local_map
     chain = local_map.chain.weighed(noise)
     if len(chain.readings):
-        sigmas = np.sqrt(1.0 + _in_cell(chain)[:, None] * np.maximum(shared, least_shared(chain.readings)))
-        of_corners = spread_of_corners(chain, noise.sigma_corner_px, float(shared.max()))
+        n_in_cell = in_cell(chain)
+        sigmas = np.sqrt(1.0 + n_in_cell[:, None] * np.maximum(shared, least_shared(chain.readings)))
+        of_corners = spread_of_corners(chain, n_in_cell, noise.sigma_corner_px, float(shared.max()))
         chain = replace(chain, readings=chain.readings.spread(sigmas, of_corners))
     weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
     graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))

@@ -25,7 +25,7 @@ from offline.goodness import WINDOW_M, fitted_windows
 from offline.graph import Parameter, build_graph
 from offline.local_map import LocalMap
 from offline.odometry import ODOMETRY_NOISE
-from offline.run_noise import spread_of_corners
+from offline.run_noise import in_cell, spread_of_corners
 from offline.self_calibration_gate import Told
 from offline.self_calibration_robot import all_open
 from offline.solver import Solution, solve
@@ -97,7 +97,8 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort
     chain = local_map.chain.weighed(own)
     if not len(chain.readings):
         return chain
-    of_corners = np.maximum(windows.sharing.max(axis=-1), spread_of_corners(chain, own.sigma_corner_px))
+    of_corners = spread_of_corners(chain, in_cell(chain), own.sigma_corner_px)
+    of_corners = np.maximum(windows.sharing.max(axis=-1), of_corners)
     return replace(chain, readings=chain.readings.spread(windows.sharing, of_corners))
 
 

@@ -43,15 +43,14 @@ class SharedErrors:
     shared: FloatArray
     shared_redundancy: FloatArray
 
-    def factors(self, cell: IntArray, least_shared: FloatArray | None = None) -> FloatArray:
+    def factors(self, cell: IntArray, least_shared: FloatArray | float = 0.0) -> FloatArray:
         """(M, 2) factors on the sigmas of readings in cells (M,), with which they tell as much as independent ones.
 
         Args:
             cell: of each reading.
-            least_shared: (M, 2) variance that they are known to share, whatever was fitted; None: none.
+            least_shared: (M, 2) variance that they are known to share, whatever was fitted.
         """
-        shared = self.shared if least_shared is None else np.maximum(self.shared, least_shared)
-        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * shared)
+        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * np.maximum(self.shared, least_shared))
 
     def freedom(self, cell: IntArray) -> float:
         """What chi-square's degrees of freedom the variance of readings so weighed is known like.
