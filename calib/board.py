@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from calib.errors import CalibError
+from groundsbot.calib.errors import CalibError
 
 if TYPE_CHECKING:
     import cv2

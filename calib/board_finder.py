@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.board import Board
-from calib.corner_fit import FIRST_BLUR_PX, Corners, fitted_corners
-from calib.corner_surroundings import FIRST_RADIUS_PX, RADIUS_PX, Surroundings, bends
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.board import Board
+from groundsbot.calib.corner_fit import FIRST_BLUR_PX, Corners, fitted_corners
+from groundsbot.calib.corner_surroundings import FIRST_RADIUS_PX, RADIUS_PX, Surroundings, bends
 
 _LOCAL_SQUARES: Final = 1.2  # sigma: how far around a corner others tell the direction of its edges
 _LEAST_CORNERS: Final = 6  # a homography takes four; two more to test it

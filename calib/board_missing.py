@@ -6,9 +6,9 @@ from typing import Final
 import cv2
 import numpy as np
 
-from calib.board import Board
-from calib.board_finder import BoardFinder
-from calib.picture_source import GreyPicture
+from groundsbot.calib.board import Board
+from groundsbot.calib.board_finder import BoardFinder
+from groundsbot.calib.picture_source import GreyPicture
 
 _LOOKED_AT: Final = 5
 _LEAST_MARKERS: Final = 4  # a wrong one is read now and then

@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.arrays import BoolArray
-from calib.board import DEFAULT_BOARD, Board
-from calib.errors import CalibError
-from calib.sheet import HOW_TO_PRINT, Rectangle, Sheets, black_cells, paper_size_mm, room_on, sheets_written
+from groundsbot.calib.arrays import BoolArray
+from groundsbot.calib.board import DEFAULT_BOARD, Board
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.sheet import HOW_TO_PRINT, Rectangle, Sheets, black_cells, paper_size_mm, room_on, sheets_written
 
 
 def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -> None:

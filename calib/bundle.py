@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
-from calib.errors import CalibError
-from calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
 
 _ROUNDS: Final = 60
 _ARRIVED: Final = 1e-10  # of the cost, relative

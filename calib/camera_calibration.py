@@ -6,19 +6,19 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.board import Board
-from calib.board_finder import BoardFinder, View
-from calib.board_missing import why_no_board
-from calib.camera_file import CameraEstimate
-from calib.errors import CalibError
-from calib.intrinsics import KINDS, Calibration, calibrated, first_fit
-from calib.lens_parameters import parameter_names
-from calib.picture_source import GreyPicture
-from calib.projection_uncertainty import PictureGrid, expected_error_px, projection_covariance
-from calib.view_choice import distinct, most_telling
-from calib.view_spread import Spread, seen_board
-from calib.words import counted
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.board import Board
+from groundsbot.calib.board_finder import BoardFinder, View
+from groundsbot.calib.board_missing import why_no_board
+from groundsbot.calib.camera_file import CameraEstimate
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.intrinsics import KINDS, Calibration, calibrated, first_fit
+from groundsbot.calib.lens_parameters import parameter_names
+from groundsbot.calib.picture_source import GreyPicture
+from groundsbot.calib.projection_uncertainty import PictureGrid, expected_error_px, projection_covariance
+from groundsbot.calib.view_choice import distinct, most_telling
+from groundsbot.calib.view_spread import Spread, seen_board
+from groundsbot.calib.words import counted
 
 _LEAST_VIEWS: Final = 5
 _ANOTHER_VIEW_SHARE: Final = 0.02  # of the picture's width that a corner shifts by

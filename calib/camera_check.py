@@ -12,16 +12,16 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2, f
 
-from calib.arrays import FloatArray
-from calib.board_finder import BoardFinder, View
-from calib.bundle import adjusted
-from calib.camera_calibration import place_in_picture, refuse_few
-from calib.camera_file import CameraEstimate
-from calib.camera_model import CameraModel
-from calib.errors import CalibError
-from calib.intrinsics import Calibration, calibrated
-from calib.lens_parameters import parameters_of
-from calib.projection_uncertainty import PictureGrid, difference_px, rms_px
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.board_finder import BoardFinder, View
+from groundsbot.calib.bundle import adjusted
+from groundsbot.calib.camera_calibration import place_in_picture, refuse_few
+from groundsbot.calib.camera_file import CameraEstimate
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.intrinsics import Calibration, calibrated
+from groundsbot.calib.lens_parameters import parameters_of
+from groundsbot.calib.projection_uncertainty import PictureGrid, difference_px, rms_px
 
 _CHANCE: Final = 0.001
 # A camera that is off by less is as good as corners of tags, of which the best detector's err by 0.04 to 0.1 px.

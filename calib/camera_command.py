@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from calib.board import DEFAULT_BOARD, parse_board
-from calib.board_finder import BoardFinder
-from calib.camera_calibration import (
+from groundsbot.calib.board import DEFAULT_BOARD, parse_board
+from groundsbot.calib.board_finder import BoardFinder
+from groundsbot.calib.camera_calibration import (
     calibrate_from,
     check_ruler,
     estimate_of,
@@ -15,13 +15,13 @@ from calib.camera_calibration import (
     search,
     verdict,
 )
-from calib.camera_check import Check, checked
-from calib.camera_file import read_camera_yaml, read_estimate, write_camera_yaml
-from calib.camera_report import report_html
-from calib.errors import CalibError
-from calib.files import written_whole
-from calib.picture_source import grey_pictures
-from calib.words import counted
+from groundsbot.calib.camera_check import Check, checked
+from groundsbot.calib.camera_file import read_camera_yaml, read_estimate, write_camera_yaml
+from groundsbot.calib.camera_report import report_html
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.picture_source import grey_pictures
+from groundsbot.calib.words import counted
 
 _MOST_NAMED: Final = 20  # a video may have hundreds
 

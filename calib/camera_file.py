@@ -11,13 +11,13 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.distortion import COEFFICIENTS
-from calib.errors import CalibError
-from calib.files import written_whole
-from calib.kalibr import camera_from_kalibr, is_kalibr
-from calib.yaml_file import parse_mapping, read_text, validated
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.distortion import COEFFICIENTS
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.kalibr import camera_from_kalibr, is_kalibr
+from groundsbot.calib.yaml_file import parse_mapping, read_text, validated
 
 _ROUNDED_UP: Final = 1.001  # by whoever wrote the file
 

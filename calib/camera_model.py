@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import FloatArray
-from calib.distortion import COEFFICIENTS, Distortion
-from calib.errors import CalibError
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.distortion import COEFFICIENTS, Distortion
+from groundsbot.calib.errors import CalibError
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.camera_calibration import error_map, estimate_of
-from calib.intrinsics import Calibration
-from calib.lens_parameters import parameters_of
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_calibration import error_map, estimate_of
+from groundsbot.calib.intrinsics import Calibration
+from groundsbot.calib.lens_parameters import parameters_of
 
 _WIDTH_PX: Final = 560  # of a picture on the page
 _STYLE: Final = """

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Final, NoReturn
 
 import typer
 
-from calib.errors import GroundsbotError
+from groundsbot.calib.errors import GroundsbotError
 
 EXIT_DONE: Final = 0
 EXIT_REFUSED: Final = 1

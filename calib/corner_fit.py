@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.corner_surroundings import FIRST_RADIUS_PX, Surroundings
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.corner_surroundings import FIRST_RADIUS_PX, Surroundings
 
 FIRST_BLUR_PX: Final = 0.7
 _ROUNDS: Final = 15

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from scipy.special import erf
 
-from calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
 
 FIRST_RADIUS_PX: Final = 6  # about a corner whose edges' bends are not known yet
 RADIUS_PX: Final = 16  # with bends; time grows with its square, what is gained ends with half a square

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.polynomial.polynomial import polyroots, polyval
 
-from calib.arrays import BoolArray, FloatArray
+from groundsbot.calib.arrays import BoolArray, FloatArray
 
 COEFFICIENTS: Final = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from calib.errors import CalibError
+from groundsbot.calib.errors import CalibError
 
 
 @contextmanager

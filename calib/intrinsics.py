@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray
-from calib.board_finder import BoardFinder, View
-from calib.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
-from calib.camera_model import CameraModel
-from calib.distortion import COEFFICIENTS
-from calib.errors import CalibError
-from calib.lens_fit import MEDIAN_CHI2, LensFit, first_guess, fitted_lens
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.calib.board_finder import BoardFinder, View
+from groundsbot.calib.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.distortion import COEFFICIENTS
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.lens_fit import MEDIAN_CHI2, LensFit, first_guess, fitted_lens
 
 KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # the fewest coefficients first
 _FOLDS: Final = 5

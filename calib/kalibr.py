@@ -9,9 +9,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.camera_model import CameraModel
-from calib.errors import CalibError
-from calib.yaml_file import validated
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.yaml_file import validated
 
 _DISTORTIONS: Final = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
 _FinitePart = Annotated[float, Field(allow_inf_nan=False)]

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
-from calib.arrays import BoolArray, FloatArray
-from calib.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
-from calib.camera_model import CameraModel
-from calib.errors import CalibError
-from calib.lens_parameters import undistorted_camera
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.calib.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.lens_parameters import undistorted_camera
 
 _FOCALS: Final = np.geomspace(0.15, 5.0, 30)  # of the picture's width: from a fisheye to a telescope
 _VIEWS_FOR_GUESS: Final = 8

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.distortion import COEFFICIENTS
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.distortion import COEFFICIENTS
 
 FOCAL_AND_CENTRE = ("fx_px", "fy_px", "cx_px", "cy_px")
 _NAMES = {

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.yaml_file import parse_mapping, read_text, validated
+from groundsbot.calib.yaml_file import parse_mapping, read_text, validated
 
 # Wider than anything that drives, and within what sums of squares can hold.
 Sigma = Annotated[float, Field(ge=1e-9, le=1e3)]

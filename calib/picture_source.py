@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import CalibError
-from calib.picture_bytes import MOST_PIXELS, claimed_size, is_complete
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.picture_bytes import MOST_PIXELS, claimed_size, is_complete
 
 _PICTURES: Final = frozenset({".png", ".jpg", ".jpeg"})
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".mjpeg", ".mjpg"})

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.lens_parameters import pixels_by_parameters
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.lens_parameters import pixels_by_parameters
 
 _COLUMNS = 40
 _ROTATION_ROUNDS = 20

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.errors import CalibError
-from calib.yaml_file import parse_mapping, read_text, validated, write_model
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.yaml_file import parse_mapping, read_text, validated, write_model
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]

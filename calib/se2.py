@@ -9,7 +9,7 @@ estimation in robotics" (2018), appendix on SE(2).
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 _SERIES_BELOW_RAD = 0.5  # (w - sin w) / w^2 loses digits below this; its series does not
 

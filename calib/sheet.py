@@ -7,9 +7,9 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from calib.arrays import BoolArray
-from calib.errors import CalibError
-from calib.files import written_whole
+from groundsbot.calib.arrays import BoolArray
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import written_whole
 
 try:
     from reportlab.lib.units import mm

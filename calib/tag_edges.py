@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 _NEXT: Final = np.array([1, 2, 3, 0])
 _LAST: Final = np.array([3, 0, 1, 2])

@@ -11,8 +11,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from calib.arrays import BoolArray
-from calib.errors import CalibError
+from groundsbot.calib.arrays import BoolArray
+from groundsbot.calib.errors import CalibError
 
 _OPENCV_DICTIONARIES: Final = {
     "tag36h11": cv2.aruco.DICT_APRILTAG_36h11,

@@ -2,8 +2,8 @@
 
 import re
 
-from calib.errors import CalibError
-from calib.tag_family import family_size
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.tag_family import family_size
 
 _PART = re.compile(r"(\d+)(?:-(\d+))?")
 

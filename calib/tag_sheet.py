@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from calib.errors import CalibError
-from calib.sheet import (
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.sheet import (
     HOW_TO_PRINT,
     Sheets,
     black_cells,
@@ -14,7 +14,7 @@ from calib.sheet import (
     sheets_written,
     text_width_mm,
 )
-from calib.tag_family import tag_bits
+from groundsbot.calib.tag_family import tag_bits
 
 _SMALLEST_MM: Final = 20.0  # below this nobody could read what stands beside the tag
 _BETWEEN_MM: Final = 6.0  # two tags: room for the cutting marks of both

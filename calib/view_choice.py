@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
 
 
 def most_telling(by_view: FloatArray, most: int) -> BoolArray:

@@ -11,8 +11,8 @@ from typing import Final, cast
 import cv2
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.board import Board
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.board import Board
 
 # A calibration is the less certain the farther it must reach beyond the corners seen; so the border counts for itself.
 _BORDER: Final = 0.2  # of the picture's width and height

@@ -8,7 +8,7 @@ The paper's heading row has a sign slip and an Euler step where this has the arc
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 _SERIES_BELOW_RAD = 0.5
 

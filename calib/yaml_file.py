@@ -11,8 +11,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from calib.errors import CalibError
-from calib.files import written_whole
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import written_whole
 
 Model = TypeVar("Model", bound=BaseModel)
 

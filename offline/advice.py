@@ -12,17 +12,17 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from calib.arrays import FloatArray, IntArray
-from offline.advice_gain import Gain, Known
-from offline.advice_passes import Pass, Sighting, gain_of_pass, passes_of, sightings_of, ways_m
-from offline.advice_seen import expected_sigmas_m
-from offline.advice_tags import Drives, Place, View, drives_of, gain_of_place, places_of, view_of
-from offline.factors import State
-from offline.graph import Graph
-from offline.result import AdviceResult
-from offline.run_tags import TagKey
-from offline.solver import Solution
-from offline.weak_parts import MAX_RELATIVE_ERROR
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.advice_gain import Gain, Known
+from groundsbot.offline.advice_passes import Pass, Sighting, gain_of_pass, passes_of, sightings_of, ways_m
+from groundsbot.offline.advice_seen import expected_sigmas_m
+from groundsbot.offline.advice_tags import Drives, Place, View, drives_of, gain_of_place, places_of, view_of
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.result import AdviceResult
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.weak_parts import MAX_RELATIVE_ERROR
 
 # Corners of a way are enough to draw it.
 _MOST_POINTS: Final = 40

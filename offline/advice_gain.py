@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import linalg, sparse
 
-from calib.arrays import FloatArray, IntArray
-from offline.factors import Linearised, stacked
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import Linearised, stacked
 
 # Directions of an information matrix that tell this much less than the best one are rounding.
 _LEAST_SHARE: Final = 1e-10

@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.advice_gain import Gain, condensed
-from offline.factors import Columns, State
-from offline.graph import Graph
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.advice_gain import Gain, condensed
+from groundsbot.offline.factors import Columns, State
+from groundsbot.offline.graph import Graph
 
 # A pass is a trip, not the whole drive again: at most this share of the longest run, and so far.
 _LENGTH_SHARE: Final = 0.25

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.advice_gain import Known
-from offline.advice_tags import Drives, Place, View, gain_of_place, is_in_view
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.advice_gain import Known
+from groundsbot.offline.advice_tags import Drives, Place, View, gain_of_place, is_in_view
 
 # Points of equal weight on circles that hold 1/6, 1/2 and 5/6 of a normal distribution in the plane.
 _RADII: Final = np.sqrt(-2.0 * np.log1p(-np.array([1.0, 3.0, 5.0]) / 6.0))

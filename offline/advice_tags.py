@@ -12,12 +12,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.advice_gain import Gain, condensed
-from offline.advice_passes import SIGHTING_GAP_M
-from offline.factors import Columns, ReadingFactors, State
-from offline.graph import Graph
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.advice_gain import Gain, condensed
+from groundsbot.offline.advice_passes import SIGHTING_GAP_M
+from groundsbot.offline.factors import Columns, ReadingFactors, State
+from groundsbot.offline.graph import Graph
 
 MOST_TAGS: Final = 18
 # Places along the way from which these are chosen, and keyframes among which their viewers are sought.

@@ -13,16 +13,16 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray
-from offline.alignment_effort import UNLIMITED, AlignmentEffort
-from offline.alignment_rivals import CHANCE_NATS, Rivalry
-from offline.alignment_search import Explanation, explanations, halves, settled, without
-from offline.condensed import CondensedMap
-from offline.joint_fit import REACH_M, JointFit
-from offline.measured import Placement
-from offline.run_tags import TagKey
-from offline.tag_fit import FALSE_ALARM
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline.alignment_effort import UNLIMITED, AlignmentEffort
+from groundsbot.offline.alignment_rivals import CHANCE_NATS, Rivalry
+from groundsbot.offline.alignment_search import Explanation, explanations, halves, settled, without
+from groundsbot.offline.condensed import CondensedMap
+from groundsbot.offline.joint_fit import REACH_M, JointFit
+from groundsbot.offline.measured import Placement
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.tag_fit import FALSE_ALARM
 
 # An alignment's covariance holds for other choices of tags as well, down to this much less likely: that costs width
 # only, and a claim is wrong where the truth is beyond it.

@@ -18,12 +18,12 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray
-from offline.alignment_search import Explanation, without
-from offline.condensed import quarter_turned
-from offline.joint_fit import Held, Linear, hold
-from offline.tag_fit import FALSE_ALARM, log_wrong
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline.alignment_search import Explanation, without
+from groundsbot.offline.condensed import quarter_turned
+from groundsbot.offline.joint_fit import Held, Linear, hold
+from groundsbot.offline.tag_fit import FALSE_ALARM, log_wrong
 
 # Sure is what explains the tags a hundred times better than anything else. Hardly any comes near: of 214 trials of
 # `tests.benchmarks.alignment_study` none was between this and 10,000 times.

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.joint_fit import Bend, Held, JointFit, Linear, hold
-from offline.tag_fit import FALSE_ALARM, TAG_GATE, WRONG_FROM_M, ill_fitting, log_wrong_there, squared_sigmas
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.joint_fit import Bend, Held, JointFit, Linear, hold
+from groundsbot.offline.tag_fit import FALSE_ALARM, TAG_GATE, WRONG_FROM_M, ill_fitting, log_wrong_there, squared_sigmas
 
 # Looked for until an alignment with half the tags of the best one would be missed so rarely.
 MISSED: Final = 1e-4

@@ -12,20 +12,26 @@ from typing import Final
 import numpy as np
 from scipy import linalg
 
-from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_many, arrowhead_substitution, linearise_kernels, linearise_odometry, linearise_readings
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_covariance import SquareRoot, joint_covariance, square_root
-from offline.arrowhead_marginals import pose_marginals
-from offline.arrowhead_measured import MeasuredBlocks
-from offline.arrowhead_skeleton import expand
-from offline.arrowhead_threads import eliminate_chains
-from offline.arrowhead_tree import Tree
-from offline.factors import State
-from offline.linearise_kernels import Free, Odometry, Readings, Values
-from offline.robust import SQUARES, Loss
-from offline.rolled_step import rolled
-from offline.starting_pass import starting_pass
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline import (
+    arrowhead_many,
+    arrowhead_substitution,
+    linearise_kernels,
+    linearise_odometry,
+    linearise_readings,
+)
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_covariance import SquareRoot, joint_covariance, square_root
+from groundsbot.offline.arrowhead_marginals import pose_marginals
+from groundsbot.offline.arrowhead_measured import MeasuredBlocks
+from groundsbot.offline.arrowhead_skeleton import expand
+from groundsbot.offline.arrowhead_threads import eliminate_chains
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.factors import State
+from groundsbot.offline.linearise_kernels import Free, Odometry, Readings, Values
+from groundsbot.offline.robust import SQUARES, Loss
+from groundsbot.offline.rolled_step import rolled
+from groundsbot.offline.starting_pass import starting_pass
 
 _CONDITION_STEPS: Final = 12
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 
 class System(NamedTuple):

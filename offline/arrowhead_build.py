@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.arrays import BoolArray, IntArray
-from offline.arrowhead import Arrowhead, Skeleton
-from offline.arrowhead_measured import ends_in_top, measured_blocks
-from offline.arrowhead_skeleton import add_moments, compose
-from offline.arrowhead_tree import Couplings, build_tree
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
-from offline.linearise_kernels import Free, Odometry, Readings
-from offline.measured_factors import NOTHING_MEASURED, Measured
+from groundsbot.calib.arrays import BoolArray, IntArray
+from groundsbot.offline.arrowhead import Arrowhead, Skeleton
+from groundsbot.offline.arrowhead_measured import ends_in_top, measured_blocks
+from groundsbot.offline.arrowhead_skeleton import add_moments, compose
+from groundsbot.offline.arrowhead_tree import Couplings, build_tree
+from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
+from groundsbot.offline.linearise_kernels import Free, Odometry, Readings
+from groundsbot.offline.measured_factors import NOTHING_MEASURED, Measured
 
 
 def build_arrowhead(

@@ -11,10 +11,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy import linalg, sparse
 
-from calib.arrays import FloatArray, IntArray
-from offline import arrowhead_substitution
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_tree import Tree
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline import arrowhead_substitution
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_tree import Tree
 
 _AT_ONCE: Final = 1024
 # Numbers are kept with their zeros, which makes products ten times quicker, where there are few, and where what is

@@ -4,8 +4,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.jit import jitted
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.jit import jitted
 
 _LEAF_POSES: Final = 30
 _LEAVES_IN_MIDDLE: Final = 8

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.arrowhead_cut import LEVELS, Pieces
-from offline.jit import inner, jitted
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.arrowhead_cut import LEVELS, Pieces
+from groundsbot.offline.jit import inner, jitted
 
 
 class Lists(NamedTuple):

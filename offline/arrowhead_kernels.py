@@ -7,12 +7,12 @@ the blocks of H again when needed, so that fill is never stored.
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_cut import LEVELS
-from offline.arrowhead_leaf import eliminate_leaf
-from offline.arrowhead_tree import Tree, n_slots_of
-from offline.jit import borrowed, inner, jitted
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_cut import LEVELS
+from groundsbot.offline.arrowhead_leaf import eliminate_leaf
+from groundsbot.offline.arrowhead_tree import Tree, n_slots_of
+from groundsbot.offline.jit import borrowed, inner, jitted
 
 
 @jitted

@@ -1,9 +1,9 @@
 """Compiled elimination of a leaf, the poses of a chain between two separators: see `arrowhead_kernels`."""
 
-from calib.arrays import FloatArray
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_tree import Tree, n_slots_of
-from offline.jit import inner
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_tree import Tree, n_slots_of
+from groundsbot.offline.jit import inner
 
 
 @inner

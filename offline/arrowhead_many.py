@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_tree import Tree
-from offline.jit import borrowed, inner, jitted
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.jit import borrowed, inner, jitted
 
 
 class Pieces(NamedTuple):

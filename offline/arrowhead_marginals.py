@@ -12,12 +12,12 @@ up to the top for each.
 import numpy as np
 from scipy import linalg
 
-from calib.arrays import BoolArray, FloatArray
-from offline import arrowhead_substitution
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_cut import LEVELS
-from offline.arrowhead_tree import Tree
-from offline.jit import inner, jitted
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline import arrowhead_substitution
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_cut import LEVELS
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.jit import inner, jitted
 
 
 def pose_marginals(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: BoolArray) -> FloatArray:

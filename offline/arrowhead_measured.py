@@ -11,12 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead_blocks import System
-from offline.arrowhead_tree import Tree
-from offline.factors import Columns, State
-from offline.linearise_kernels import Free
-from offline.measured_factors import DistanceFactors, Measured
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead_blocks import System
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.factors import Columns, State
+from groundsbot.offline.linearise_kernels import Free
+from groundsbot.offline.measured_factors import DistanceFactors, Measured
 
 _NONE: Final = np.zeros(0, dtype=np.int64)
 

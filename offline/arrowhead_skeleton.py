@@ -7,10 +7,10 @@ factors of Lupton and Sukkarieh, "Visual-inertial-aided navigation for high-dyna
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import Odometry, multiply, wrapped
-from offline.linearise_odometry import motion_at, wheel_correction
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.jit import borrowed, inner, jitted
+from groundsbot.offline.linearise_kernels import Odometry, multiply, wrapped
+from groundsbot.offline.linearise_odometry import motion_at, wheel_correction
 
 
 @jitted

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_tree import Tree, n_slots_of
-from offline.jit import borrowed, inner, jitted
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_tree import Tree, n_slots_of
+from groundsbot.offline.jit import borrowed, inner, jitted
 
 
 @jitted

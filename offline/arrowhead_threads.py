@@ -4,10 +4,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_kernels import eliminate
-from offline.arrowhead_tree import Tree
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_kernels import eliminate
+from groundsbot.offline.arrowhead_tree import Tree
 
 
 def eliminate_chains(tree: Tree, system: System, damping: float, rows: Rows, threads: int) -> int:

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.arrowhead_cut import LEVELS, cut, nodes_of_poses
-from offline.arrowhead_fronts import Fronts, Lists, fronts_of, homes_of_tags, places_of, tags_in_nodes
-from offline.jit import inner
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.arrowhead_cut import LEVELS, cut, nodes_of_poses
+from groundsbot.offline.arrowhead_fronts import Fronts, Lists, fronts_of, homes_of_tags, places_of, tags_in_nodes
+from groundsbot.offline.jit import inner
 
 
 class Tree(NamedTuple):

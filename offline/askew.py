@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.tag_pose import TagReadings
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.tag_pose import TagReadings
 
 UPRIGHT_DOF: Final = 2
 FALSE_ALARM: Final = 1e-6

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from calib.words import counted
-from offline.bag_frames import FixedFrames
-from offline.bag_reader import Bag, BagMessage, BagTopic
-from offline.bag_tags import Look, read_look, told_left_out
-from offline.bag_topics import APRILTAG_MSGS, CAMERA_INFO, TAGS, TRANSFORMS, BagOptions, ChosenTopics
-from offline.errors import OfflineError
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_frames import FixedFrames
+from groundsbot.offline.bag_reader import Bag, BagMessage, BagTopic
+from groundsbot.offline.bag_tags import Look, read_look, told_left_out
+from groundsbot.offline.bag_topics import APRILTAG_MSGS, CAMERA_INFO, TAGS, TRANSFORMS, BagOptions, ChosenTopics
+from groundsbot.offline.errors import OfflineError
 
 _NS_PER_S: Final = 1_000_000_000
 Row = TypeVar("Row")

@@ -3,20 +3,20 @@
 import os
 from collections.abc import Iterator
 
-from calib.camera_model import CameraModel
-from calib.robot import Robot
-from calib.words import counted
-from offline.bag_content import BagClock
-from offline.bag_pictures import picture_of
-from offline.bag_reader import Bag, BagTopic
-from offline.bag_topics import BagOptions
-from offline.detect import detectors, in_parallel
-from offline.errors import OfflineError
-from offline.imported_run import Entry
-from offline.stages import Progress
-from onboard.detection_process import DetectorSettings, Picture
-from onboard.measurements import detections_message
-from onboard.messages import StampSource
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_content import BagClock
+from groundsbot.offline.bag_pictures import picture_of
+from groundsbot.offline.bag_reader import Bag, BagTopic
+from groundsbot.offline.bag_topics import BagOptions
+from groundsbot.offline.detect import detectors, in_parallel
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.imported_run import Entry
+from groundsbot.offline.stages import Progress
+from groundsbot.onboard.detection_process import DetectorSettings, Picture
+from groundsbot.onboard.measurements import detections_message
+from groundsbot.onboard.messages import StampSource
 
 
 def detect_in_bag(

@@ -5,8 +5,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.robot import R_LEVEL_OPTICAL, Mount
-from offline.errors import OfflineError
+from groundsbot.calib.robot import R_LEVEL_OPTICAL, Mount
+from groundsbot.offline.errors import OfflineError
 
 _Values = tuple[float, float, float, float, float, float, float]  # x, y, z, then quaternion x, y, z, w
 # What rounding does to a transform that is sent again and again; a joint that moves does more.

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.words import counted
-from offline.bag_content import BagContent, read_content
-from offline.bag_mount import find_mount
-from offline.bag_odometry import joint_readings, odometry_readings, wheel_joints
-from offline.bag_reader import open_bag
-from offline.bag_sightings import find_camera, tag_entries
-from offline.bag_topics import APRILTAG_ROS, JOINTS, BagOptions, ChosenTopics, choose_topics
-from offline.errors import OfflineError
-from offline.import_forms import refuse_tick_options
-from offline.import_robot import ImportOptions, KnownRobot, describe_robot, safe_name, wheel_scale
-from offline.imported_run import Entry, ImportReport, check_output, write_run
-from offline.stages import Progress
-from onboard.log_head import log_head
-from onboard.messages import PlanarOdometry
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_content import BagContent, read_content
+from groundsbot.offline.bag_mount import find_mount
+from groundsbot.offline.bag_odometry import joint_readings, odometry_readings, wheel_joints
+from groundsbot.offline.bag_reader import open_bag
+from groundsbot.offline.bag_sightings import find_camera, tag_entries
+from groundsbot.offline.bag_topics import APRILTAG_ROS, JOINTS, BagOptions, ChosenTopics, choose_topics
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.import_forms import refuse_tick_options
+from groundsbot.offline.import_robot import ImportOptions, KnownRobot, describe_robot, safe_name, wheel_scale
+from groundsbot.offline.imported_run import Entry, ImportReport, check_output, write_run
+from groundsbot.offline.stages import Progress
+from groundsbot.onboard.log_head import log_head
+from groundsbot.onboard.messages import PlanarOdometry
 
 
 def import_bag(

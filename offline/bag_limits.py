@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final, TypeVar
 
-from offline.errors import OfflineError
+from groundsbot.offline.errors import OfflineError
 
 _FREE_BYTES: Final = 112 << 20
 _BYTES_PER_BYTE: Final = 128  # odometry that hardly changes is packed into 60 bytes a message, and takes 3 kB here

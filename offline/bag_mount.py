@@ -6,11 +6,11 @@ from math import degrees, radians
 from pathlib import Path
 from typing import Final
 
-from calib.robot import Mount
-from offline.bag_frames import FixedFrames, frame_name, mount_of
-from offline.bag_topics import BagOptions
-from offline.errors import OfflineError
-from offline.import_robot import ImportOptions
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.bag_frames import FixedFrames, frame_name, mount_of
+from groundsbot.offline.bag_topics import BagOptions
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.import_robot import ImportOptions
 
 # ROS's names for the base, in the order of preference, where the odometry names none.
 _BASES: Final = ("base_link", "base_footprint")

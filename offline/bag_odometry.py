@@ -8,13 +8,13 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray, IntArray
-from offline.bag_topics import BagOptions
-from offline.errors import OfflineError
-from offline.import_forms import MAX_WHEEL_SPEED_M_S, WheelScale
-from offline.step_covariance import growth
-from offline.stretches import wheel_distances
-from onboard.messages import PlanarOdometry
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.bag_topics import BagOptions
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.import_forms import MAX_WHEEL_SPEED_M_S, WheelScale
+from groundsbot.offline.step_covariance import growth
+from groundsbot.offline.stretches import wheel_distances
+from groundsbot.onboard.messages import PlanarOdometry
 
 # A jump of the path is told from a fast drive by more than one reading's worth of crowded stamps.
 _BURST_M: Final = 0.5

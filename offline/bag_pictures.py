@@ -5,15 +5,15 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from calib.camera_file import fitted_coefficients
-from calib.camera_model import CameraModel
-from calib.distortion import COEFFICIENTS
-from calib.errors import CalibError
-from calib.picture_bytes import is_jpeg
-from offline.bag_topics import COMPRESSED_IMAGE
-from offline.errors import OfflineError
-from onboard.detection_process import Picture
-from onboard.picture import without_padding
+from groundsbot.calib.camera_file import fitted_coefficients
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.distortion import COEFFICIENTS
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.picture_bytes import is_jpeg
+from groundsbot.offline.bag_topics import COMPRESSED_IMAGE
+from groundsbot.offline.errors import OfflineError
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.picture import without_padding
 
 _GREY: Final[dict[str, np.dtype[Any]]] = {
     "mono8": np.dtype(np.uint8),

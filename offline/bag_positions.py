@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray
-from calib.words import counted
-from offline.bag_tags import Look, Sighting
-from offline.imported_run import Entry
-from onboard.messages import TagObservation, TagObservations
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_tags import Look, Sighting
+from groundsbot.offline.imported_run import Entry
+from groundsbot.onboard.messages import TagObservation, TagObservations
 
 # Nobody reads a tag's place to a hundredth of a millimetre: such variances are placeholders.
 _LEAST_SIGMA_M: Final = 1e-5

@@ -12,10 +12,10 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from calib.errors import GroundsbotError
-from offline.bag_definitions import DEFINITIONS
-from offline.bag_limits import METADATA, MOST_DEFINITION_CHARS, BagLimits
-from offline.errors import OfflineError
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.offline.bag_definitions import DEFINITIONS
+from groundsbot.offline.bag_limits import METADATA, MOST_DEFINITION_CHARS, BagLimits
+from groundsbot.offline.errors import OfflineError
 
 _BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
 _IDL_RULE: Final = "=" * 80 + "\n"  # between the files of a definition in IDL

@@ -6,25 +6,25 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
-from calib.camera_model import CameraModel
-from calib.errors import CalibError
-from calib.robot import Robot
-from calib.words import counted
-from offline.bag_content import BagContent
-from offline.bag_detection import detect_in_bag
-from offline.bag_frames import frame_name
-from offline.bag_pictures import camera_of
-from offline.bag_positions import position_entries
-from offline.bag_reader import Bag, BagTopic
-from offline.bag_tags import Look, told_left_out, with_tf_positions
-from offline.bag_topics import APRILTAG_MSGS, APRILTAG_ROS, BagOptions, ChosenTopics, the_camera_info
-from offline.errors import OfflineError
-from offline.imported_run import Entry
-from offline.run import read_robot_file
-from offline.stages import Progress
-from onboard.measurements import tag_message
-from onboard.messages import TagDetections, TagObservations
-from onboard.tag_detector import Detection
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.robot import Robot
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_content import BagContent
+from groundsbot.offline.bag_detection import detect_in_bag
+from groundsbot.offline.bag_frames import frame_name
+from groundsbot.offline.bag_pictures import camera_of
+from groundsbot.offline.bag_positions import position_entries
+from groundsbot.offline.bag_reader import Bag, BagTopic
+from groundsbot.offline.bag_tags import Look, told_left_out, with_tf_positions
+from groundsbot.offline.bag_topics import APRILTAG_MSGS, APRILTAG_ROS, BagOptions, ChosenTopics, the_camera_info
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.imported_run import Entry
+from groundsbot.offline.run import read_robot_file
+from groundsbot.offline.stages import Progress
+from groundsbot.onboard.measurements import tag_message
+from groundsbot.onboard.messages import TagDetections, TagObservations
+from groundsbot.onboard.tag_detector import Detection
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.tag_family import families, family_size
-from calib.words import counted
-from offline.bag_frames import frame_name
-from offline.bag_topics import APRILTAG_MSGS, APRILTAG_ROS
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.tag_family import families, family_size
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_frames import frame_name
+from groundsbot.offline.bag_topics import APRILTAG_MSGS, APRILTAG_ROS
 
 # OpenCV's pixels, ours, have their centres at whole numbers.
 _PIXEL_CENTRE_PX: Final = 0.5

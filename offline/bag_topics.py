@@ -6,9 +6,9 @@ from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from calib.words import counted
-from offline.bag_reader import BagTopic
-from offline.errors import OfflineError
+from groundsbot.calib.words import counted
+from groundsbot.offline.bag_reader import BagTopic
+from groundsbot.offline.errors import OfflineError
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 JOINTS: Final = "sensor_msgs/msg/JointState"

@@ -5,27 +5,27 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from calib.camera_file import write_camera_yaml
-from calib.camera_model import CameraModel
-from calib.noise import read_noise_yaml
-from calib.robot import Robot, write_robot_yaml
-from offline.corner_factors import FOCAL_SCALE
-from offline.errors import OfflineError
-from offline.jit import compilation_announced
-from offline.map_command import metre_line, read_robot_files, say
-from offline.measured import TapeOptions
-from offline.parameter_results import CalibrationResult
-from offline.pipeline import build_map, read_runs
-from offline.progress import progress_bar
-from offline.result import MapResult
-from offline.run import Run
-from offline.self_calibration import refocused
-from offline.self_calibration_option import AUTO, parse_calibrate
-from offline.self_calibration_robot import Learnt, Owned, corrected
-from offline.self_calibration_words import choice_words, learnt_lines
-from offline.stages import Stages
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.noise import read_noise_yaml
+from groundsbot.calib.robot import Robot, write_robot_yaml
+from groundsbot.offline.corner_factors import FOCAL_SCALE
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.jit import compilation_announced
+from groundsbot.offline.map_command import metre_line, read_robot_files, say
+from groundsbot.offline.measured import TapeOptions
+from groundsbot.offline.parameter_results import CalibrationResult
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.progress import progress_bar
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.self_calibration import refocused
+from groundsbot.offline.self_calibration_option import AUTO, parse_calibrate
+from groundsbot.offline.self_calibration_robot import Learnt, Owned, corrected
+from groundsbot.offline.self_calibration_words import choice_words, learnt_lines
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 
 _YAML: Final = (".yaml", ".yml")
 

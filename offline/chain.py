@@ -5,13 +5,13 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.observations import read_detections, read_positions
-from offline.odometry import ChainOdometry, WheelTrack, compose_odometry
-from offline.readings import Readings, joined
-from offline.run import Run
-from offline.run_tags import Detections, Positions, TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.observations import read_detections, read_positions
+from groundsbot.offline.odometry import ChainOdometry, WheelTrack, compose_odometry
+from groundsbot.offline.readings import Readings, joined
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
 KEYFRAME_DISTANCE_M: Final = 0.02

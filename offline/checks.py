@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.graph import TAG_SCALE, Graph
-from offline.parameter_results import CheckResult, MetreResult
-from offline.solver import Solution
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.graph import TAG_SCALE, Graph
+from groundsbot.offline.parameter_results import CheckResult, MetreResult
+from groundsbot.offline.solver import Solution
 
 # The corrections that each check compares.
 COMPARED: Final = {"scale": ("wheel_scale", TAG_SCALE), "turn": ("wheel_scale", "track_scale")}

@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.chain import Chain
-from offline.odometry import ChainOdometry, chained
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.odometry import ChainOdometry, chained
 
 # Keyframes at least this far apart where tags are read, and where none is. Turns count like arcs of half a metre.
 _READING_SPACING_M: Final = 0.25

@@ -4,26 +4,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from offline.advice import advise
-from offline.checks import checks_of, metre_of
-from offline.corner_graph import has_corners
-from offline.corner_map import Refined, refine
-from offline.fit_results import MeasurementResult, SuspectTag
-from offline.global_map import calibration_of, component_of, solve_global_map
-from offline.graph import Graph
-from offline.joined_goodness import joined_goodness
-from offline.local_map import LocalMap
-from offline.measured import Measurements
-from offline.measured_map import judged
-from offline.merge import Group
-from offline.parameter_results import CalibrationResult, CheckResult, MetreResult
-from offline.result import AdviceResult, Component
-from offline.solver import Solution
-from offline.stages import Stages
-from offline.suspects import joined, split_together
-from offline.suspects_report import suspect_tags
-from offline.weak_parts import weak_parts
-from offline.workings import Solved
+from groundsbot.offline.advice import advise
+from groundsbot.offline.checks import checks_of, metre_of
+from groundsbot.offline.corner_graph import has_corners
+from groundsbot.offline.corner_map import Refined, refine
+from groundsbot.offline.fit_results import MeasurementResult, SuspectTag
+from groundsbot.offline.global_map import calibration_of, component_of, solve_global_map
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.joined_goodness import joined_goodness
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measured import Measurements
+from groundsbot.offline.measured_map import judged
+from groundsbot.offline.merge import Group
+from groundsbot.offline.parameter_results import CalibrationResult, CheckResult, MetreResult
+from groundsbot.offline.result import AdviceResult, Component
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.suspects import joined, split_together
+from groundsbot.offline.suspects_report import suspect_tags
+from groundsbot.offline.weak_parts import weak_parts
+from groundsbot.offline.workings import Solved
 
 
 class SolvedComponent(NamedTuple):

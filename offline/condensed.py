@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.local_map import LocalMap
-from offline.run_tags import TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.corner_chosen_looks import judges, looks_by_tag
-from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
-from offline.corner_kernels import add_looks
-from offline.corner_problem import CORNER_LOSS, CornerProblem, columns_of, prior_normal
-from offline.front_kernels import System
-from offline.fronts import Fronts, NotPositiveError, build_fronts
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.corner_chosen_looks import judges, looks_by_tag
+from groundsbot.offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
+from groundsbot.offline.corner_kernels import add_looks
+from groundsbot.offline.corner_problem import CORNER_LOSS, CornerProblem, columns_of, prior_normal
+from groundsbot.offline.front_kernels import System
+from groundsbot.offline.fronts import Fronts, NotPositiveError, build_fronts
 
 _LOOKS: Final = 0  # among the kinds of factors
 

@@ -4,8 +4,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.jit import inner, jitted
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.jit import inner, jitted
 
 POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
 _JUDGING_LOOKS: Final = 8  # of each tag

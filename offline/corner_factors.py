@@ -16,13 +16,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
-from offline.corner_look_kernels import LookArrays, SpatialValues
-from offline.factors import Columns, Linearised, State
-from offline.lens_kernels import lenses_of
-from offline.tag_pose import UNIT_CORNERS
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.offline.corner_look_kernels import LookArrays, SpatialValues
+from groundsbot.offline.factors import Columns, Linearised, State
+from groundsbot.offline.lens_kernels import lenses_of
+from groundsbot.offline.tag_pose import UNIT_CORNERS
 
 # By how much camera.yaml's focal lengths are off, as a share: both alike, about the principal point, which is held.
 FOCAL_SCALE: Final = "focal_scale"

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from calib.arrays import FloatArray
-from offline.corner_factors import SpatialState
-from offline.corner_pictures import Pictures, pictures_at
-from offline.corner_problem import LOOKS, CornerProblem
-from offline.front_kernels import add_vectors
-from offline.fronts import FrontFactor, NotPositiveError
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.corner_factors import SpatialState
+from groundsbot.offline.corner_pictures import Pictures, pictures_at
+from groundsbot.offline.corner_problem import LOOKS, CornerProblem
+from groundsbot.offline.front_kernels import add_vectors
+from groundsbot.offline.fronts import FrontFactor, NotPositiveError
 
 LEVEL: Final = np.zeros(3)
 # rad and m: a floor between a hall's and a lawn's; first looked for about here, and ten times nearer to level.

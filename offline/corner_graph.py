@@ -6,20 +6,20 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import wheels
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
-from calib.tag_edges import outward
-from offline.chain import Chain
-from offline.corner_calibrated_start import calibrated
-from offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
-from offline.corner_problem import CornerProblem, columns_of
-from offline.corner_sides import facing_as_predicted
-from offline.corner_start import tags_hung
-from offline.factors import MOUNT_PARAMETERS, CalibrationPrior, ReadingFactors, State
-from offline.graph import Graph, Parameter
-from offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
-from offline.upright import NOTHING_UPRIGHT, UprightFactors
+from groundsbot.calib import wheels
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.tag_edges import outward
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.corner_calibrated_start import calibrated
+from groundsbot.offline.corner_factors import CORNER_MOUNT, FOCAL_SCALE, CornerFactors, Looks, SpatialState
+from groundsbot.offline.corner_problem import CornerProblem, columns_of
+from groundsbot.offline.corner_sides import facing_as_predicted
+from groundsbot.offline.corner_start import tags_hung
+from groundsbot.offline.factors import MOUNT_PARAMETERS, CalibrationPrior, ReadingFactors, State
+from groundsbot.offline.graph import Graph, Parameter
+from groundsbot.offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
+from groundsbot.offline.upright import NOTHING_UPRIGHT, UprightFactors
 
 _CORNER_NOISE: Final = "sigma_corner_px"
 _HEIGHT: Final = "mount_z_m"

@@ -4,13 +4,19 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, look_factor
-from offline.front_kernels import Kind, System, add_matrix, add_vector
-from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import Odometry, Values
-from offline.linearise_odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
-from offline.robust import Loss, loss_and_weight
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, look_factor
+from groundsbot.offline.front_kernels import Kind, System, add_matrix, add_vector
+from groundsbot.offline.jit import borrowed, inner, jitted
+from groundsbot.offline.linearise_kernels import Odometry, Values
+from groundsbot.offline.linearise_odometry import (
+    error_by_wheels,
+    error_of,
+    motion_at,
+    scaled_information,
+    wheel_correction,
+)
+from groundsbot.offline.robust import Loss, loss_and_weight
 
 N_LOOK: Final = 19
 N_POSE: Final = 3  # which come first

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.jit import inlined, inner
-from offline.lens_kernels import CENTRE, distorted_at
-from offline.linearise_kernels import series
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.jit import inlined, inner
+from groundsbot.offline.lens_kernels import CENTRE, distorted_at
+from groundsbot.offline.linearise_kernels import series
 
 
 class LookArrays(NamedTuple):

@@ -7,17 +7,17 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.robot import Mount
-from offline.corner_floor import LEVEL, fitted_wobble, guessed_wobble, with_wobble
-from offline.corner_graph import CornerGraph, corner_graph
-from offline.corner_problem import CornerProblem
-from offline.corner_solver import CornerSolution, solve_corners
-from offline.corner_start import tags_rehung
-from offline.factors import State
-from offline.graph import Graph, Parameter
-from offline.level_stretches import stretches_off_level
-from offline.result import FloorSigmas, TagPose
-from offline.solver import Solution
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.corner_floor import LEVEL, fitted_wobble, guessed_wobble, with_wobble
+from groundsbot.offline.corner_graph import CornerGraph, corner_graph
+from groundsbot.offline.corner_problem import CornerProblem
+from groundsbot.offline.corner_solver import CornerSolution, solve_corners
+from groundsbot.offline.corner_start import tags_rehung
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph, Parameter
+from groundsbot.offline.level_stretches import stretches_off_level
+from groundsbot.offline.result import FloorSigmas, TagPose
+from groundsbot.offline.solver import Solution
 
 # Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
 _MOST_OUTLIERS: Final = 0.5

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.readings import Readings
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.readings import Readings
 
 # Measured on rendered drives, as is what follows (docs/estimate.md). Up and down tags of any size are seen right to
 # less than this, and that alone is what ranges come from. Left and right sides are those beside half hidden margins,

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.fronts import Fronts, build_fronts, common_ancestor
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.fronts import Fronts, build_fronts, common_ancestor
 
 if TYPE_CHECKING:
-    from offline.corner_problem import CornerProblem
+    from groundsbot.offline.corner_problem import CornerProblem
 
 # Poses that one leaf eliminates, between two separators, and leaves or branches that meet in a branch.
 _LEAF: Final = 12

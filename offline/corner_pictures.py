@@ -4,10 +4,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_factors import SpatialState, spatial_values
-from offline.corner_kernels import N_LOOK, add_wobble
-from offline.corner_problem import CORNER_LOSS, CornerProblem
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_factors import SpatialState, spatial_values
+from groundsbot.offline.corner_kernels import N_LOOK, add_wobble
+from groundsbot.offline.corner_problem import CORNER_LOSS, CornerProblem
 
 _BY_THE_LOSS: Final = np.zeros(0)
 

@@ -7,20 +7,20 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.arrowhead_build import compiled_motions
-from offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
-from offline.corner_kernels import N_LOOK, add_looks, add_motions
-from offline.corner_order import corner_order
-from offline.corner_step_kernels import move
-from offline.factors import CalibrationPrior, Linearised, OdometryFactors, ReadingFactors
-from offline.front_kernels import System
-from offline.fronts import FrontFactor, Fronts, Normal
-from offline.linearise_kernels import Odometry, Values
-from offline.measured_factors import Measured
-from offline.robust import Loss, huber, losses_and_weights
-from offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
-from offline.upright import NOTHING_UPRIGHT, UprightFactors
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.arrowhead_build import compiled_motions
+from groundsbot.offline.corner_factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
+from groundsbot.offline.corner_kernels import N_LOOK, add_looks, add_motions
+from groundsbot.offline.corner_order import corner_order
+from groundsbot.offline.corner_step_kernels import move
+from groundsbot.offline.factors import CalibrationPrior, Linearised, OdometryFactors, ReadingFactors
+from groundsbot.offline.front_kernels import System
+from groundsbot.offline.fronts import FrontFactor, Fronts, Normal
+from groundsbot.offline.linearise_kernels import Odometry, Values
+from groundsbot.offline.measured_factors import Measured
+from groundsbot.offline.robust import Loss, huber, losses_and_weights
+from groundsbot.offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD
+from groundsbot.offline.upright import NOTHING_UPRIGHT, UprightFactors
 
 # Beyond it lie as many of good looks, with their eight numbers, as of good readings with two.
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))

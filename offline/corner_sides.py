@@ -1,4 +1,4 @@
-"""Which way tags' sides face in pictures, for cameras that see them too far in (`calib.tag_edges`).
+"""Which way tags' sides face in pictures, for cameras that see them too far in (`groundsbot.calib.tag_edges`).
 
 Seen corners would tell it too, but with their noise in it: a side that is seen askew would face as its own error has
 it, and the sum of that over all looks tells of a shift that is not there. A corner adds 2 sigma^2 over the side's
@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.tag_edges import outward
-from offline.corner_factors import CornerFactors, SpatialState, spatial_values
-from offline.corner_look_kernels import Eye, LookArrays, SpatialValues
-from offline.corner_start_kernels import eyes_of
-from offline.jit import borrowed, jitted
-from offline.lens_kernels import CENTRE, distorted_at
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.tag_edges import outward
+from groundsbot.offline.corner_factors import CornerFactors, SpatialState, spatial_values
+from groundsbot.offline.corner_look_kernels import Eye, LookArrays, SpatialValues
+from groundsbot.offline.corner_start_kernels import eyes_of
+from groundsbot.offline.jit import borrowed, jitted
+from groundsbot.offline.lens_kernels import CENTRE, distorted_at
 
 
 def facing_as_predicted(factors: CornerFactors, state: SpatialState) -> CornerFactors:

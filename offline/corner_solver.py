@@ -6,13 +6,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_factors import SpatialState
-from offline.corner_pictures import Pictures, pictures_at
-from offline.corner_problem import CornerProblem
-from offline.damping import Damping
-from offline.front_kernels import System
-from offline.fronts import FrontFactor, NotPositiveError
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_factors import SpatialState
+from groundsbot.offline.corner_pictures import Pictures, pictures_at
+from groundsbot.offline.corner_problem import CornerProblem
+from groundsbot.offline.damping import Damping
+from groundsbot.offline.front_kernels import System
+from groundsbot.offline.fronts import FrontFactor, NotPositiveError
 
 _MOST_STEPS: Final = 40
 # What is tried of a step, the most first. What hangs loose is swung by metres on an arc that a whole step overshoots;

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_chosen_looks import POSED_LOOKS, judges, looks_by_tag, posed
-from offline.corner_factors import CornerFactors, SpatialState, spatial_values
-from offline.corner_problem import CORNER_LOSS, CornerProblem
-from offline.corner_start_kernels import POSES, SAME_RAD, allowed, fit, rays_of
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_chosen_looks import POSED_LOOKS, judges, looks_by_tag, posed
+from groundsbot.offline.corner_factors import CornerFactors, SpatialState, spatial_values
+from groundsbot.offline.corner_problem import CORNER_LOSS, CornerProblem
+from groundsbot.offline.corner_start_kernels import POSES, SAME_RAD, allowed, fit, rays_of
 
 
 def tags_hung(problem: CornerProblem, state: SpatialState) -> SpatialState:

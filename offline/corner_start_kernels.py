@@ -4,16 +4,16 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.arrowhead_kernels import eliminate_columns
-from offline.corner_chosen_looks import ByTag
-from offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, gone_back
-from offline.corner_step_kernels import turn_by
-from offline.jit import borrowed, inlined, inner, jitted
-from offline.lens_kernels import CENTRE, distorted_at
-from offline.linearise_kernels import multiply
-from offline.planar_kernels import ray_through, square_poses
-from offline.robust import Loss, loss_and_weight
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.arrowhead_kernels import eliminate_columns
+from groundsbot.offline.corner_chosen_looks import ByTag
+from groundsbot.offline.corner_look_kernels import Eye, LookArrays, SpatialValues, face, gone_back
+from groundsbot.offline.corner_step_kernels import turn_by
+from groundsbot.offline.jit import borrowed, inlined, inner, jitted
+from groundsbot.offline.lens_kernels import CENTRE, distorted_at
+from groundsbot.offline.linearise_kernels import multiply
+from groundsbot.offline.planar_kernels import ray_through, square_poses
+from groundsbot.offline.robust import Loss, loss_and_weight
 
 # Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
 # have no planar pose at all.

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_look_kernels import SpatialValues
-from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import advance, go_along, multiply, series
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_look_kernels import SpatialValues
+from groundsbot.offline.jit import borrowed, inner, jitted
+from groundsbot.offline.linearise_kernels import advance, go_along, multiply, series
 
 
 @jitted

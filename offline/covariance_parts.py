@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.noise import NoiseParameters
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Final, NoReturn
 
-from offline.errors import OfflineError
+from groundsbot.offline.errors import OfflineError
 
 _NS_PER_S: Final = Decimal(1_000_000_000)
 _MAX_NS: Final = 2**63 - 1

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
 
 # A ring that closes is taken for one that does not so rarely.
 _FALSE_ALARM: Final = 1e-4

@@ -12,21 +12,21 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from calib.errors import GroundsbotError
-from calib.picture_bytes import claimed_size
-from calib.robot import parse_robot_yaml
-from offline.errors import OfflineError
-from offline.new_log import new_log
-from offline.picture_limits import most_work_pixels, plausible_pixels, work_pixels
-from offline.stages import Progress
-from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings, Picture
-from onboard.log_head import camera_from_message
-from onboard.log_losses import LogLosses
-from onboard.log_reader import files_of, read_head, read_log
-from onboard.log_segments import PICTURE_TOPIC, SegmentLimits
-from onboard.log_writer import LogWriter
-from onboard.measurements import detections_message
-from onboard.messages import (
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.picture_bytes import claimed_size
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.new_log import new_log
+from groundsbot.offline.picture_limits import most_work_pixels, plausible_pixels, work_pixels
+from groundsbot.offline.stages import Progress
+from groundsbot.onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings, Picture
+from groundsbot.onboard.log_head import camera_from_message
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import files_of, read_head, read_log
+from groundsbot.onboard.log_segments import PICTURE_TOPIC, SegmentLimits
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.measurements import detections_message
+from groundsbot.onboard.messages import (
     TOPICS,
     CameraCalibration,
     CompressedImage,

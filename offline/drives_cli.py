@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from calib.command_line import EXIT_WITH_LOSSES
-from offline.cli_options import JsonFlag, LogArguments
-from offline.map_model import MapModel
-from offline.self_calibration_option import AUTO, OFF
+from groundsbot.calib.command_line import EXIT_WITH_LOSSES
+from groundsbot.offline.cli_options import JsonFlag, LogArguments
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.self_calibration_option import AUTO, OFF
 
 RobotFiles = Annotated[
     list[Path] | None,
@@ -75,7 +75,7 @@ def map_command(
     Exit 3: the runs do not all hang together, so that the map has several components; or a log is damaged, and the map
     is without what is lost of it. Which of these is printed.
     """
-    from offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
+    from groundsbot.offline.map_command import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
     options = MapOptions(
         logs,
@@ -121,7 +121,7 @@ def calibrate(
     """
     import json
 
-    from offline.calibrate_command import CalibrateOptions, as_json, calibrate_robots, summary
+    from groundsbot.offline.calibrate_command import CalibrateOptions, as_json, calibrate_robots, summary
 
     options = CalibrateOptions(
         logs, output, robot or (), noise, distance or (), corners=model is MapModel.CORNERS, calibrate=calibrate
@@ -157,7 +157,7 @@ def localize(
     """
     import json
 
-    from offline.localize_command import LocalizeOptions, as_json, exit_code, localize_log, summary
+    from groundsbot.offline.localize_command import LocalizeOptions, as_json, exit_code, localize_log, summary
 
     found = localize_log(LocalizeOptions(log, folder, output, robot or (), noise, component, overwrite))
     if json_output:

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.factors import State
-from offline.graph import Graph
-from offline.result import GraphEdges
-from offline.robust import losses_and_weights
-from offline.solver import Solution
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.result import GraphEdges
+from groundsbot.offline.robust import losses_and_weights
+from groundsbot.offline.solver import Solution
 
 
 def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> GraphEdges:

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from offline.chain import Chain
-from offline.errors import OfflineError
-from offline.inputs import ALONE, Inputs
-from offline.solver import MAX_TRIES, Problem, Solution
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.inputs import ALONE, Inputs
+from groundsbot.offline.solver import MAX_TRIES, Problem, Solution
 
 # Linearising a factor takes as long as so many multiplications in a leaf; those above run in larger blocks.
 _A_FACTOR: Final = 2000.0

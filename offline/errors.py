@@ -1,6 +1,6 @@
 """Errors of mapping and its commands."""
 
-from calib.errors import GroundsbotError
+from groundsbot.calib.errors import GroundsbotError
 
 
 class OfflineError(GroundsbotError):

@@ -9,13 +9,13 @@ from itertools import combinations
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.map_errors import ComponentErrors, MapErrors, StartError, TagError
-from offline.nees import nees_per_dim, tangent_errors
-from offline.result import Component, MapResult, RunResult, TagResult
-from offline.truth import TrueRun, Truth
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.map_errors import ComponentErrors, MapErrors, StartError, TagError
+from groundsbot.offline.nees import nees_per_dim, tangent_errors
+from groundsbot.offline.result import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.truth import TrueRun, Truth
 
 
 def evaluate(result: MapResult, truth: Truth) -> MapErrors:

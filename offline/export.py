@@ -8,17 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from calib.files import folder_written_whole, written_whole
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.export_g2o import g2o_text
-from offline.export_geojson import geojson_of
-from offline.export_layout import fmap_of, frc_layout_of
-from offline.export_options import ExportFormat, ExportOptions
-from offline.map_io import read_map
-from offline.result import Component, MapResult, RunResult
-from offline.tags_table import tags_csv
-from offline.trajectory_file import write_tum
+from groundsbot.calib.files import folder_written_whole, written_whole
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export_g2o import g2o_text
+from groundsbot.offline.export_geojson import geojson_of
+from groundsbot.offline.export_layout import fmap_of, frc_layout_of
+from groundsbot.offline.export_options import ExportFormat, ExportOptions
+from groundsbot.offline.map_io import read_map
+from groundsbot.offline.result import Component, MapResult, RunResult
+from groundsbot.offline.tags_table import tags_csv
+from groundsbot.offline.trajectory_file import write_tum
 
 RUN_COLUMNS: Final = ("t_ns", "x_m", "y_m", "theta_rad")
 

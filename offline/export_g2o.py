@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.result import Component, GraphEdges
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.result import Component, GraphEdges
 
 
 def g2o_text(component: Component) -> str:

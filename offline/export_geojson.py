@@ -5,10 +5,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.export_options import ExportOptions, numbers
-from offline.result import Component
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export_options import ExportOptions, numbers
+from groundsbot.offline.result import Component
 
 # WGS 84: NIMA TR8350.2, third edition, table 3.1.
 _A_M: Final = 6378137.0

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from offline.errors import OfflineError
-from offline.export_options import ExportOptions, numbers
-from offline.result import Component
-from offline.tag_heights import PlacedTag, tags_in_space
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export_options import ExportOptions, numbers
+from groundsbot.offline.result import Component
+from groundsbot.offline.tag_heights import PlacedTag, tags_in_space
 
 # docs.limelightvision.io, "AprilTag Map Specification", names these two.
 _LIMELIGHT_FAMILIES: Final = {"tag36h11": "apriltag3_36h11_classic", "tag16h5": "apriltag3_16h5_classic"}

@@ -5,7 +5,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from offline.errors import OfflineError
+from groundsbot.offline.errors import OfflineError
 
 
 class ExportFormat(StrEnum):

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
 
 # The calibration numbers that a tag reading depends on, besides the scale of the tag's batch.
 MOUNT_PARAMETERS: Final = ("mount_x_m", "mount_y_m", "mount_yaw_rad")

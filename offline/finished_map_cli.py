@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from offline.cli_options import JsonFlag
-from offline.export_options import ExportFormat, ExportOptions
+from groundsbot.offline.cli_options import JsonFlag
+from groundsbot.offline.export_options import ExportFormat, ExportOptions
 
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")]
 
@@ -26,12 +26,12 @@ def compare(
     """
     import json
 
-    from offline.evaluation import evaluate
-    from offline.map_errors import MapErrors
-    from offline.map_io import read_map
-    from offline.survey import judge_survey, read_survey
-    from offline.survey_errors import SurveyErrors
-    from offline.truth import read_truth
+    from groundsbot.offline.evaluation import evaluate
+    from groundsbot.offline.map_errors import MapErrors
+    from groundsbot.offline.map_io import read_map
+    from groundsbot.offline.survey import judge_survey, read_survey
+    from groundsbot.offline.survey_errors import SurveyErrors
+    from groundsbot.offline.truth import read_truth
 
     errors: MapErrors | SurveyErrors
     if truth is not None and survey is None:
@@ -86,7 +86,7 @@ def export(
 
     Nothing is written over, and nothing made up: what a form needs and a map does not hold is an option.
     """
-    from offline.export import export_map
+    from groundsbot.offline.export import export_map
 
     options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
     for line in export_map(folder, options):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 
 @dataclass(frozen=True)

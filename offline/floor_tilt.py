@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from calib.arrays import FloatArray, IntArray
-from offline.tag_pose import TagReadings
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.tag_pose import TagReadings
 
 _MEDIAN_CHI2: Final = float(chdtri(1, 0.5))
 # Looks between which the range changes by more see a turned mount differently.

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead_kernels import eliminate_columns
-from offline.jit import borrowed, inner, jitted
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead_kernels import eliminate_columns
+from groundsbot.offline.jit import borrowed, inner, jitted
 
 Unsigned = NDArray[np.uint64]
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.front_kernels import (
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.front_kernels import (
     Factors,
     Kind,
     Nodes,

@@ -4,25 +4,25 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.robot import Mount
-from offline.corner_map import Refined
-from offline.corner_solver import CornerSolution
-from offline.edges import edges_of
-from offline.factors import State
-from offline.graph import Graph, Parameter, build_graph
-from offline.kept import KeptCalibration, nominal_row
-from offline.local_map import LocalMap
-from offline.map_model import MapModel
-from offline.measured import Measurements
-from offline.measured_map import with_measurements
-from offline.merge import Group
-from offline.parameter_results import CalibrationResult
-from offline.result import Component, RunResult, StartToStart, TagPose, TagResult
-from offline.run_tags import TagKey
-from offline.solver import Solution, solve
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.corner_map import Refined
+from groundsbot.offline.corner_solver import CornerSolution
+from groundsbot.offline.edges import edges_of
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph, Parameter, build_graph
+from groundsbot.offline.kept import KeptCalibration, nominal_row
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.measured import Measurements
+from groundsbot.offline.measured_map import with_measurements
+from groundsbot.offline.merge import Group
+from groundsbot.offline.parameter_results import CalibrationResult
+from groundsbot.offline.result import Component, RunResult, StartToStart, TagPose, TagResult
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution, solve
+from groundsbot.offline.stages import Stages
 
 
 def solve_global_map(

@@ -15,14 +15,14 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.effort import Effort
-from offline.factors import Columns, OdometryFactors, State, stacked
-from offline.measured_factors import NOTHING_MEASURED
-from offline.odometry import chained
-from offline.robust import losses_and_weights
-from offline.shared_errors import fit_shared_errors
-from offline.solver import DEFAULT_LOSSES, MAX_TRIES, Losses, Problem, Solution, solve
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.factors import Columns, OdometryFactors, State, stacked
+from groundsbot.offline.measured_factors import NOTHING_MEASURED
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.robust import losses_and_weights
+from groundsbot.offline.shared_errors import fit_shared_errors
+from groundsbot.offline.solver import DEFAULT_LOSSES, MAX_TRIES, Losses, Problem, Solution, solve
 
 # Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from offline.factors import State
-from offline.robust import SQUARES, Loss, forgets, graduated
-from offline.solver import Losses, Problem, Solution, solve
+from groundsbot.offline.factors import State
+from groundsbot.offline.robust import SQUARES, Loss, forgets, graduated
+from groundsbot.offline.solver import Losses, Problem, Solution, solve
 
 # The control falls by this each time, as in the paper.
 _FALL: Final = 1.4

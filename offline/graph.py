@@ -6,10 +6,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.robot import Mount, Robot
-from offline.chain import Chain
-from offline.factors import (
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.robot import Mount, Robot
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.factors import (
     MOUNT_PARAMETERS,
     CalibrationPrior,
     Columns,
@@ -18,10 +18,10 @@ from offline.factors import (
     State,
     whitening,
 )
-from offline.odometry import WHEEL_PARAMETERS
-from offline.readings import CAMERA_PARAMETERS
-from offline.run_tags import TagKey
-from offline.solver import Problem
+from groundsbot.offline.odometry import WHEEL_PARAMETERS
+from groundsbot.offline.readings import CAMERA_PARAMETERS
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Problem
 
 TAG_SCALE: Final = "tag_scale"
 IMPORTED_BATCH: Final = "imported "  # and the family: of positions that somebody else worked out

@@ -7,14 +7,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.chain import Chain
-from offline.effort import Effort
-from offline.graph import Parameter, build_graph
-from offline.odometry import chained
-from offline.run_tags import TagKey
-from offline.solver import solve
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.graph import Parameter, build_graph
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import solve
 
 # Of all drives whose wheels are right, so many are taken for broken.
 FALSE_ALARM: Final = 1e-3

@@ -14,18 +14,18 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.factors import State
-from offline.graph import Graph, build_graph, unheld
-from offline.joint_fit import UNMODELLED_SIGMA_M
-from offline.known_map import KnownMap
-from offline.local_map import LocalMap
-from offline.run_tags import TagKey
-from offline.solver import Solution, solve
-from offline.suspects import renamed
-from offline.suspects_search import FALSE_ALARM
-from offline.tag_fit import squared_sigmas
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph, build_graph, unheld
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution, solve
+from groundsbot.offline.suspects import renamed
+from groundsbot.offline.suspects_search import FALSE_ALARM
+from groundsbot.offline.tag_fit import squared_sigmas
 
 _MOST_CHANGES: Final = 20
 _MOVED: Final = "moved, "

@@ -47,9 +47,9 @@ def import_recording(
     CSV: observations in observations.csv are in the robot's base frame, unless a --camera option is given: then they
     are in the camera's. Those in landmarks.csv always are. Bags, of ROS 1 or ROS 2: topics are found by type.
     """
-    from offline.bag_reader import is_bag
-    from offline.bag_topics import BagOptions
-    from offline.import_robot import ImportOptions
+    from groundsbot.offline.bag_reader import is_bag
+    from groundsbot.offline.bag_topics import BagOptions
+    from groundsbot.offline.import_robot import ImportOptions
 
     options = ImportOptions(
         run_id=run_id,
@@ -77,13 +77,13 @@ def import_recording(
         receive_times=receive_times,
     )
     if is_bag(recording):
-        from offline.bag_import import import_bag
-        from offline.progress import progress_bar
+        from groundsbot.offline.bag_import import import_bag
+        from groundsbot.offline.progress import progress_bar
 
         with progress_bar() as show:
             report = import_bag(recording, output, options, of_bags, show)
     else:
-        from offline.importers import import_folder
+        from groundsbot.offline.importers import import_folder
 
         of_bags.refuse_any(recording)
         report = import_folder(recording, output, options)

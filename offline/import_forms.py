@@ -10,9 +10,9 @@ from math import hypot, pi
 from pathlib import Path
 from typing import Final, Literal
 
-from offline.csv_table import CsvTable, read_table
-from offline.errors import OfflineError
-from offline.observations import MAX_RANGE_M
+from groundsbot.offline.csv_table import CsvTable, read_table
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.observations import MAX_RANGE_M
 
 MAX_WHEEL_SPEED_M_S: Final = 20.0  # beyond it the unit is wrong, a counter was reset, or a time is
 _NS_PER_S: Final = 1_000_000_000

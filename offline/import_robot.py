@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import yaml
 
-from calib.robot import Mount, Robot, parse_robot_yaml, read_robot_yaml
-from offline.errors import OfflineError
-from offline.import_forms import WheelScale
+from groundsbot.calib.robot import Mount, Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.import_forms import WheelScale
 
 # Somebody else's CSV seldom says where the camera sat; a robot of this kind holds it within these of its axle's middle.
 UNKNOWN_MOUNT_SIGMA_X_M: Final = 0.2

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
-from calib.files import folder_written_whole
-from calib.words import counted
-from offline.errors import OfflineError
-from onboard.log_writer import LogWriter
+from groundsbot.calib.files import folder_written_whole
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.onboard.log_writer import LogWriter
 
 Entry = tuple[int, str, Message]  # stamp in ns, topic, message
 

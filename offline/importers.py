@@ -8,10 +8,10 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from calib.tag_family import families, family_size
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.import_forms import (
+from groundsbot.calib.tag_family import families, family_size
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.import_forms import (
     Observation,
     WheelPath,
     read_observations,
@@ -20,9 +20,9 @@ from offline.import_forms import (
     read_paper_odometry,
     refuse_tick_options,
 )
-from offline.import_robot import ImportOptions, describe_robot, safe_name, wheel_scale
-from offline.imported_run import Entry, ImportReport, check_output, write_run
-from onboard.messages import PlanarOdometry, RunInfo, TagObservation, TagObservations
+from groundsbot.offline.import_robot import ImportOptions, describe_robot, safe_name, wheel_scale
+from groundsbot.offline.imported_run import Entry, ImportReport, check_output, write_run
+from groundsbot.onboard.messages import PlanarOdometry, RunInfo, TagObservation, TagObservations
 
 _HEADER_PAIR: Final = ("odometry.csv", "observations.csv")
 _PAPER_PAIR: Final = ("odom.csv", "landmarks.csv")

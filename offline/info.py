@@ -10,14 +10,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from calib.robot import Wheels, parse_robot_yaml
-from calib.words import counted
-from offline.errors import OfflineError
-from onboard.allowance import Allowance
-from onboard.log_losses import LogLosses
-from onboard.log_reader import read_log
-from onboard.message_decoder import LogMessage
-from onboard.messages import (
+from groundsbot.calib.robot import Wheels, parse_robot_yaml
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.onboard.allowance import Allowance
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.onboard.messages import (
     TOPICS,
     Event,
     PlanarOdometry,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from offline.errors import OfflineError
+from groundsbot.offline.errors import OfflineError
 
 # Any number of drives may be mapped together, as long as they were driven: recorded ones take 200 kB a minute and more,
 # and who has a hundred has some that broke off. Pairs of stretches are laid over each other.

@@ -121,7 +121,7 @@ def _kernel_hash() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         source = path.read_bytes()
-        if b"offline.jit" in source:
+        if b"groundsbot.offline.jit" in source:
             digest.update(source)
     return digest.hexdigest()[:16]
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from offline.goodness import FALSE_ALARM, Goodness, fitted_windows, freedom_of
-from offline.local_map import LocalMap
-from offline.solver import Solution
+from groundsbot.offline.goodness import FALSE_ALARM, Goodness, fitted_windows, freedom_of
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.solver import Solution
 
 
 def joined_goodness(maps: Sequence[LocalMap], solution: Solution) -> Goodness:

@@ -25,11 +25,11 @@ import numpy as np
 from scipy import linalg
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.alignment_effort import UNLIMITED, AlignmentEffort
-from offline.condensed import AnchorTree, quarter_turned
-from offline.tag_fit import FALSE_ALARM, ill_fitting, worth_nats
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.alignment_effort import UNLIMITED, AlignmentEffort
+from groundsbot.offline.condensed import AnchorTree, quarter_turned
+from groundsbot.offline.tag_fit import FALSE_ALARM, ill_fitting, worth_nats
 
 # What is told to no better than this is told to be somewhere: the next wall, the next door.
 REACH_M: Final = 10.0

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.readings import CAMERA_PARAMETERS
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.readings import CAMERA_PARAMETERS
 
 # What a calibration number corrects is four numbers at most; the rest of a row is NaN.
 _NOMINAL: Final = 4

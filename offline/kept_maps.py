@@ -12,25 +12,25 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
-from calib.robot import Robot
-from offline.chain import Chain
-from offline.covariance_parts import CovarianceParts
-from offline.errors import OfflineError
-from offline.factors import State
-from offline.goodness import Goodness
-from offline.graph import build_graph
-from offline.kept import KeptChain
-from offline.local_map import LocalMap
-from offline.measured import TapeOptions
-from offline.observations import SAME_SIZE_M
-from offline.odometry import ChainOdometry
-from offline.readings import Readings
-from offline.result import MapResult
-from offline.run import Run
-from offline.run_tags import Detections, Positions, TagKey
-from offline.solver import solve
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.covariance_parts import CovarianceParts
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.factors import State
+from groundsbot.offline.goodness import Goodness
+from groundsbot.offline.graph import build_graph
+from groundsbot.offline.kept import KeptChain
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measured import TapeOptions
+from groundsbot.offline.observations import SAME_SIZE_M
+from groundsbot.offline.odometry import ChainOdometry
+from groundsbot.offline.readings import Readings
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
+from groundsbot.offline.solver import solve
 
 
 def kept_of(local_map: LocalMap) -> KeptChain:

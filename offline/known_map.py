@@ -12,16 +12,16 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.condensed import CondensedMap
-from offline.errors import OfflineError
-from offline.factors import CalibrationPrior, whitening
-from offline.graph import Graph, Parameter
-from offline.joint_fit import REACH_M
-from offline.kept import KeptCalibration, nominal_row
-from offline.measured_factors import NOTHING_MEASURED, KnownPlaces
-from offline.result import Component
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.condensed import CondensedMap
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.factors import CalibrationPrior, whitening
+from groundsbot.offline.graph import Graph, Parameter
+from groundsbot.offline.joint_fit import REACH_M
+from groundsbot.offline.kept import KeptCalibration, nominal_row
+from groundsbot.offline.measured_factors import NOTHING_MEASURED, KnownPlaces
+from groundsbot.offline.result import Component
+from groundsbot.offline.run_tags import TagKey
 
 # Far below what a tag's place is ever known to, and far above rounding.
 _LEAST_SIGMA_M: Final = 1e-6

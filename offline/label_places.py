@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 _MARKER_PX: Final = 5.0  # half a marker, and a little air
 _DIRECTIONS: Final = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [0, 1], [0, -1], [1, 0], [-1, 0]], dtype=np.float64)

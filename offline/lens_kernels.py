@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.distortion import Distortion
-from offline.jit import inner
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.distortion import Distortion
+from groundsbot.offline.jit import inner
 
 _N_NUMERATOR: Final = 5
 _N_DENOMINATOR: Final = 4

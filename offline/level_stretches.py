@@ -17,12 +17,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import FloatArray, IntArray
-from offline.chain import Chain
-from offline.corner_problem import LOOKS
-from offline.corner_solver import CornerSolution
-from offline.graph import Graph
-from offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.corner_problem import LOOKS
+from groundsbot.offline.corner_solver import CornerSolution
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
 
 # Of way, or of turning; a ramp is longer, and a bump is none.
 _STRETCH_M: Final = 2.0

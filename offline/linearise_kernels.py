@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.arrowhead_blocks import System
-from offline.jit import inlined, inner, jitted
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.arrowhead_blocks import System
+from groundsbot.offline.jit import inlined, inner, jitted
 
 
 class Values(NamedTuple):

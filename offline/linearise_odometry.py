@@ -7,11 +7,11 @@ Small matrices travel as tuples, row by row; of symmetric ones the upper triangl
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.arrowhead_blocks import System
-from offline.jit import borrowed, inner, jitted
-from offline.linearise_kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
-from offline.robust import Loss, loss_and_weight
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead_blocks import System
+from groundsbot.offline.jit import borrowed, inner, jitted
+from groundsbot.offline.linearise_kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
+from groundsbot.offline.robust import Loss, loss_and_weight
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]

@@ -4,12 +4,12 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.arrowhead_blocks import System
-from offline.jit import borrowed, inlined, inner, jitted
-from offline.linearise_kernels import Free, Readings, Values
-from offline.readings import CAMERA_PARAMETERS
-from offline.robust import Loss, loss_and_weight
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead_blocks import System
+from groundsbot.offline.jit import borrowed, inlined, inner, jitted
+from groundsbot.offline.linearise_kernels import Free, Readings, Values
+from groundsbot.offline.readings import CAMERA_PARAMETERS
+from groundsbot.offline.robust import Loss, loss_and_weight
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
 _N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera

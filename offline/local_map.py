@@ -14,17 +14,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.chain import Chain
-from offline.coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
-from offline.corner_noise import least_shared
-from offline.effort import Effort
-from offline.goodness import Goodness, Windows, fitted_windows
-from offline.graph import Graph, Parameter, build_graph
-from offline.odometry import chained
-from offline.run_tags import TagKey
-from offline.solver import Solution, solve
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
+from groundsbot.offline.corner_noise import least_shared
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.goodness import Goodness, Windows, fitted_windows
+from groundsbot.offline.graph import Graph, Parameter, build_graph
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution, solve
 
 # A chain is built up in pieces over which dead reckoning stays in the right valley: what a wheel ratio 1 % off turns in
 # this distance (0.2 rad on a half-metre track) is far from losing a tag. Later, when the wheels are known, they grow

@@ -6,8 +6,8 @@ Typed, in the frame of the map's component, in SI units.
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.arrays import FloatArray, IntArray
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

@@ -11,23 +11,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
-from calib.files import folder_written_whole, written_whole
-from calib.noise import read_noise_yaml
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.jit import compilation_announced
-from offline.localization import Candidate, Localization, LocatedRun, NotLocated
-from offline.localizing import localize
-from offline.map_command import check_output, read_robot_files, say
-from offline.map_io import read_map
-from offline.pipeline import check_robots
-from offline.progress import progress_bar
-from offline.run import load_run
-from offline.run_tags import TagKey
-from offline.stages import Stages
-from offline.trajectory_file import write_tum
-from onboard.log_reader import find_logs
+from groundsbot.calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from groundsbot.calib.files import folder_written_whole, written_whole
+from groundsbot.calib.noise import read_noise_yaml
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.jit import compilation_announced
+from groundsbot.offline.localization import Candidate, Localization, LocatedRun, NotLocated
+from groundsbot.offline.localizing import localize
+from groundsbot.offline.map_command import check_output, read_robot_files, say
+from groundsbot.offline.map_io import read_map
+from groundsbot.offline.pipeline import check_robots
+from groundsbot.offline.progress import progress_bar
+from groundsbot.offline.run import load_run
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.trajectory_file import write_tum
+from groundsbot.onboard.log_reader import find_logs
 
 FORMAT_VERSION: Final = 1
 JSON_FILE: Final = "localization.json"

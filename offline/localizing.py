@@ -10,25 +10,25 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from calib.words import counted
-from offline.alignment_rivals import MARGIN_NATS
-from offline.chain import chains_of
-from offline.errors import OfflineError
-from offline.held_run import HeldRun, solve_held
-from offline.kept_maps import check_sizes_in_map
-from offline.known_map import KnownMap, known_map
-from offline.local_map import LocalMap
-from offline.localization import Candidate, Localization, LocatedRun, MovedTag, NotLocated
-from offline.located import Located, locate
-from offline.merge_report import why_not_joined
-from offline.pipeline import local_maps_of
-from offline.result import MapResult
-from offline.run import Run
-from offline.run_noise import weighed_as
-from offline.stages import Stages
-from offline.twins import told_apart
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.words import counted
+from groundsbot.offline.alignment_rivals import MARGIN_NATS
+from groundsbot.offline.chain import chains_of
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.held_run import HeldRun, solve_held
+from groundsbot.offline.kept_maps import check_sizes_in_map
+from groundsbot.offline.known_map import KnownMap, known_map
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.localization import Candidate, Localization, LocatedRun, MovedTag, NotLocated
+from groundsbot.offline.located import Located, locate
+from groundsbot.offline.merge_report import why_not_joined
+from groundsbot.offline.pipeline import local_maps_of
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_noise import weighed_as
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.twins import told_apart
 
 _MAP = "the map"
 

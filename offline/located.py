@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from offline.alignment import Alignment, align
-from offline.condensed import CondensedMap, condense
-from offline.known_map import KnownMap
-from offline.local_map import LocalMap
-from offline.merge import variance_factor
-from offline.run_tags import TagKey
+from groundsbot.offline.alignment import Alignment, align
+from groundsbot.offline.condensed import CondensedMap, condense
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.merge import variance_factor
+from groundsbot.offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

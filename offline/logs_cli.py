@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from calib.command_line import EXIT_WITH_LOSSES
-from calib.errors import GroundsbotError
-from offline.cli_options import JsonFlag, LogArguments
+from groundsbot.calib.command_line import EXIT_WITH_LOSSES
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.offline.cli_options import JsonFlag, LogArguments
 
 
 def info(
@@ -21,9 +21,9 @@ def info(
     """
     import json
 
-    from offline.info import describe_log
-    from onboard.allowance import Allowance
-    from onboard.log_reader import find_logs
+    from groundsbot.offline.info import describe_log
+    from groundsbot.onboard.allowance import Allowance
+    from groundsbot.onboard.log_reader import find_logs
 
     described, refused, allowance = [], [], Allowance()
     for log in find_logs(logs):
@@ -52,7 +52,7 @@ def salvage(
 
     The old log is not touched. Exit 3: something of it is lost; it is said what.
     """
-    from offline.salvage import salvage as make_salvage
+    from groundsbot.offline.salvage import salvage as make_salvage
 
     salvaged = make_salvage(log, output)
     for line in (line for each in salvaged for line in each.lines()):
@@ -82,8 +82,8 @@ def detect(
 
     The old log is not touched. Exit 3: pictures are of no use, or the log is damaged; it is said what.
     """
-    from offline.detect import DetectOptions, detect_again
-    from offline.progress import progress_bar
+    from groundsbot.offline.detect import DetectOptions, detect_again
+    from groundsbot.offline.progress import progress_bar
 
     options = DetectOptions(tuple(family) if family else None, detector, decimate, drop_others, processes)
     with progress_bar() as show:

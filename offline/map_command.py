@@ -9,31 +9,31 @@ from math import degrees
 from pathlib import Path
 from typing import Final
 
-from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
-from calib.files import folder_written_whole
-from calib.noise import read_noise_yaml
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.fit_results import AlignmentResult, MeasurementResult
-from offline.jit import compilation_announced
-from offline.map_io import JSON_FILE, read_map, write_map
-from offline.map_json import advice_as_json, map_as_json
-from offline.map_mcap import MAP_FILE, write_mcap
-from offline.measured import TapeOptions
-from offline.parameter_results import FittedNoise, MetreResult
-from offline.picture import write_picture
-from offline.pipeline import build_map, read_runs
-from offline.progress import progress_bar
-from offline.report_words import advice_sentence
-from offline.result import Component, MapResult
-from offline.run import RobotFile, read_robot_file
-from offline.run_noise import NOT_NEEDED
-from offline.self_calibration_option import OFF, parse_calibrate
-from offline.self_calibration_words import freed_lines
-from offline.stages import StageCost, Stages
-from offline.upright import check_upright
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from groundsbot.calib.files import folder_written_whole
+from groundsbot.calib.noise import read_noise_yaml
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.fit_results import AlignmentResult, MeasurementResult
+from groundsbot.offline.jit import compilation_announced
+from groundsbot.offline.map_io import JSON_FILE, read_map, write_map
+from groundsbot.offline.map_json import advice_as_json, map_as_json
+from groundsbot.offline.map_mcap import MAP_FILE, write_mcap
+from groundsbot.offline.measured import TapeOptions
+from groundsbot.offline.parameter_results import FittedNoise, MetreResult
+from groundsbot.offline.picture import write_picture
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.progress import progress_bar
+from groundsbot.offline.report_words import advice_sentence
+from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.run import RobotFile, read_robot_file
+from groundsbot.offline.run_noise import NOT_NEEDED
+from groundsbot.offline.self_calibration_option import OFF, parse_calibrate
+from groundsbot.offline.self_calibration_words import freed_lines
+from groundsbot.offline.stages import StageCost, Stages
+from groundsbot.offline.upright import check_upright
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 
 REPORT_FILE: Final = "report.html"
 
@@ -99,7 +99,7 @@ def _write_files(result: MapResult, workings: Workings, folder: Path, output: Pa
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
         if find_spec("plotly") is not None:  # a map is worth having where only the report's script is missing
-            from offline.report import write_report
+            from groundsbot.offline.report import write_report
 
             with stages.stage("writing the report"):
                 write_report(result, workings, folder / REPORT_FILE)

@@ -13,14 +13,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.errors import CalibError
-from calib.files import written_whole
-from offline.array_file import open_arrays
-from offline.errors import OfflineError
-from offline.fit_results import SuspectTag
-from offline.kept import KeptChain, arrays_of, calibration_from, chain_from
-from offline.map_json import (
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import written_whole
+from groundsbot.offline.array_file import open_arrays
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.fit_results import SuspectTag
+from groundsbot.offline.kept import KeptChain, arrays_of, calibration_from, chain_from
+from groundsbot.offline.map_json import (
     FORMAT_VERSION,
     advice_from,
     alignment_from,
@@ -34,11 +34,11 @@ from offline.map_json import (
     number_from,
     tag_from,
 )
-from offline.map_model import MapModel
-from offline.parameter_results import CalibrationChoice, CalibrationResult, MetreResult
-from offline.result import Component, GraphEdges, MapResult, RunResult, StartToStart
-from offline.tags_table import tags_csv
-from offline.trajectory_file import read_tum, write_tum
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.parameter_results import CalibrationChoice, CalibrationResult, MetreResult
+from groundsbot.offline.result import Component, GraphEdges, MapResult, RunResult, StartToStart
+from groundsbot.offline.tags_table import tags_csv
+from groundsbot.offline.trajectory_file import read_tum, write_tum
 
 JSON_FILE: Final = "map.json"
 ARRAYS_FILE: Final = "map.npz"

@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
-from offline.parameter_results import CheckResult, FittedNoise, FittedParameter
-from offline.result import AdviceResult, Component, FloorSigmas, MapResult, RunResult, TagPose, TagResult
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from groundsbot.offline.parameter_results import CheckResult, FittedNoise, FittedParameter
+from groundsbot.offline.result import AdviceResult, Component, FloorSigmas, MapResult, RunResult, TagPose, TagResult
 
 FORMAT_VERSION: Final = 1
 

@@ -30,10 +30,10 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from calib.files import written_whole
-from offline.result import Component, MapResult, RunResult, TagResult
-from onboard.log_head import BASE_FRAME, CAMERA_FRAME
-from onboard.messages import FrameTransform, timestamp
+from groundsbot.calib.files import written_whole
+from groundsbot.offline.result import Component, MapResult, RunResult, TagResult
+from groundsbot.onboard.log_head import BASE_FRAME, CAMERA_FRAME
+from groundsbot.onboard.messages import FrameTransform, timestamp
 
 MAP_FILE: Final = "map.mcap"
 TRANSFORMS_TOPIC: Final = "/map/tf"

@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 
-from offline.chain import Chain
-from offline.checks import COMPARED, check_warnings
-from offline.components import Found
-from offline.graph import TAG_SCALE
-from offline.local_map import LocalMap
-from offline.measured_map import measurement_warnings
-from offline.merge import Merge
-from offline.merge_report import merge_warnings
-from offline.parameter_results import MAX_SIGMAS, CalibrationResult, CheckResult
-from offline.run import Run
-from offline.tag_joins import TagJoin
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.checks import COMPARED, check_warnings
+from groundsbot.offline.components import Found
+from groundsbot.offline.graph import TAG_SCALE
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measured_map import measurement_warnings
+from groundsbot.offline.merge import Merge
+from groundsbot.offline.merge_report import merge_warnings
+from groundsbot.offline.parameter_results import MAX_SIGMAS, CalibrationResult, CheckResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.tag_joins import TagJoin
 
 
 def map_warnings(

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.run_tags import TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.run_tags import TagKey
 
 # No tape is longer, none is finer, and a measurement that says less says nothing; squares of these are still numbers.
 _FARTHEST_M: Final = 1e5

@@ -5,9 +5,9 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.factors import Columns, Linearised, State
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import Columns, Linearised, State
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import FloatArray
-from offline.corner_solver import CornerSolution
-from offline.factors import Linearised, State, whitening
-from offline.fit_results import MeasurementResult
-from offline.graph import Graph
-from offline.measured import MeasuredDistance, MeasuredStart, Measurements
-from offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
-from offline.run_tags import TagKey
-from offline.solver import Solution
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.corner_solver import CornerSolution
+from groundsbot.offline.factors import Linearised, State, whitening
+from groundsbot.offline.fit_results import MeasurementResult
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.measured import MeasuredDistance, MeasuredStart, Measurements
+from groundsbot.offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution
 
 # A measurement that belongs is said to contradict the map so rarely.
 _FALSE_ALARM: Final = 1e-4

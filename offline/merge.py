@@ -11,15 +11,15 @@ from math import log, pi
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.alignment import Alignment, align
-from offline.alignment_effort import AlignmentEffort, AlignmentTooLongError
-from offline.condensed import CondensedMap, condense
-from offline.cycles import Contradiction, Link, consistent_links, spanning_tree
-from offline.local_map import LocalMap
-from offline.measured import Placement
-from offline.run_tags import TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.alignment import Alignment, align
+from groundsbot.offline.alignment_effort import AlignmentEffort, AlignmentTooLongError
+from groundsbot.offline.condensed import CondensedMap, condense
+from groundsbot.offline.cycles import Contradiction, Link, consistent_links, spanning_tree
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measured import Placement
+from groundsbot.offline.run_tags import TagKey
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 from collections.abc import Collection, Sequence
 from math import degrees
 
-from calib.arrays import FloatArray
-from offline.alignment import Alignment
-from offline.corner_graph import has_corners
-from offline.fit_results import AlignmentResult, RivalResult
-from offline.local_map import LocalMap
-from offline.merge import Group, Merge, PairAlignment
-from offline.run_tags import TagKey
-from offline.tag_joins import TagJoin
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.alignment import Alignment
+from groundsbot.offline.corner_graph import has_corners
+from groundsbot.offline.fit_results import AlignmentResult, RivalResult
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.merge import Group, Merge, PairAlignment
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.tag_joins import TagJoin
 
 _MOST_NAMED = 8
 _TOO_LONG = (

@@ -16,8 +16,8 @@ import numpy as np
 from scipy import linalg
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from calib import se2
-from calib.arrays import FloatArray
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
 
 
 def nees_per_dim(error: FloatArray, covariance: FloatArray) -> float | None:

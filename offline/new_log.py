@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from calib.files import folder_written_whole, sync
-from offline.errors import OfflineError
+from groundsbot.calib.files import folder_written_whole, sync
+from groundsbot.offline.errors import OfflineError
 
 
 @contextmanager

@@ -7,15 +7,15 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.chain import Chain
-from offline.covariance_parts import CovarianceParts
-from offline.graph import build_graph
-from offline.local_map import LocalMap
-from offline.solver import Solution
-from offline.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
-from offline.variance_look import Components, Part
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.covariance_parts import CovarianceParts
+from groundsbot.offline.graph import build_graph
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
+from groundsbot.offline.variance_look import Components, Part
 
 # What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals.
 _MAX_KEYFRAMES: Final = 6_000

@@ -7,22 +7,22 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.errors import CalibError
-from calib.noise import NoiseParameters
-from calib.robot import Robot
-from offline.askew import FALSE_ALARM, UPRIGHT_DOF, askew, doubted, level_of, with_common_turn
-from offline.corner_noise import refined_bias_px
-from offline.covariance_parts import CovarianceParts
-from offline.errors import OfflineError
-from offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
-from offline.readings import CAMERA_PARAMETERS, Readings, no_readings
-from offline.rolling_shutter import read_at_once
-from offline.run import Run
-from offline.run_tags import Detections, Positions
-from offline.standing_corners import averaged
-from offline.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.askew import FALSE_ALARM, UPRIGHT_DOF, askew, doubted, level_of, with_common_turn
+from groundsbot.offline.corner_noise import refined_bias_px
+from groundsbot.offline.covariance_parts import CovarianceParts
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
+from groundsbot.offline.readings import CAMERA_PARAMETERS, Readings, no_readings
+from groundsbot.offline.rolling_shutter import read_at_once
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, Positions
+from groundsbot.offline.standing_corners import averaged
+from groundsbot.offline.tag_pose import TagReadings, general_readings, upright_readings
 
 # What the covariance of an imported position without one is made of.
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")

@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2, wheels
-from calib.arrays import FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.covariance_parts import CovarianceParts
+from groundsbot.calib import se2, wheels
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.covariance_parts import CovarianceParts
 
 # The calibration numbers that odometry depends on, in the order of `ChainOdometry.jacobian`:
 # left = left_nominal (1 + wheel_scale) (1 - wheel_ratio / 2), right likewise with +, track = nominal (1 + track_scale).

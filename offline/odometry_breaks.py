@@ -17,19 +17,19 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import binom, chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.alignment import Alignment, align
-from offline.chain import Chain
-from offline.condensed import condense
-from offline.effort import Effort
-from offline.errors import OfflineError
-from offline.factors import State
-from offline.graph import Graph
-from offline.grown_parts import COST_TOLERANCE, FALSE_ALARM, Grown, grown_parts, limit_of, noise_factor
-from offline.local_map import LocalMap, solve_local_map
-from offline.odometry import chained
-from offline.solver import Problem, Solution, solve
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.alignment import Alignment, align
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.condensed import condense
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.grown_parts import COST_TOLERANCE, FALSE_ALARM, Grown, grown_parts, limit_of, noise_factor
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.solver import Problem, Solution, solve
 
 _MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
 _MOST_PLACES: Final = 24

@@ -4,12 +4,12 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.jit import jitted
-from offline.linearise_kernels import Values, series, wrapped
-from offline.linearise_odometry import motion_at, wheel_correction
-from offline.linearise_readings import N_READING, reading_factor
-from offline.online_kernels import Border, Motions, Sights, spread_out
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.jit import jitted
+from groundsbot.offline.linearise_kernels import Values, series, wrapped
+from groundsbot.offline.linearise_odometry import motion_at, wheel_correction
+from groundsbot.offline.linearise_readings import N_READING, reading_factor
+from groundsbot.offline.online_kernels import Border, Motions, Sights, spread_out
 
 # Of what is checked of a tag, below which rounding is all there is.
 _LEAST_SHARE: Final = 1e-9

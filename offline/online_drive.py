@@ -7,15 +7,21 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.robot import Robot
-from offline.chain import Chain
-from offline.factors import whitening
-from offline.graph import NO_PARAMETER, Parameter, mount_parameters_of, parameters_of_camera, parameters_of_wheels
-from offline.kept_maps import measured_chain, run_without_log
-from offline.online_kernels import Motions, Sights
-from offline.readings import CAMERA_PARAMETERS
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.factors import whitening
+from groundsbot.offline.graph import (
+    NO_PARAMETER,
+    Parameter,
+    mount_parameters_of,
+    parameters_of_camera,
+    parameters_of_wheels,
+)
+from groundsbot.offline.kept_maps import measured_chain, run_without_log
+from groundsbot.offline.online_kernels import Motions, Sights
+from groundsbot.offline.readings import CAMERA_PARAMETERS
+from groundsbot.offline.run_tags import TagKey
 
 _NAME: Final = "the drive"
 _ROOM: Final = 1024

@@ -6,9 +6,9 @@ from typing import Final
 
 from scipy.stats import chi2
 
-from offline.online_root import SLICE, Lifted, OnlineRoot
-from offline.run_tags import TagKey
-from offline.suspects_search import FALSE_ALARM
+from groundsbot.offline.online_root import SLICE, Lifted, OnlineRoot
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.suspects_search import FALSE_ALARM
 
 CALLED: Final = 150_000  # what calling many small functions costs, in multiplications
 # A tag that was judged otherwise is not judged again before so many more readings have come.

@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.jit import inner, jitted
-from offline.linearise_kernels import Values, wrapped
-from offline.linearise_odometry import error_by_wheels, error_of, motion_at, wheel_correction
-from offline.linearise_readings import N_READING, reading_factor
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.jit import inner, jitted
+from groundsbot.offline.linearise_kernels import Values, wrapped
+from groundsbot.offline.linearise_odometry import error_by_wheels, error_of, motion_at, wheel_correction
+from groundsbot.offline.linearise_readings import N_READING, reading_factor
 
 BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
 

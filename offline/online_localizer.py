@@ -12,11 +12,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.robot import Robot
-from offline.alignment_rivals import GROUP_MARGIN
-from offline.errors import OfflineError
-from offline.graph import (
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.alignment_rivals import GROUP_MARGIN
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.graph import (
     NO_PARAMETER,
     Parameter,
     mount_parameters_of,
@@ -24,17 +24,17 @@ from offline.graph import (
     parameters_of_camera,
     parameters_of_wheels,
 )
-from offline.known_map import KnownMap, known_map
-from offline.located import Located
-from offline.merge_report import why_not_joined
-from offline.online_drive import TagReading
-from offline.online_prior import Numbers
-from offline.online_settling import judged, solved_anew
-from offline.online_smoother import Smoother
-from offline.online_start import SeenTags, StartSearch
-from offline.readings import CAMERA_PARAMETERS
-from offline.result import MapResult
-from offline.run_tags import TagKey
+from groundsbot.offline.known_map import KnownMap, known_map
+from groundsbot.offline.located import Located
+from groundsbot.offline.merge_report import why_not_joined
+from groundsbot.offline.online_drive import TagReading
+from groundsbot.offline.online_prior import Numbers
+from groundsbot.offline.online_settling import judged, solved_anew
+from groundsbot.offline.online_smoother import Smoother
+from groundsbot.offline.online_start import SeenTags, StartSearch
+from groundsbot.offline.readings import CAMERA_PARAMETERS
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run_tags import TagKey
 
 _WARMING_CALLS: Final = 10  # two rounds
 _DOUBTFUL: Final = "tags that lie elsewhere than the map has them may as well be those that stayed; settle"

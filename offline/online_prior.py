@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.factors import whitening
-from offline.known_map import KnownMap
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import whitening
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.run_tags import TagKey
 
 _ROOM: Final = 64
 

@@ -12,17 +12,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.joint_fit import UNMODELLED_SIGMA_M
-from offline.linearise_kernels import Values
-from offline.online_answers import carried, foretold, move, moved_on, snooped, through, weighed
-from offline.online_drive import Drive
-from offline.online_kernels import BY_POINTS, Border, Motions, Sights, sweep
-from offline.online_prior import OnlinePrior, padded
-from offline.online_turn import Known, pose_among, relaxed, turned, twist_of
-from offline.run_tags import TagKey
-from offline.solver import HUBER_THRESHOLD
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.offline.linearise_kernels import Values
+from groundsbot.offline.online_answers import carried, foretold, move, moved_on, snooped, through, weighed
+from groundsbot.offline.online_drive import Drive
+from groundsbot.offline.online_kernels import BY_POINTS, Border, Motions, Sights, sweep
+from groundsbot.offline.online_prior import OnlinePrior, padded
+from groundsbot.offline.online_turn import Known, pose_among, relaxed, turned, twist_of
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import HUBER_THRESHOLD
 
 _DIAGONAL: Final = np.arange(3), np.arange(3)
 # Of a start that is the frame: far below what anything is known to, and far above rounding.

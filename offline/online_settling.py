@@ -5,16 +5,16 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from offline.goodness import Goodness
-from offline.graph import Parameter, build_graph
-from offline.held_run import solve_held
-from offline.known_map import KnownMap
-from offline.local_map import LocalMap, solve_local_map
-from offline.located import Located, locate
-from offline.online_smoother import Smoother
-from offline.run_tags import TagKey
-from offline.solver import Solution
+from groundsbot.calib import se2
+from groundsbot.offline.goodness import Goodness
+from groundsbot.offline.graph import Parameter, build_graph
+from groundsbot.offline.held_run import solve_held
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.located import Located, locate
+from groundsbot.offline.online_smoother import Smoother
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution
 
 _COMPONENT: Final = 0  # there is one only
 _UNJUDGED: Final = Goodness(0.0, 0, 0.0, 1.0, 1.0)

@@ -12,21 +12,21 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.robot import Robot
-from offline.graph import Parameter
-from offline.joint_fit import UNMODELLED_SIGMA_M
-from offline.known_map import KnownMap
-from offline.online_answers import move, moved_on, substituted
-from offline.online_drive import Drive, TagReading
-from offline.online_judge import CALLED, TagJudge
-from offline.online_kernels import Sights
-from offline.online_prior import Numbers, OnlinePrior
-from offline.online_root import SLICE, OnlineRoot
-from offline.online_turn import pose_among
-from offline.run_tags import TagKey
-from offline.tag_fit import TAG_GATE
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.graph import Parameter
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.online_answers import move, moved_on, substituted
+from groundsbot.offline.online_drive import Drive, TagReading
+from groundsbot.offline.online_judge import CALLED, TagJudge
+from groundsbot.offline.online_kernels import Sights
+from groundsbot.offline.online_prior import Numbers, OnlinePrior
+from groundsbot.offline.online_root import SLICE, OnlineRoot
+from groundsbot.offline.online_turn import pose_among
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.tag_fit import TAG_GATE
 
 _POSES_A_SLICE: Final = 256
 

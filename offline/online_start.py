@@ -11,15 +11,15 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.alignment_rivals import CHANCE_NATS, Rivalry
-from offline.alignment_search import Explanation, distances, is_same_distance, through
-from offline.condensed import quarter_turned
-from offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold
-from offline.known_map import KnownMap
-from offline.run_tags import TagKey
-from offline.tag_fit import ill_fitting
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.alignment_rivals import CHANCE_NATS, Rivalry
+from groundsbot.offline.alignment_search import Explanation, distances, is_same_distance, through
+from groundsbot.offline.condensed import quarter_turned
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M, Bend, Linear, hold
+from groundsbot.offline.known_map import KnownMap
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.tag_fit import ill_fitting
 
 _STEPS: Final = 4
 # Two tags are held against each other by their distance alone, which a tag that was moved aside keeps: nothing

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.jit import inner, jitted
-from offline.linearise_kernels import series, wrapped
-from offline.online_kernels import Border
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.jit import inner, jitted
+from groundsbot.offline.linearise_kernels import series, wrapped
+from groundsbot.offline.online_kernels import Border
 
 # A step whose slope is less than so many sigmas is where the cost is least.
 _FLAT_SIGMAS: Final = 1e-4

@@ -17,11 +17,11 @@ from matplotlib.path import Path as PolygonPath
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
-from calib.arrays import FloatArray
-from calib.files import written_whole
-from calib.words import counted
-from offline.label_places import place_labels
-from offline.result import Component, MapResult, RunResult, TagResult
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.words import counted
+from groundsbot.offline.label_places import place_labels
+from groundsbot.offline.result import Component, MapResult, RunResult, TagResult
 
 Dashes = Literal["-", "--", "-.", ":"]
 # Okabe and Ito, "Color universal design" (2008), without those too pale for lines; then again with other dashes.

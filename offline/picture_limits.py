@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from calib.picture_bytes import MOST_PIXELS, claimed_size, is_jpeg
+from groundsbot.calib.picture_bytes import MOST_PIXELS, claimed_size, is_jpeg
 
 # A camera's JPEG spends at least 6 bits on 64 pixels, and cannot be packed further; a bomb takes minutes.
 _PIXELS_PER_BYTE: Final = 128

@@ -6,35 +6,35 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from calib.noise import NoiseParameters
-from offline.chain import Chain, chains_of
-from offline.components import Found, SolvedComponent, solved_component
-from offline.effort import efforts_of
-from offline.errors import OfflineError
-from offline.inputs import Inputs
-from offline.kept_maps import kept_of, local_map_of, tags_of, tape_of
-from offline.local_map import LocalMap, solve_local_map
-from offline.map_warnings import map_warnings
-from offline.measured import Measurements, TapeOptions, parse_measurements
-from offline.measured_map import unused
-from offline.merge import Merge, merge
-from offline.merge_report import alignment_results
-from offline.observations import check_tag_sizes
-from offline.odometry_breaks import split_where_broken
-from offline.parameter_results import CalibrationChoice
-from offline.result import MapResult
-from offline.run import RobotFile, Run, load_run
-from offline.run_noise import fit_and_weigh, weighed_as
-from offline.runs_refused import check_distinct, check_new
-from offline.self_calibration import TIMES_MAPPED, about_the_files, free_what_is_told
-from offline.self_calibration_option import Calibrate
-from offline.stages import Stages
-from offline.suspects import RunsAlone, with_outliers_apart
-from offline.tag_join_report import join_results, join_warnings
-from offline.tag_joins import TagJoin, joined_over_tags
-from offline.twins import told_apart
-from offline.workings import Workings
-from onboard.allowance import Allowance
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain, chains_of
+from groundsbot.offline.components import Found, SolvedComponent, solved_component
+from groundsbot.offline.effort import efforts_of
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.inputs import Inputs
+from groundsbot.offline.kept_maps import kept_of, local_map_of, tags_of, tape_of
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.map_warnings import map_warnings
+from groundsbot.offline.measured import Measurements, TapeOptions, parse_measurements
+from groundsbot.offline.measured_map import unused
+from groundsbot.offline.merge import Merge, merge
+from groundsbot.offline.merge_report import alignment_results
+from groundsbot.offline.observations import check_tag_sizes
+from groundsbot.offline.odometry_breaks import split_where_broken
+from groundsbot.offline.parameter_results import CalibrationChoice
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import RobotFile, Run, load_run
+from groundsbot.offline.run_noise import fit_and_weigh, weighed_as
+from groundsbot.offline.runs_refused import check_distinct, check_new
+from groundsbot.offline.self_calibration import TIMES_MAPPED, about_the_files, free_what_is_told
+from groundsbot.offline.self_calibration_option import Calibrate
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.suspects import RunsAlone, with_outliers_apart
+from groundsbot.offline.tag_join_report import join_results, join_warnings
+from groundsbot.offline.tag_joins import TagJoin, joined_over_tags
+from groundsbot.offline.twins import told_apart
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.allowance import Allowance
 
 
 def read_runs(

@@ -1,6 +1,6 @@
 """Compiled: the two poses that explain the four corners of a square, and rays through pixels.
 
-As `calib.bundle.planar_poses`, which is by OpenCV and for any board; tests hold both to each other. Collins and
+As `groundsbot.calib.bundle.planar_poses`, which is by OpenCV and for any board; tests hold both to each other. Collins and
 Bartoli, "Infinitesimal plane-based pose estimation" (2014): the homography's first derivatives at the tag's centre fix
 its turn up to the sign of how it leans from the ray. Heckbert, "Fundamentals of texture mapping and image warping"
 (1989): the homography of a square.
@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.jit import inner
-from offline.lens_kernels import CENTRE, distorted_at
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.jit import inner
+from groundsbot.offline.lens_kernels import CENTRE, distorted_at
 
 _LEAST_COSINE: Final = 0.05  # of a ray against the tag's direction
 _NEWTON_STEPS: Final = 20

@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.errors import OfflineError
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.errors import OfflineError
 
 # Beyond these, numbers come from broken files or wrong units, not from a robot.
 _LARGEST: Final = 1e7

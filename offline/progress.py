@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from offline.stages import Progress
+from groundsbot.offline.stages import Progress
 
 
 @contextmanager

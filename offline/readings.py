@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.covariance_parts import CovarianceParts, concatenated
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.covariance_parts import CovarianceParts, concatenated
 
 # How many pixels too far out the sides of tags are seen.
 EDGE_SHIFT: Final = "edge_shift_px"

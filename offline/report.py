@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from calib.files import written_whole
-from calib.words import counted
-from offline.map_json import map_as_json
-from offline.report_data import figures
-from offline.report_page import page
-from offline.report_tables import tables
-from offline.report_words import sentences
-from offline.result import MapResult
-from offline.workings import Workings
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.words import counted
+from groundsbot.offline.map_json import map_as_json
+from groundsbot.offline.report_data import figures
+from groundsbot.offline.report_page import page
+from groundsbot.offline.report_tables import tables
+from groundsbot.offline.report_words import sentences
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.workings import Workings
 
 
 def write_report(result: MapResult, workings: Workings, path: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.picture import RUN_COLOURS
-from offline.report_timeline import events_of, timeline
-from offline.report_words import advice_sentence, has_several_families, tag_label, would_help
-from offline.workings import Solved, Workings
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.picture import RUN_COLOURS
+from groundsbot.offline.report_timeline import events_of, timeline
+from groundsbot.offline.report_words import advice_sentence, has_several_families, tag_label, would_help
+from groundsbot.offline.workings import Solved, Workings
 
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
 _MOST_POINTS: Final = 1500

@@ -5,8 +5,8 @@ from itertools import combinations
 from math import degrees
 from typing import Any, Final
 
-from offline.report_cells import Table, number, table_of
-from offline.report_words import has_several_families, largest_sigma_m, linking_tags, tag_label
+from groundsbot.offline.report_cells import Table, number, table_of
+from groundsbot.offline.report_words import has_several_families, largest_sigma_m, linking_tags, tag_label
 
 # Fewer shared tags tell no transform.
 _LEAST_SHARED: Final = 2

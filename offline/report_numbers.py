@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from offline.report_cells import UNKNOWN, Table, number, numbers, table_of
-from offline.report_words import check_contradicts
+from groundsbot.offline.report_cells import UNKNOWN, Table, number, numbers, table_of
+from groundsbot.offline.report_words import check_contradicts
 
 
 def checks(document: dict[str, Any]) -> Table:

@@ -11,9 +11,9 @@ from string import Template
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from offline.report_cells import Table
+from groundsbot.offline.report_cells import Table
 
-_ASSETS: Final = "offline.report_assets"
+_ASSETS: Final = "groundsbot.offline.report_assets"
 # Longer tables are folded away.
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)

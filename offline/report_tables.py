@@ -3,10 +3,10 @@
 from math import degrees
 from typing import Any
 
-from offline.report_cells import Table, number, table_of
-from offline.report_joins import alignments, holding, start_to_start
-from offline.report_numbers import calibration, checks, choices, measurements, metres, noise
-from offline.report_words import advice_sentence, has_several_families, largest_sigma_m
+from groundsbot.offline.report_cells import Table, number, table_of
+from groundsbot.offline.report_joins import alignments, holding, start_to_start
+from groundsbot.offline.report_numbers import calibration, checks, choices, measurements, metres, noise
+from groundsbot.offline.report_words import advice_sentence, has_several_families, largest_sigma_m
 
 
 def tables(document: dict[str, Any]) -> list[Table]:

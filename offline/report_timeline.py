@@ -5,10 +5,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.chain import Chain
-from offline.odometry import GAP_NS
-from offline.run import RunEvent
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.odometry import GAP_NS
+from groundsbot.offline.run import RunEvent
 
 # As many points as a screen is wide.
 _MOST_POINTS: Final = 800

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.words import counted
-from offline.parameter_results import MAX_SIGMAS
+from groundsbot.calib.words import counted
+from groundsbot.offline.parameter_results import MAX_SIGMAS
 
 # A tag read less often has little to contradict it.
 FEW_READINGS: Final = 3

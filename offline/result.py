@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from math import atan2
 from pathlib import Path
 
-from calib.arrays import FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.fit_results import AlignmentResult, MeasurementResult, SuspectTag
-from offline.kept import KeptCalibration, KeptChain
-from offline.map_model import MapModel
-from offline.parameter_results import (
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.fit_results import AlignmentResult, MeasurementResult, SuspectTag
+from groundsbot.offline.kept import KeptCalibration, KeptChain
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.parameter_results import (
     CalibrationChoice,
     CalibrationResult,
     CheckResult,

@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.jit import inner, jitted
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.jit import inner, jitted
 
 _SQUARES: Final = 0
 _HUBER: Final = 1

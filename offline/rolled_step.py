@@ -8,9 +8,9 @@ its start: odometry then follows its linear model all but exactly, and what is l
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.jit import inner, jitted
-from offline.linearise_kernels import Values
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.jit import inner, jitted
+from groundsbot.offline.linearise_kernels import Values
 
 
 @jitted

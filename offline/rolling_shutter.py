@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.robot import Robot
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
 
 
 def read_at_once(

@@ -5,26 +5,26 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from calib.arrays import IntArray
-from calib.camera_file import read_camera_yaml
-from calib.camera_model import CameraModel
-from calib.errors import GroundsbotError
-from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
-from calib.tag_edges import moved_out
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.inputs import ALONE, Inputs, size_bytes
-from offline.odometry import WheelTrack
-from offline.plausible import check_file_name
-from offline.run_readings import RunReadings
-from offline.run_tags import Detections, Positions, TagKey
-from offline.stretches import WheelRow, stretches_of
-from onboard.allowance import Allowance
-from onboard.log_head import camera_from_message
-from onboard.log_losses import LogLosses
-from onboard.log_reader import read_log
-from onboard.message_decoder import LogMessage
-from onboard.messages import (
+from groundsbot.calib.arrays import IntArray
+from groundsbot.calib.camera_file import read_camera_yaml
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.calib.tag_edges import moved_out
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.inputs import ALONE, Inputs, size_bytes
+from groundsbot.offline.odometry import WheelTrack
+from groundsbot.offline.plausible import check_file_name
+from groundsbot.offline.run_readings import RunReadings
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
+from groundsbot.offline.stretches import WheelRow, stretches_of
+from groundsbot.onboard.allowance import Allowance
+from groundsbot.onboard.log_head import camera_from_message
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.onboard.messages import (
     CameraCalibration,
     Event,
     PlanarOdometry,

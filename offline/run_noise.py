@@ -14,17 +14,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.chain import Chain
-from offline.corner_noise import least_shared, least_shared_by_corners
-from offline.factors import State, whitening
-from offline.local_map import LocalMap
-from offline.noise_fit import FittedPart, FittedSigma, fit_noise
-from offline.odometry import ODOMETRY_NOISE
-from offline.parameter_results import FittedNoise, FittedParameter
-from offline.shared_errors import SharedErrors, fit_shared_errors
-from offline.solver import solve
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.corner_noise import least_shared, least_shared_by_corners
+from groundsbot.offline.factors import State, whitening
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.noise_fit import FittedPart, FittedSigma, fit_noise
+from groundsbot.offline.odometry import ODOMETRY_NOISE
+from groundsbot.offline.parameter_results import FittedNoise, FittedParameter
+from groundsbot.offline.shared_errors import SharedErrors, fit_shared_errors
+from groundsbot.offline.solver import solve
 
 NOT_NEEDED: Final = "no measurement depends on it"
 _NO_RUN: Final = "no run has tag readings that fit together"

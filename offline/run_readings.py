@@ -12,11 +12,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.errors import OfflineError
-from offline.run_tags import Detections, Positions, TagKey
-from onboard.corner_refinement import REFINED_CORNERS
-from onboard.messages import TagDetections, TagObservations
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
+from groundsbot.onboard.corner_refinement import REFINED_CORNERS
+from groundsbot.onboard.messages import TagDetections, TagObservations
 
 
 class Gathered(NamedTuple):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
 
 
 class TagKey(NamedTuple):

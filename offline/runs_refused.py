@@ -3,12 +3,12 @@
 import re
 from collections.abc import Sequence
 
-from calib.noise import NoiseParameters
-from offline.errors import OfflineError
-from offline.kept_maps import check_can_be_extended, check_sizes_in_map
-from offline.result import MapResult
-from offline.run import Run
-from offline.self_calibration_option import Calibrate
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.kept_maps import check_can_be_extended, check_sizes_in_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.self_calibration_option import Calibrate
 
 
 def check_distinct(runs: Sequence[Run]) -> None:

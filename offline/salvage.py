@@ -7,16 +7,16 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
-from offline.errors import OfflineError
-from offline.new_log import new_log
-from onboard.allowance import Allowance
-from onboard.errors import LogError, MessageRefusedError
-from onboard.log_losses import LogLosses
-from onboard.log_reader import files_of, read_head, read_log
-from onboard.log_segments import finished_name, of_pictures
-from onboard.log_writer import LogWriter
-from onboard.message_decoder import LogMessage
-from onboard.messages import TOPICS, Event, EventKind, Severity
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.new_log import new_log
+from groundsbot.onboard.allowance import Allowance
+from groundsbot.onboard.errors import LogError, MessageRefusedError
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import files_of, read_head, read_log
+from groundsbot.onboard.log_segments import finished_name, of_pictures
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.onboard.messages import TOPICS, Event, EventKind, Severity
 
 
 @dataclass(frozen=True)

@@ -4,18 +4,18 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from calib.camera_model import CameraModel
-from calib.noise import NoiseParameters
-from offline.chain import Chain
-from offline.corner_factors import FOCAL_SCALE
-from offline.effort import efforts_of
-from offline.graph import IMPORTED_BATCH, TAG_SCALE
-from offline.local_map import solve_local_map
-from offline.parameter_results import CalibrationChoice, CalibrationResult
-from offline.run import Run
-from offline.self_calibration_gate import choose
-from offline.self_calibration_robot import LIMITS, Learnt, Owned, corrected, opened
-from offline.self_calibration_told import told_by
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.corner_factors import FOCAL_SCALE
+from groundsbot.offline.effort import efforts_of
+from groundsbot.offline.graph import IMPORTED_BATCH, TAG_SCALE
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.parameter_results import CalibrationChoice, CalibrationResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.self_calibration_gate import choose
+from groundsbot.offline.self_calibration_robot import LIMITS, Learnt, Owned, corrected, opened
+from groundsbot.offline.self_calibration_told import told_by
 
 # Put right before the map is made, which takes them to first order, or on the floor not at all. Wheel readings are in
 # metres by then, and stamps on one clock; both are as good to first order.

@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import norm
 
-from calib.arrays import BoolArray, FloatArray
-from offline.graph import Parameter
-from offline.parameter_results import CalibrationChoice
-from offline.self_calibration_robot import LIMITS
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline.graph import Parameter
+from groundsbot.offline.parameter_results import CalibrationChoice
+from groundsbot.offline.self_calibration_robot import LIMITS
 
 # Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.
 _FALSE_ALARM: Final = 0.01

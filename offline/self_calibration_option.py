@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from offline.errors import OfflineError
+from groundsbot.offline.errors import OfflineError
 
 OFF: Final = "off"
 AUTO: Final = "auto"

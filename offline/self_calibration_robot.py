@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from calib.robot import Mount, Robot, TagBatch, Wheels
-from offline.corner_factors import FOCAL_SCALE
-from offline.factors import MOUNT_PARAMETERS
-from offline.graph import IMPORTED_BATCH, TAG_SCALE
-from offline.odometry import WHEEL_PARAMETERS
-from offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
+from groundsbot.calib.robot import Mount, Robot, TagBatch, Wheels
+from groundsbot.offline.corner_factors import FOCAL_SCALE
+from groundsbot.offline.factors import MOUNT_PARAMETERS
+from groundsbot.offline.graph import IMPORTED_BATCH, TAG_SCALE
+from groundsbot.offline.odometry import WHEEL_PARAMETERS
+from groundsbot.offline.readings import CAMERA_PARAMETERS, EDGE_SHIFT, TIME_OFFSET
 
 _WHEEL_SCALE, _WHEEL_RATIO, _TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"

@@ -12,23 +12,23 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from calib.robot import Robot
-from offline.chain import Chain
-from offline.corner_factors import FOCAL_SCALE
-from offline.corner_graph import corner_graph, has_corners
-from offline.corner_noise import least_shared
-from offline.corner_solver import CornerSolution, solve_corners
-from offline.effort import Effort
-from offline.goodness import WINDOW_M, fitted_windows
-from offline.graph import Parameter, build_graph
-from offline.local_map import LocalMap
-from offline.odometry import ODOMETRY_NOISE
-from offline.run_noise import in_cell, spread_of_corners
-from offline.self_calibration_gate import Told
-from offline.self_calibration_robot import all_open
-from offline.solver import Solution, solve
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.corner_factors import FOCAL_SCALE
+from groundsbot.offline.corner_graph import corner_graph, has_corners
+from groundsbot.offline.corner_noise import least_shared
+from groundsbot.offline.corner_solver import CornerSolution, solve_corners
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.goodness import WINDOW_M, fitted_windows
+from groundsbot.offline.graph import Parameter, build_graph
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.odometry import ODOMETRY_NOISE
+from groundsbot.offline.run_noise import in_cell, spread_of_corners
+from groundsbot.offline.self_calibration_gate import Told
+from groundsbot.offline.self_calibration_robot import all_open
+from groundsbot.offline.solver import Solution, solve
 
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
 _STRETCHES: Final = 5

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from offline.parameter_results import CalibrationChoice, CalibrationResult
-from offline.result import MapResult
-from offline.self_calibration_gate import TELLS_LESS
+from groundsbot.offline.parameter_results import CalibrationChoice, CalibrationResult
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.self_calibration_gate import TELLS_LESS
 
 # How to drive so that it can be told.
 DRIVES: Final[Mapping[str, str]] = MappingProxyType(

@@ -16,10 +16,10 @@ from typing import Final
 import numpy as np
 from scipy import sparse
 
-from calib.arrays import FloatArray, IntArray
-from offline.factors import stacked
-from offline.robust import losses_and_weights
-from offline.solver import Solution
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import stacked
+from groundsbot.offline.robust import losses_and_weights
+from groundsbot.offline.solver import Solution
 
 # What was assumed before, that readings share nothing, counts like this many cells.
 _TOLD: Final = 4.0

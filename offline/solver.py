@@ -11,18 +11,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
-from offline.arrowhead_blocks import Rows, System
-from offline.arrowhead_build import build_arrowhead, build_skeleton, reweighed
-from offline.damping import Damping
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
-from offline.linearise_kernels import diagonal_square
-from offline.measured_factors import NOTHING_MEASURED, Measured
-from offline.robust import SQUARES, Loss, huber, losses_and_weights
-from offline.step_taken import Before, take_step
-from offline.tied_down import Untied, untied_parts
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from groundsbot.offline.arrowhead_blocks import Rows, System
+from groundsbot.offline.arrowhead_build import build_arrowhead, build_skeleton, reweighed
+from groundsbot.offline.damping import Damping
+from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.linearise_kernels import diagonal_square
+from groundsbot.offline.measured_factors import NOTHING_MEASURED, Measured
+from groundsbot.offline.robust import SQUARES, Loss, huber, losses_and_weights
+from groundsbot.offline.step_taken import Before, take_step
+from groundsbot.offline.tied_down import Untied, untied_parts
 
 # Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
+from groundsbot.calib.arrays import FloatArray, IntArray
 
 
 def averaged(

@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray
-from offline.arrowhead_tree import Tree
-from offline.jit import borrowed, inlined, jitted
-from offline.linearise_kernels import Odometry, Readings, Values, wrapped
-from offline.linearise_odometry import motion_at, wheel_correction
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.jit import borrowed, inlined, jitted
+from groundsbot.offline.linearise_kernels import Odometry, Readings, Values, wrapped
+from groundsbot.offline.linearise_odometry import motion_at, wheel_correction
 
 # A reading farther off than this many sigmas is passed over.
 _GATE: Final = 6.0

@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray
-from onboard.messages import PlanarOdometry
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.onboard.messages import PlanarOdometry
 
 # By how much of the largest entry rounding may spoil symmetry, or make the smallest eigenvalue negative.
 _ROUNDING: Final = 1e-9

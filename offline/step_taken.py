@@ -4,11 +4,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead import Arrowhead
-from offline.arrowhead_blocks import System
-from offline.factors import State
-from offline.robust import Loss
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead import Arrowhead
+from groundsbot.offline.arrowhead_blocks import System
+from groundsbot.offline.factors import State
+from groundsbot.offline.robust import Loss
 
 # A step that brings less than this share of what the linear model says is also tried in the other way.
 _GOOD_GAIN: Final = 0.75

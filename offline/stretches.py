@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from calib.robot import Robot
-from calib.words import counted
-from offline.errors import OfflineError
-from offline.odometry import WheelTrack
-from offline.plausible import check_numbers, check_speed, check_stamps
-from offline.step_covariance import given_covariances
-from onboard.messages import PlanarOdometry
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.robot import Robot
+from groundsbot.calib.words import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.odometry import WheelTrack
+from groundsbot.offline.plausible import check_numbers, check_speed, check_stamps
+from groundsbot.offline.step_covariance import given_covariances
+from groundsbot.onboard.messages import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 

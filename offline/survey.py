@@ -14,13 +14,13 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.alignment import fit_transform
-from offline.csv_table import CsvTable, read_table
-from offline.errors import OfflineError
-from offline.result import Component, MapResult
-from offline.survey_errors import ComponentSurvey, JudgedEntry, SurveyErrors
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.alignment import fit_transform
+from groundsbot.offline.csv_table import CsvTable, read_table
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.survey_errors import ComponentSurvey, JudgedEntry, SurveyErrors
 
 # What a tape measure and a plumb line leave, where the file does not say.
 DEFAULT_SIGMA_M: Final = 0.02

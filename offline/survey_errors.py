@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from offline.result import TagResult
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.result import TagResult
 
 
 @dataclass(frozen=True)

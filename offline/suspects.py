@@ -12,24 +12,26 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from offline.graph import Graph, build_graph
-from offline.local_map import LocalMap, solve_local_map
-from offline.measured_factors import Measured
-from offline.merge import Merge
-from offline.run_tags import TagKey
-from offline.solver import Solution, solve
-from offline.suspects_evidence import Evidence, Heard, contradicted, gathered, heard, noise_scales, to_other_tags
-from offline.suspects_passings import few_of_each_tag
-from offline.suspects_places import Places, settled
-from offline.suspects_search import FALSE_ALARM, bound, excess, search
-from offline.suspects_sightings import (
-    Sightings,
-    instances,
-    places_told_apart,
-    sightings_of,
-    with_instances,
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.graph import Graph, build_graph
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measured_factors import Measured
+from groundsbot.offline.merge import Merge
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution, solve
+from groundsbot.offline.suspects_evidence import (
+    Evidence,
+    Heard,
+    contradicted,
+    gathered,
+    heard,
+    noise_scales,
+    to_other_tags,
 )
+from groundsbot.offline.suspects_passings import few_of_each_tag
+from groundsbot.offline.suspects_places import Places, settled
+from groundsbot.offline.suspects_search import FALSE_ALARM, bound, excess, search
+from groundsbot.offline.suspects_sightings import Sightings, instances, places_told_apart, sightings_of, with_instances
 
 # Each search is linearised where the last one led; two do where a move is far beyond its sigma.
 _MOST_SEARCHES: Final = 5

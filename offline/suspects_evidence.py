@@ -16,16 +16,16 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import Columns, State
-from offline.goodness import Goodness
-from offline.graph import Graph
-from offline.joint_fit import UNMODELLED_SIGMA_M
-from offline.measured_factors import Measured
-from offline.robust import losses_and_weights
-from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, factorised
-from offline.suspects_information import Information, no_information
-from offline.suspects_sightings import Sightings
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.factors import Columns, State
+from groundsbot.offline.goodness import Goodness
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.offline.measured_factors import Measured
+from groundsbot.offline.robust import losses_and_weights
+from groundsbot.offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, factorised
+from groundsbot.offline.suspects_information import Information, no_information
+from groundsbot.offline.suspects_sightings import Sightings
 
 _WEIGHINGS: Final = 5
 _MOVED_IN_SIGHT: Final = 1e-4

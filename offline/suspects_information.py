@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from calib.arrays import FloatArray, IntArray
-from offline.arrowhead_covariance import SquareRoot
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.arrowhead_covariance import SquareRoot
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import IntArray
-from offline.run_tags import TagKey
-from offline.suspects_evidence import Evidence
-from offline.suspects_places import Places
-from offline.suspects_sightings import Sightings
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.suspects_evidence import Evidence
+from groundsbot.offline.suspects_places import Places
+from groundsbot.offline.suspects_sightings import Sightings
 
 MOVED: Final = "moved"
 MOVING: Final = "moving"

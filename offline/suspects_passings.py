@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.arrowhead_cut import LEVELS
-from offline.arrowhead_tree import Tree
-from offline.graph import Graph
-from offline.suspects_sightings import Sightings, places_told_apart
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.arrowhead_cut import LEVELS
+from groundsbot.offline.arrowhead_tree import Tree
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.suspects_sightings import Sightings, places_told_apart
 
 # Of one tag. A choice among so many takes as long as a few linearisations; drives of the project's worlds, and the
 # paper's, pass a tag two to ten times.

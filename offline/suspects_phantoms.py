@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 from scipy.stats import binom
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.factors import State
-from offline.graph import Graph
-from offline.suspects_sightings import Sightings
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.suspects_sightings import Sightings
 
 # "Read once or a few times."
 MOST_READINGS: Final = 3

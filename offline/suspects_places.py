@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.suspects_evidence import Evidence
-from offline.suspects_information import Gathered, Information, rows_of
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.suspects_evidence import Evidence
+from groundsbot.offline.suspects_information import Gathered, Information, rows_of
 
 # A place is somewhere within a kilometre: ties down what no reading does.
 NOWHERE: Final = 1e-6

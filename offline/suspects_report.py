@@ -5,11 +5,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.words import counted
-from offline.fit_results import SuspectTag
-from offline.suspects import Searched
-from offline.suspects_kinds import (
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.words import counted
+from groundsbot.offline.fit_results import SuspectTag
+from groundsbot.offline.suspects import Searched
+from groundsbot.offline.suspects_kinds import (
     INCONSISTENT,
     MOVED,
     MOVING,
@@ -21,8 +21,8 @@ from offline.suspects_kinds import (
     swapped_pairs,
     wrong_runs,
 )
-from offline.suspects_phantoms import MOST_READINGS, Views, chances, views_of
-from offline.suspects_search import FALSE_ALARM
+from groundsbot.offline.suspects_phantoms import MOST_READINGS, Views, chances, views_of
+from groundsbot.offline.suspects_search import FALSE_ALARM
 
 _MOST_NAMED: Final = 4
 

@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.suspects_evidence import Evidence
-from offline.suspects_places import NOWHERE, Places, settled
-from offline.suspects_sightings import Sightings
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.suspects_evidence import Evidence
+from groundsbot.offline.suspects_places import NOWHERE, Places, settled
+from groundsbot.offline.suspects_sightings import Sightings
 
 # One map in a hundred names a tag that is where it was.
 FALSE_ALARM: Final = 0.01

@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, IntArray
-from offline.chain import Chain
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import BoolArray, IntArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.run_tags import TagKey
 
 # Longer out of sight, by the way driven or by the clock, and it is another sighting.
 GAP_M: Final = 2.0

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import FloatArray
+from groundsbot.calib.arrays import FloatArray
 
 # What is as both maps have it is taken for wrong so rarely.
 FALSE_ALARM: Final = 1e-4

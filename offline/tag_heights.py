@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from offline.csv_table import CsvTable, read_table
-from offline.errors import OfflineError
-from offline.export_options import ExportOptions
-from offline.result import Component, TagResult
+from groundsbot.offline.csv_table import CsvTable, read_table
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export_options import ExportOptions
+from groundsbot.offline.result import Component, TagResult
 
 _Key = tuple[str, int, str]
 

@@ -16,13 +16,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.condensed import quarter_turned
-from offline.corner_factors import SpatialState
-from offline.corner_solver import CornerSolution
-from offline.joint_fit import REACH_M, UNMODELLED_SIGMA_M
-from offline.tag_fit import FALSE_ALARM
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.condensed import quarter_turned
+from groundsbot.offline.corner_factors import SpatialState
+from groundsbot.offline.corner_solver import CornerSolution
+from groundsbot.offline.joint_fit import REACH_M, UNMODELLED_SIGMA_M
+from groundsbot.offline.tag_fit import FALSE_ALARM
 
 _STEPS: Final = 6
 _STRAIGHT_SIGMAS: Final = 2.0

@@ -5,11 +5,11 @@ from math import degrees
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.components import SolvedComponent
-from offline.fit_results import AlignmentResult, RivalResult
-from offline.tag_joins import TagJoin
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.components import SolvedComponent
+from groundsbot.offline.fit_results import AlignmentResult, RivalResult
+from groundsbot.offline.tag_joins import TagJoin
 
 
 def join_results(components: Sequence[SolvedComponent], joins: Sequence[TagJoin]) -> tuple[AlignmentResult, ...]:

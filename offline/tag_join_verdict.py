@@ -9,18 +9,18 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import IntArray
-from offline.alignment_rivals import MARGIN_NATS
-from offline.components import SolvedComponent
-from offline.corner_map import Refined
-from offline.corner_solver import CornerSolution, solve_corners
-from offline.corner_start import hung_otherwise
-from offline.fronts import NotPositiveError
-from offline.joint_fit import UNMODELLED_SIGMA_M
-from offline.local_map import LocalMap
-from offline.merge import variance_factor
-from offline.run_tags import TagKey
-from offline.tag_join_fit import HungTags, TagFit, fitted, hung_tags, radial_sigmas
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.alignment_rivals import MARGIN_NATS
+from groundsbot.offline.components import SolvedComponent
+from groundsbot.offline.corner_map import Refined
+from groundsbot.offline.corner_solver import CornerSolution, solve_corners
+from groundsbot.offline.corner_start import hung_otherwise
+from groundsbot.offline.fronts import NotPositiveError
+from groundsbot.offline.joint_fit import UNMODELLED_SIGMA_M
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.merge import variance_factor
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.tag_join_fit import HungTags, TagFit, fitted, hung_tags, radial_sigmas
 
 # Then sigma is no more than 1.4 times what first order says of it; where a tag is seen squarely it may be anything.
 _LEAST_STRAIGHTNESS: Final = 0.5

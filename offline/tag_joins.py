@@ -11,21 +11,21 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.components import SolvedComponent
-from offline.corner_map import refine
-from offline.factors import State
-from offline.graph import Graph, Parameter, build_graph
-from offline.local_map import LocalMap
-from offline.measured import Measurements
-from offline.measured_factors import StartFactors
-from offline.measured_map import with_measurements
-from offline.merge import Group, Merge, size_rank
-from offline.run_tags import TagKey
-from offline.solver import solve
-from offline.stages import Stages
-from offline.tag_join_verdict import Verdict, verdict
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.components import SolvedComponent
+from groundsbot.offline.corner_map import refine
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph, Parameter, build_graph
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measured import Measurements
+from groundsbot.offline.measured_factors import StartFactors
+from groundsbot.offline.measured_map import with_measurements
+from groundsbot.offline.merge import Group, Merge, size_rank
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import solve
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.tag_join_verdict import Verdict, verdict
 
 # Against what tags and wheels tell of headings this is nothing; it is there for what they do not.
 _HELD_RAD: Final = 1.0

@@ -21,10 +21,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray
-from calib.bundle import board_pose
-from calib.camera_model import CameraModel
-from calib.tag_edges import outward
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.calib.bundle import board_pose
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.tag_edges import outward
 
 # Corners of a tag with side 1 in its own frame; the order is that of groundsbot.proto.
 UNIT_CORNERS: Final[FloatArray] = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])

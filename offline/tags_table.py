@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from offline.result import Component, TagResult
+from groundsbot.offline.result import Component, TagResult
 
 TAG_COLUMNS: Final = (
     "tag_id",

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from scipy import linalg, sparse
 
-from calib.arrays import FloatArray, IntArray
-from offline.factors import Columns, OdometryFactors, ReadingFactors, State
-from offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.measured_factors import DistanceFactors, Measured, StartFactors, ends_of
 
 # Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.
 _FREE: Final = 1e-12

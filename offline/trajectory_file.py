@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
-from calib.files import written_whole
-from offline.errors import OfflineError
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.files import written_whole
+from groundsbot.offline.errors import OfflineError
 
 _NS_PER_S: Final = 1_000_000_000
 

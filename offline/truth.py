@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.errors import OfflineError
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.errors import OfflineError
 
 # A reading's stamp is an estimate too: this far beyond the truth's ends its end stands for it.
 _END_TOLERANCE_NS: Final = 100_000_000

@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.chain import Chain
-from offline.odometry import chained
-from offline.readings import Readings
-from offline.suspects_sightings import GAP_M
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.readings import Readings
+from groundsbot.offline.suspects_sightings import GAP_M
 
 # Beside its covariance, how far a reading is off from what the last one made expect.
 _SLACK_M: Final = 0.01

@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.arrays import FloatArray, IntArray
-from offline.corner_factors import SpatialColumns, SpatialState
-from offline.errors import OfflineError
-from offline.factors import Linearised
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.corner_factors import SpatialColumns, SpatialState
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.factors import Linearised
+from groundsbot.offline.run_tags import TagKey
 
 # A level tells a hundredth of a degree at best; what leans by ten is not upright.
 _FINEST_DEG: Final = 0.01

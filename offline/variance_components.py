@@ -19,9 +19,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import BoolArray, FloatArray
-from offline.solver import Solution
-from offline.variance_look import Good, Looker, Part
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.variance_look import Good, Looker, Part
 
 # Of a logarithm of sigma: a factor of ten either way is one such sigma.
 PRIOR_SIGMA: Final = float(np.log(10.0))

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.linalg import hadamard
 from scipy.special import chdtr, chdtri
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import State, stacked, whitening
-from offline.solver import Problem, Solution, solve
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.factors import State, stacked, whitening
+from groundsbot.offline.solver import Problem, Solution, solve
 
 # A residual beyond this is no noise but a fault, and says nothing of the noise; of good ones 0.1 % lie there.
 _FAULT: Final = 1e-3

@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.arrays import IntArray
-from offline.graph import Graph
-from offline.run_tags import TagKey
-from offline.solver import Solution
+from groundsbot.calib.arrays import IntArray
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution
 
 # Rounding that changes a covariance by a hundredth is a tenth of what the sigma of a good noise model is off.
 MAX_RELATIVE_ERROR: Final = 0.01

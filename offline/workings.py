@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from calib.arrays import FloatArray
-from offline.graph import Graph
-from offline.local_map import LocalMap
-from offline.merge import Group
-from offline.run import Run
-from offline.solver import Solution
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.merge import Group
+from groundsbot.offline.run import Run
+from groundsbot.offline.solver import Solution
 
 
 class Solved(NamedTuple):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from onboard.errors import LogError
+from groundsbot.onboard.errors import LogError
 
 
 @dataclass

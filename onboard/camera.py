@@ -10,10 +10,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from onboard.clock import RunClock
-from onboard.detection_process import Picture
-from onboard.errors import OnboardError
-from onboard.messages import StampSource
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.messages import StampSource
 
 _NS_PER_S: Final = 1_000_000_000
 
@@ -89,8 +89,8 @@ def camera_for(settings: CameraSettings, clock: RunClock, since_ns: int) -> Came
         clock: the run's clock.
         since_ns: pictures in a folder that are older are left alone.
     """
-    from onboard.picture_folder import FolderCamera
-    from onboard.v4l2_camera import V4l2Camera
+    from groundsbot.onboard.picture_folder import FolderCamera
+    from groundsbot.onboard.v4l2_camera import V4l2Camera
 
     path = Path(settings.device)
     if path.is_dir():

@@ -11,17 +11,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import DEFAULT_BOARD
-from calib.files import written_whole
-from calib.picture_bytes import is_jpeg
-from calib.words import counted
-from onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
-from onboard.capture_guide import Advice, CaptureGuide
-from onboard.clock import RunClock
-from onboard.detection_process import Picture
-from onboard.drawing import save_board
-from onboard.errors import OnboardError
-from onboard.picture import decode_grey, to_grey
+from groundsbot.calib.board import DEFAULT_BOARD
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.picture_bytes import is_jpeg
+from groundsbot.calib.words import counted
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
+from groundsbot.onboard.capture_guide import Advice, CaptureGuide
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.drawing import save_board
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.picture import decode_grey, to_grey
 
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.1

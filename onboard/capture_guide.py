@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import DEFAULT_VIEWS, Board
-from calib.view_spread import SeenBoard, Spread, seen_board
-from onboard.errors import OnboardError
+from groundsbot.calib.board import DEFAULT_VIEWS, Board
+from groundsbot.calib.view_spread import SeenBoard, Spread, seen_board
+from groundsbot.onboard.errors import OnboardError
 
 _NS_PER_S: Final = 1_000_000_000
 # What moves so fast is smeared by a third of a pixel in 1/60 s, a long exposure, in a picture 1280 px wide.

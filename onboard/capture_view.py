@@ -9,7 +9,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from onboard.capture_guide import Advice, CaptureGuide
+from groundsbot.onboard.capture_guide import Advice, CaptureGuide
 
 _PERIOD_S: Final = 2.0  # between two plain lines that tell of no new picture
 _FULL: Final = "■"

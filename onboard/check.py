@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
-from onboard.clock import RunClock, wall_clock_synchronised
-from onboard.detection_process import ChildDetector, DetectionResult
-from onboard.disk_hours import Load, hours_until_full
-from onboard.drawing import save_drawn
-from onboard.encoder_port import EncoderPort, PortLostError
-from onboard.encoder_protocol import EncoderParser
-from onboard.errors import OnboardError
-from onboard.messages import TOPICS
-from onboard.robot_files import RobotFiles
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
+from groundsbot.onboard.clock import RunClock, wall_clock_synchronised
+from groundsbot.onboard.detection_process import ChildDetector, DetectionResult
+from groundsbot.onboard.disk_hours import Load, hours_until_full
+from groundsbot.onboard.drawing import save_drawn
+from groundsbot.onboard.encoder_port import EncoderPort, PortLostError
+from groundsbot.onboard.encoder_protocol import EncoderParser
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.messages import TOPICS
+from groundsbot.onboard.robot_files import RobotFiles
 
 _NS_PER_S: Final = 1_000_000_000
 _LISTEN_NS: Final = 2 * _NS_PER_S

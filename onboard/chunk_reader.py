@@ -10,11 +10,11 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from onboard.allowance import Allowance
-from onboard.errors import LogError
-from onboard.log_losses import Damage
-from onboard.mcap_summary import Summary, read_summary
-from onboard.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_text
+from groundsbot.onboard.allowance import Allowance
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_losses import Damage
+from groundsbot.onboard.mcap_summary import Summary, read_summary
+from groundsbot.onboard.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_text
 
 # A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
 RECORD_LIMIT_BYTES: Final = 64 << 20

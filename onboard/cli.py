@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
-from calib.command_line import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
+from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
+from groundsbot.calib.command_line import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
 
 if TYPE_CHECKING:
-    from onboard.messages import Event
+    from groundsbot.onboard.messages import Event
 
 PRIORITY = -10  # the recorder's among the processes of its computer, as `nice` counts
 KEPT_BYTES = 16 << 20  # free memory that stays with the recorder: several chunks of pictures on their way to the disk
@@ -40,14 +40,14 @@ def record(
     import os
     import sys
 
-    from onboard.console_lines import ConsoleLines
-    from onboard.ending import told_to_end
-    from onboard.housekeeping import Housekeeper
-    from onboard.live_recorder import LiveRecorder
-    from onboard.process_memory import keep_memory
-    from onboard.robot_files import RobotFiles
-    from onboard.status import STATUS_SUFFIX
-    from onboard.systemd import Notifier
+    from groundsbot.onboard.console_lines import ConsoleLines
+    from groundsbot.onboard.ending import told_to_end
+    from groundsbot.onboard.housekeeping import Housekeeper
+    from groundsbot.onboard.live_recorder import LiveRecorder
+    from groundsbot.onboard.process_memory import keep_memory
+    from groundsbot.onboard.robot_files import RobotFiles
+    from groundsbot.onboard.status import STATUS_SUFFIX
+    from groundsbot.onboard.systemd import Notifier
 
     stop = told_to_end()
     with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
@@ -93,8 +93,8 @@ def check(
 
     Exit code 1 if one fails.
     """
-    from onboard.check import check_robot
-    from onboard.robot_files import RobotFiles
+    from groundsbot.onboard.check import check_robot
+    from groundsbot.onboard.robot_files import RobotFiles
 
     failed = False
     for result in check_robot(RobotFiles(robot), output, picture or robot.with_name("check.jpg")):
@@ -130,14 +130,14 @@ def capture(
     """
     from rich.console import Console
 
-    from calib.board import parse_board
-    from onboard.camera import camera_for
-    from onboard.capture import Capture, summary
-    from onboard.capture_guide import CaptureGuide
-    from onboard.capture_view import CaptureView
-    from onboard.clock import RunClock
-    from onboard.ending import told_to_end
-    from onboard.robot_files import capture_settings
+    from groundsbot.calib.board import parse_board
+    from groundsbot.onboard.camera import camera_for
+    from groundsbot.onboard.capture import Capture, summary
+    from groundsbot.onboard.capture_guide import CaptureGuide
+    from groundsbot.onboard.capture_view import CaptureView
+    from groundsbot.onboard.clock import RunClock
+    from groundsbot.onboard.ending import told_to_end
+    from groundsbot.onboard.robot_files import capture_settings
 
     guide = CaptureGuide(parse_board(board), views)
     clock = RunClock()
@@ -169,8 +169,8 @@ def status(
     """
     from rich.console import Console
 
-    from onboard.status import is_alive
-    from onboard.status_view import print_once, show_live
+    from groundsbot.onboard.status import is_alive
+    from groundsbot.onboard.status_view import print_once, show_live
 
     console = Console()
     if not once and console.is_terminal:

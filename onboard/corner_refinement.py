@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.camera_model import CameraModel
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
 
 # In the detector settings of pictures whose tags had their corners sharpened; ",lens" follows where the lens was known.
 REFINED_CORNERS: Final = "corners=sides"

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 from google.protobuf.message import Message
 
-from onboard.errors import MessageRefusedError
-from onboard.log_segments import PICTURE_TOPIC
-from onboard.log_writer import LogNote, RunLog
-from onboard.messages import Event, EventKind, Severity
+from groundsbot.onboard.errors import MessageRefusedError
+from groundsbot.onboard.log_segments import PICTURE_TOPIC
+from groundsbot.onboard.log_writer import LogNote, RunLog
+from groundsbot.onboard.messages import Event, EventKind, Severity
 
 
 class CountedLog:

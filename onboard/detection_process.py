@@ -17,13 +17,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera_model import CameraModel
-from calib.picture_bytes import is_jpeg
-from onboard.ending import ENDING_SIGNALS
-from onboard.errors import OnboardError
-from onboard.picture import decode, decode_grey, encode_jpeg, to_grey
-from onboard.process_memory import keep_memory
-from onboard.tag_detector import Detection, TagDetector
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.picture_bytes import is_jpeg
+from groundsbot.onboard.ending import ENDING_SIGNALS
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.picture import decode, decode_grey, encode_jpeg, to_grey
+from groundsbot.onboard.process_memory import keep_memory
+from groundsbot.onboard.tag_detector import Detection, TagDetector
 
 Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
 

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from onboard.camera import Camera, CameraEndedError, CameraSettings, Frame, camera_for
-from onboard.clock import RunClock
-from onboard.encoder_port import EncoderPort
-from onboard.errors import OnboardError
-from onboard.recorder import RecorderCore
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraSettings, Frame, camera_for
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.encoder_port import EncoderPort
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.recorder import RecorderCore
 
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.05

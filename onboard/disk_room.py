@@ -8,10 +8,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from calib.robot import Robot
-from onboard.errors import OnboardError
-from onboard.log_segments import CAMERA_SUFFIX
-from onboard.storage import Storage
+from groundsbot.calib.robot import Robot
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log_segments import CAMERA_SUFFIX
+from groundsbot.onboard.storage import Storage
 
 BALLAST_BYTES: Final = 16 << 20  # half a second of everything, and the indices of a segment
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.files import written_whole
-from calib.view_spread import SeenBoard, Spread, region_shares
-from onboard.detection_process import Picture
-from onboard.picture import decode, encode_jpeg
-from onboard.tag_detector import Detection
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.view_spread import SeenBoard, Spread, region_shares
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.picture import decode, encode_jpeg
+from groundsbot.onboard.tag_detector import Detection
 
 _GREEN: Final = (60, 220, 60)
 _RED: Final = (40, 40, 255)

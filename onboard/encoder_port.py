@@ -8,7 +8,7 @@ from typing import Final
 
 import serial
 
-from onboard.errors import OnboardError
+from groundsbot.onboard.errors import OnboardError
 
 _READ_BYTES: Final = 4096
 

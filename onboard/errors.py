@@ -1,6 +1,6 @@
 """Errors of the recorder and of logs."""
 
-from calib.errors import GroundsbotError
+from groundsbot.calib.errors import GroundsbotError
 
 
 class OnboardError(GroundsbotError):

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-from onboard.clock import wall_clock_synchronised
-from onboard.disk_hours import hours_until_full
-from onboard.live_recorder import LiveRecorder
-from onboard.log_keeper import LogStatus
-from onboard.messages import Event, Severity
-from onboard.status import DiskStatus, Look, Rates, Status, write_status
-from onboard.systemd import Notifier
+from groundsbot.onboard.clock import wall_clock_synchronised
+from groundsbot.onboard.disk_hours import hours_until_full
+from groundsbot.onboard.live_recorder import LiveRecorder
+from groundsbot.onboard.log_keeper import LogStatus
+from groundsbot.onboard.messages import Event, Severity
+from groundsbot.onboard.status import DiskStatus, Look, Rates, Status, write_status
+from groundsbot.onboard.systemd import Notifier
 
 _NS_PER_S: Final = 1_000_000_000
 _PERIOD_S: Final = 1.0

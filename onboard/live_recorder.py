@@ -17,20 +17,20 @@ from typing import Final
 
 from google.protobuf.message import Message
 
-from calib.picture_bytes import is_complete, is_jpeg
-from onboard.camera import Frame
-from onboard.clock import RunClock, read_clocks, wall_clock_synchronised
-from onboard.detection_process import ChildDetector, DetectionResult
-from onboard.device_threads import Act, CameraThread, DeviceThread, WheelThread
-from onboard.disk_room import DiskRoom, one_recorder, space_policy
-from onboard.encoder_port import EncoderPort
-from onboard.log_keeper import LogKeeper
-from onboard.log_segments import segment_limits
-from onboard.log_thread import LogThread
-from onboard.messages import Event, EventKind
-from onboard.recorder import RecorderCore, Run
-from onboard.robot_files import RobotFiles
-from onboard.storage import Disk
+from groundsbot.calib.picture_bytes import is_complete, is_jpeg
+from groundsbot.onboard.camera import Frame
+from groundsbot.onboard.clock import RunClock, read_clocks, wall_clock_synchronised
+from groundsbot.onboard.detection_process import ChildDetector, DetectionResult
+from groundsbot.onboard.device_threads import Act, CameraThread, DeviceThread, WheelThread
+from groundsbot.onboard.disk_room import DiskRoom, one_recorder, space_policy
+from groundsbot.onboard.encoder_port import EncoderPort
+from groundsbot.onboard.log_keeper import LogKeeper
+from groundsbot.onboard.log_segments import segment_limits
+from groundsbot.onboard.log_thread import LogThread
+from groundsbot.onboard.messages import Event, EventKind
+from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.onboard.robot_files import RobotFiles
+from groundsbot.onboard.storage import Disk
 
 _NS_PER_S: Final = 1_000_000_000
 _WAIT_S: Final = 0.05

@@ -10,8 +10,8 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import register_schema
 
-from onboard.messages import TOPICS
-from onboard.storage import Storage, StoredFile
+from groundsbot.onboard.messages import TOPICS
+from groundsbot.onboard.storage import Storage, StoredFile
 
 ACTIVE_SUFFIX: Final = ".active"
 

@@ -7,10 +7,10 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 
-from calib.camera_model import CameraModel
-from calib.robot import Mount, Robot
-from onboard.errors import LogError
-from onboard.messages import CameraCalibration, FrameTransform, RunInfo, timestamp
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Mount, Robot
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.messages import CameraCalibration, FrameTransform, RunInfo, timestamp
 
 BASE_FRAME: Final = "base"
 CAMERA_FRAME: Final = "camera"

@@ -13,12 +13,12 @@ from typing import Final, NamedTuple
 
 from google.protobuf.message import Message
 
-from onboard.disk_room import NO_ROOM, DiskRoom
-from onboard.log_file import Record
-from onboard.log_segments import PICTURE_TOPIC, LogSegments, SegmentLimits, files_of_run
-from onboard.log_writer import LogNote, checked_record, head_records
-from onboard.messages import EventKind, Severity
-from onboard.storage import Storage
+from groundsbot.onboard.disk_room import NO_ROOM, DiskRoom
+from groundsbot.onboard.log_file import Record
+from groundsbot.onboard.log_segments import PICTURE_TOPIC, LogSegments, SegmentLimits, files_of_run
+from groundsbot.onboard.log_writer import LogNote, checked_record, head_records
+from groundsbot.onboard.messages import EventKind, Severity
+from groundsbot.onboard.storage import Storage
 
 _PICTURES_LIMIT_BYTES: Final = 16 << 20  # waiting in memory; beyond it new pictures are dropped
 _LIMIT_BYTES: Final = 64 << 20  # waiting in all; beyond it the oldest tenth goes

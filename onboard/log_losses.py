@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from onboard.errors import LogError
+from groundsbot.onboard.errors import LogError
 
 _PLACES_KEPT: Final = 100
 

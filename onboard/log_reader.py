@@ -9,14 +9,14 @@ from typing import Final
 
 from google.protobuf.message import Message
 
-from onboard.allowance import Allowance
-from onboard.chunk_reader import ChunkReader
-from onboard.errors import LogError
-from onboard.log_file import ACTIVE_SUFFIX
-from onboard.log_losses import LogLosses, NoLosses
-from onboard.log_segments import PICTURE_TOPIC, of_pictures
-from onboard.message_decoder import LogMessage, MessageDecoder
-from onboard.messages import TOPICS, RunInfo
+from groundsbot.onboard.allowance import Allowance
+from groundsbot.onboard.chunk_reader import ChunkReader
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_file import ACTIVE_SUFFIX
+from groundsbot.onboard.log_losses import LogLosses, NoLosses
+from groundsbot.onboard.log_segments import PICTURE_TOPIC, of_pictures
+from groundsbot.onboard.message_decoder import LogMessage, MessageDecoder
+from groundsbot.onboard.messages import TOPICS, RunInfo
 
 _SMALLEST_RECORD_BYTES: Final = 4  # ours shrink to 14 bytes at best; a hostile file may hold millions in a few kB
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)

@@ -10,10 +10,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from calib.robot import Robot
-from onboard.log_file import ACTIVE_SUFFIX, LogFile, Record
-from onboard.messages import TOPICS
-from onboard.storage import Storage
+from groundsbot.calib.robot import Robot
+from groundsbot.onboard.log_file import ACTIVE_SUFFIX, LogFile, Record
+from groundsbot.onboard.messages import TOPICS
+from groundsbot.onboard.storage import Storage
 
 PICTURE_TOPIC: Final = "/camera/image"
 CORE_SUFFIX: Final = ".core.mcap"

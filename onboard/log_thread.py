@@ -8,9 +8,9 @@ from typing import Final
 
 from google.protobuf.message import Message
 
-from onboard.log_keeper import LogKeeper, LogStatus
-from onboard.log_writer import LogNote
-from onboard.messages import EventKind, Severity
+from groundsbot.onboard.log_keeper import LogKeeper, LogStatus
+from groundsbot.onboard.log_writer import LogNote
+from groundsbot.onboard.messages import EventKind, Severity
 
 # From one step's start to the next one's. With what readings and detections wait for before (0.35 s), and with the
 # steps of a disk that takes 0.1 s for a sync, what is older than a second is safe.

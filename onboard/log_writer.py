@@ -7,11 +7,18 @@ from typing import Final, NamedTuple, Protocol
 
 from google.protobuf.message import Message
 
-from onboard.errors import LogError, MessageRefusedError
-from onboard.log_file import Record
-from onboard.log_segments import PICTURE_TOPIC, LogSegments, SegmentLimits, files_of_run, is_unfinished, single_file
-from onboard.messages import TOPICS, EventKind, Severity
-from onboard.storage import Disk, Storage
+from groundsbot.onboard.errors import LogError, MessageRefusedError
+from groundsbot.onboard.log_file import Record
+from groundsbot.onboard.log_segments import (
+    PICTURE_TOPIC,
+    LogSegments,
+    SegmentLimits,
+    files_of_run,
+    is_unfinished,
+    single_file,
+)
+from groundsbot.onboard.messages import TOPICS, EventKind, Severity
+from groundsbot.onboard.storage import Disk, Storage
 
 _FLUSH_PERIOD_NS: Final = 500_000_000  # what is older than this on the log's own time is in the file
 _TIME_LIMIT_NS: Final = 1 << 63
@@ -95,7 +102,7 @@ class LogWriter:
         """Appends one message.
 
         Args:
-            topic: one of `onboard.messages.TOPICS`.
+            topic: one of `groundsbot.onboard.messages.TOPICS`.
             message: of that topic's schema.
             log_time_ns: when the host received it, on the run's clock; not before the last one's.
             publish_time_ns: best estimate of when it was measured, on the run's clock.

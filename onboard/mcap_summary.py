@@ -7,7 +7,7 @@ from typing import BinaryIO, Final, NamedTuple
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from onboard.record_bytes import RECORD_HEAD, U32
+from groundsbot.onboard.record_bytes import RECORD_HEAD, U32
 
 _FOOTER: Final = struct.Struct("<BQQQI")  # code, length, start of the summary, of its offsets, CRC-32
 _STATISTICS: Final = struct.Struct("<QHIIII")  # messages, schemas, channels, attachments, metadata, chunks

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from onboard.messages import StampSource, TagDetection, TagDetections, WheelEncoders
-from onboard.tag_detector import Detection
-from onboard.wheel_intake import StampedReading
+from groundsbot.onboard.messages import StampSource, TagDetection, TagDetections, WheelEncoders
+from groundsbot.onboard.tag_detector import Detection
+from groundsbot.onboard.wheel_intake import StampedReading
 
 
 def wheel_message(each: StampedReading) -> WheelEncoders:

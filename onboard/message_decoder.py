@@ -8,9 +8,9 @@ from typing import Final, NamedTuple, NoReturn
 from google.protobuf.message import DecodeError, Message
 from mcap.opcode import Opcode
 
-from onboard.errors import LogError
-from onboard.messages import TOPICS
-from onboard.record_bytes import MESSAGE_HEAD, RECORD_HEAD, U16, read_text
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.messages import TOPICS
+from groundsbot.onboard.record_bytes import MESSAGE_HEAD, RECORD_HEAD, U16, read_text
 
 _MESSAGE_FIXED_BYTES: Final = MESSAGE_HEAD.size - RECORD_HEAD.size
 _HEAD_RECORDS: Final = 1000

@@ -15,7 +15,7 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from onboard.groundsbot_pb2 import (
+from groundsbot.onboard.groundsbot_pb2 import (
     ClockAnchor,
     Event,
     PlanarOdometry,

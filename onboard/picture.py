@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.picture_bytes import JPEG_END, MOST_PIXELS, claimed_size, is_complete
-from onboard.errors import OnboardError
+from groundsbot.calib.picture_bytes import JPEG_END, MOST_PIXELS, claimed_size, is_complete
+from groundsbot.onboard.errors import OnboardError
 
 
 def decode_grey(encoded: bytes) -> NDArray[np.uint8]:

@@ -1,7 +1,7 @@
 """What is checked of each picture beside its tags: its size, and where its stamp comes from."""
 
-from calib.camera_model import CameraModel
-from onboard.messages import StampSource
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.onboard.messages import StampSource
 
 
 class PictureChecks:

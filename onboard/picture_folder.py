@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import Final
 
-from calib.picture_bytes import is_complete
-from onboard.camera import Camera, CameraLostError, Frame
-from onboard.clock import RunClock
-from onboard.messages import StampSource
+from groundsbot.calib.picture_bytes import is_complete
+from groundsbot.onboard.camera import Camera, CameraLostError, Frame
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.messages import StampSource
 
 _NS_PER_S: Final = 1_000_000_000
 _PICTURE_NAME: Final = re.compile(r"(\d{1,19})\.(?:png|jpe?g)", re.IGNORECASE)

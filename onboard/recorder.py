@@ -11,31 +11,23 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera_model import CameraModel
-from calib.robot import Robot
-from onboard.counted_log import CountedLog
-from onboard.errors import LogError
-from onboard.log_head import CAMERA_FRAME, log_head
-from onboard.log_segments import segment_limits
-from onboard.log_writer import LogOpener, LogWriter, RunLog
-from onboard.measurements import detections_message, wheel_message
-from onboard.messages import (
-    ClockAnchor,
-    CompressedImage,
-    Event,
-    EventKind,
-    Severity,
-    StampSource,
-    timestamp,
-)
-from onboard.picture import encode_jpeg
-from onboard.picture_checks import PictureChecks
-from onboard.picture_schedule import PictureSchedule
-from onboard.recording_losses import RecordingLosses
-from onboard.tag_detector import Detection, TagDetector
-from onboard.waiting_detections import ReadyDetections, WaitingDetections
-from onboard.watches import Watches
-from onboard.wheel_intake import StampedReading, WheelIntake
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.onboard.counted_log import CountedLog
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_head import CAMERA_FRAME, log_head
+from groundsbot.onboard.log_segments import segment_limits
+from groundsbot.onboard.log_writer import LogOpener, LogWriter, RunLog
+from groundsbot.onboard.measurements import detections_message, wheel_message
+from groundsbot.onboard.messages import ClockAnchor, CompressedImage, Event, EventKind, Severity, StampSource, timestamp
+from groundsbot.onboard.picture import encode_jpeg
+from groundsbot.onboard.picture_checks import PictureChecks
+from groundsbot.onboard.picture_schedule import PictureSchedule
+from groundsbot.onboard.recording_losses import RecordingLosses
+from groundsbot.onboard.tag_detector import Detection, TagDetector
+from groundsbot.onboard.waiting_detections import ReadyDetections, WaitingDetections
+from groundsbot.onboard.watches import Watches
+from groundsbot.onboard.wheel_intake import StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S

@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from onboard.counted_log import CountedLog
-from onboard.messages import EventKind, Severity
-from onboard.tallies import Tallies
-from onboard.watches import Watches
-from onboard.wheel_intake import StampedReading, WheelIntake
+from groundsbot.onboard.counted_log import CountedLog
+from groundsbot.onboard.messages import EventKind, Severity
+from groundsbot.onboard.tallies import Tallies
+from groundsbot.onboard.watches import Watches
+from groundsbot.onboard.wheel_intake import StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map

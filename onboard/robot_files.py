@@ -4,13 +4,13 @@ import re
 from pathlib import Path
 from typing import Final
 
-from calib.camera_file import read_camera_yaml
-from calib.camera_model import CameraModel
-from calib.robot import Robot, parse_robot_yaml, read_robot_yaml
-from calib.yaml_file import read_text
-from onboard.camera import CameraSettings
-from onboard.detection_process import DetectorSettings
-from onboard.errors import OnboardError
+from groundsbot.calib.camera_file import read_camera_yaml
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.calib.yaml_file import read_text
+from groundsbot.onboard.camera import CameraSettings
+from groundsbot.onboard.detection_process import DetectorSettings
+from groundsbot.onboard.errors import OnboardError
 
 _DEFAULT_SIZE_PX: Final = (1280, 720)
 _SIZE: Final = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")

@@ -7,8 +7,8 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calib.files import written_whole
-from onboard.errors import OnboardError
+from groundsbot.calib.files import written_whole
+from groundsbot.onboard.errors import OnboardError
 
 STATUS_SUFFIX: Final = ".status.json"
 

@@ -11,8 +11,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from onboard.errors import OnboardError
-from onboard.status import DeviceStatus, Status, is_alive, read_status
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.status import DeviceStatus, Status, is_alive, read_status
 
 _PERIOD_S: Final = 0.5
 _OLD_S: Final = 1.0

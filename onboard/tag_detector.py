@@ -9,11 +9,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.tag_family import tag_bits
-from onboard.corner_refinement import REFINED_CORNERS, refined_corners
-from onboard.errors import OnboardError
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.tag_family import tag_bits
+from groundsbot.onboard.corner_refinement import REFINED_CORNERS, refined_corners
+from groundsbot.onboard.errors import OnboardError
 
 SMALLEST_SIDE_PX: Final = 32  # the libraries crash on empty and tiny pictures
 _MODULES: Final = {"pupil-apriltags": "pupil_apriltags", "pyapriltags": "pyapriltags"}
@@ -65,7 +65,7 @@ class TagDetector:
                 about 27 px are missed.
             threads: within the library.
             camera: whose pictures these are, for the bends that its lens gives to a tag's sides; None: not known.
-            refine: sharpens corners on the picture (`onboard.corner_refinement`).
+            refine: sharpens corners on the picture (`groundsbot.onboard.corner_refinement`).
 
         Raises:
             OnboardError: neither library is there, or a family or the library is unknown.

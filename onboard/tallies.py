@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from onboard.messages import EventKind
-from onboard.wheel_intake import WheelIntake
+from groundsbot.onboard.messages import EventKind
+from groundsbot.onboard.wheel_intake import WheelIntake
 
 
 class Tally(NamedTuple):

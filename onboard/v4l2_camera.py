@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from onboard.camera import Camera, CameraLostError, CameraSettings, Frame
-from onboard.clock import RunClock
-from onboard.detection_process import Picture
-from onboard.messages import StampSource
-from onboard.picture import without_padding
+from groundsbot.onboard.camera import Camera, CameraLostError, CameraSettings, Frame
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.messages import StampSource
+from groundsbot.onboard.picture import without_padding
 
 _NS_PER_S: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from operator import itemgetter
 from typing import Final, NamedTuple
 
-from onboard.messages import TagDetections
-from onboard.wheel_intake import WARM_UP_NS
+from groundsbot.onboard.messages import TagDetections
+from groundsbot.onboard.wheel_intake import WARM_UP_NS
 
 _WAIT_FOR_WHEELS_NS: Final = WARM_UP_NS  # readings that are held back come within that time too
 _WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from onboard.messages import EventKind
+from groundsbot.onboard.messages import EventKind
 
 _NS_PER_S: Final = 1_000_000_000
 _WHEEL_SILENCE_NS: Final = 2_800_000_000  # ticks come a few times a second: told of within 3 s

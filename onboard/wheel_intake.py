@@ -2,8 +2,8 @@
 
 from typing import Final, NamedTuple
 
-from onboard.clock import DeviceClockFilter
-from onboard.encoder_protocol import EncoderParser, WheelReading, WheelUnwrapper
+from groundsbot.onboard.clock import DeviceClockFilter
+from groundsbot.onboard.encoder_protocol import EncoderParser, WheelReading, WheelUnwrapper
 
 # The first readings of a boot wait this long for the clock mapping: they may have lain in a buffer before. Longer than
 # the bursts of 300 ms in which lines may come, and short enough for the log to keep its promise.

@@ -16,7 +16,7 @@ from hypothesis import settings
 from tests.programs import Outcome, Run
 
 if TYPE_CHECKING:
-    from fixtures.devices import PtyPort
+    from groundsbot.fixtures.devices import PtyPort
 
 # A busy machine must not fail a property test.
 settings.register_profile("groundsbot", deadline=None)
@@ -39,7 +39,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.fixture
 def calib(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """`groundsbot-calib ARGUMENTS`, as the program."""
-    from calib import cli
+    from groundsbot.calib import cli
 
     return _calling(cli.main, "groundsbot-calib", monkeypatch, capsys)
 
@@ -60,8 +60,8 @@ def _calling(
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """`groundsbot-offline ARGUMENTS`, as the program."""
-    from offline import cli
-    from offline.jit import COMPILING
+    from groundsbot.offline import cli
+    from groundsbot.offline.jit import COMPILING
 
     program = _calling(cli.main, "groundsbot-offline", monkeypatch, capsys)
 
@@ -76,7 +76,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs of three robots in a room that share tags, unrendered, and the truth; to be read only."""
-    from fixtures.simulate import simulate
+    from groundsbot.fixtures.simulate import simulate
 
     folder = tmp_path_factory.mktemp("drives") / "room"
     simulate("room", 3, folder, render=False)
@@ -86,7 +86,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def plug_in() -> Iterator[Callable[..., "PtyPort"]]:
     """`PtyPort(LINK, ...)`, unplugged after the test."""
-    from fixtures.devices import PtyPort
+    from groundsbot.fixtures.devices import PtyPort
 
     with ExitStack() as ports:
 
@@ -101,7 +101,7 @@ def plug_in() -> Iterator[Callable[..., "PtyPort"]]:
 @pytest.fixture
 def signals_back() -> Iterator[None]:
     """Whatever `told_to_end` takes over is given back after the test, and its thread ends."""
-    from onboard.ending import ENDING_SIGNALS
+    from groundsbot.onboard.ending import ENDING_SIGNALS
 
     handlers = {each: signal.getsignal(each) for each in ENDING_SIGNALS}
     before = signal.set_wakeup_fd(-1)

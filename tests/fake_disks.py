@@ -1,4 +1,4 @@
-"""Disks that fill up, fail, block and lose power, behind the seam of `onboard.storage`."""
+"""Disks that fill up, fail, block and lose power, behind the seam of `groundsbot.onboard.storage`."""
 
 import errno
 import os
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from onboard.disk_room import BALLAST_BYTES
-from onboard.storage import Disk, StoredFile
+from groundsbot.onboard.disk_room import BALLAST_BYTES
+from groundsbot.onboard.storage import Disk, StoredFile
 
 PAGE_BYTES = 4096
 

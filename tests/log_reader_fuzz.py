@@ -13,12 +13,12 @@ import zstandard
 from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, IndexType, Writer
 
-from onboard import chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes
-from onboard.errors import LogError
-from onboard.log_losses import LogLosses
-from onboard.log_reader import read_log
-from onboard.message_decoder import LogMessage
-from onboard.messages import TOPICS
+from groundsbot.onboard import chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.onboard.messages import TOPICS
 from tests.made_logs import Entry, drive, head
 
 _READER = (chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes)

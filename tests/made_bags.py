@@ -17,15 +17,15 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-from calib import wheels
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from calib.robot import Mount
-from offline.bag_definitions import DEFINITIONS
-from offline.odometry import WheelTrack, chained
-from offline.run import Run, load_run
-from onboard.log_reader import read_log
-from onboard.messages import TagDetections, TagObservations
+from groundsbot.calib import wheels
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.bag_definitions import DEFINITIONS
+from groundsbot.offline.odometry import WheelTrack, chained
+from groundsbot.offline.run import Run, load_run
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.messages import TagDetections, TagObservations
 
 S = 1_000_000_000
 BASE, CAMERA, ODOM = "base_link", "camera_optical", "odom"

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from calib.camera_model import CameraModel
-from calib.robot import parse_robot_yaml
-from onboard.encoder_protocol import WheelLine, format_line
-from onboard.log_losses import LogLosses
-from onboard.log_reader import read_log
-from onboard.messages import Event, TagDetections, WheelEncoders
-from onboard.recorder import RecorderCore, Run
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.onboard.encoder_protocol import WheelLine, format_line
+from groundsbot.onboard.log_losses import LogLosses
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.messages import Event, TagDetections, WheelEncoders
+from groundsbot.onboard.recorder import RecorderCore, Run
 
 ROBOT_YAML = """
 robot_id: gb1

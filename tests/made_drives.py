@@ -8,16 +8,16 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calib import se2, wheels
-from calib.arrays import FloatArray, IntArray
-from calib.camera_model import CameraModel
-from calib.robot import Robot
-from offline.odometry import WheelTrack, chained
-from offline.run import Run
-from offline.run_tags import Detections, Positions, TagKey
-from onboard.log_head import log_head
-from onboard.log_writer import LogWriter
-from onboard.messages import TagDetection, TagDetections, WheelEncoders
+from groundsbot.calib import se2, wheels
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.odometry import WheelTrack, chained
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
+from groundsbot.onboard.log_head import log_head
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.messages import TagDetection, TagDetections, WheelEncoders
 
 S = 1_000_000_000
 START_NS = 1_800_000_000_000_000_003  # loses its last digits in a float

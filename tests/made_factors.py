@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from offline.factors import OdometryFactors, ReadingFactors, State, whitening
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.factors import OdometryFactors, ReadingFactors, State, whitening
 
 
 def odometry_of(

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from offline.import_robot import ImportOptions
-from offline.imported_run import ImportReport
-from offline.importers import import_folder
-from onboard.log_reader import read_log
-from onboard.messages import PlanarOdometry, RunInfo, TagObservations
+from groundsbot.offline.import_robot import ImportOptions
+from groundsbot.offline.imported_run import ImportReport
+from groundsbot.offline.importers import import_folder
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.messages import PlanarOdometry, RunInfo, TagObservations
 
 TRACK = ImportOptions(track_width_m=0.5)
 PAPER = ImportOptions(track_width_m=0.508, state_rate_hz=4.2)

@@ -8,15 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.noise import NoiseParameters
-from calib.robot import Robot
-from offline.chain import Chain, chains_of
-from offline.factors import State
-from offline.graph import Graph
-from offline.odometry import WheelTrack
-from offline.run_tags import Positions, TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.chain import Chain, chains_of
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.odometry import WheelTrack
+from groundsbot.offline.run_tags import Positions, TagKey
 from tests.made_drives import FAMILY, START_NS, S, made_robot, made_run
 
 ROAD_M: Final = 25.0

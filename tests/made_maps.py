@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.fit_results import AlignmentResult, MeasurementResult
-from offline.parameter_results import CalibrationResult, CheckResult, MetreResult
-from offline.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
-from offline.truth import TrueRun, Truth
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.fit_results import AlignmentResult, MeasurementResult
+from groundsbot.offline.parameter_results import CalibrationResult, CheckResult, MetreResult
+from groundsbot.offline.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
+from groundsbot.offline.truth import TrueRun, Truth
 
 STEP_NS = 100_000_001  # so that stamps do not fit into a float of seconds
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import Message
 
-from onboard.log_head import log_head
-from onboard.log_reader import read_log
-from onboard.log_writer import LogWriter
-from onboard.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log_head import log_head
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
 from tests.made_drives import FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
 
 TAGS = [

@@ -14,17 +14,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.board import DEFAULT_BOARD
-from calib.camera_model import CameraModel
-from fixtures.board_picture import BoardPainter, drawn_views
-from fixtures.calibration import true_tag_sizes_m
-from fixtures.devices import PictureFolder, PtyPort, wheel_line
-from fixtures.encoder_sim import Controller
-from fixtures.render import Renderer
-from fixtures.scene import tags_of
-from fixtures.session import Options, Picture, Session, prepare
-from fixtures.textures import ByteArray
-from fixtures.world import World, load_world
+from groundsbot.calib.board import DEFAULT_BOARD
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.fixtures.board_picture import BoardPainter, drawn_views
+from groundsbot.fixtures.calibration import true_tag_sizes_m
+from groundsbot.fixtures.devices import PictureFolder, PtyPort, wheel_line
+from groundsbot.fixtures.encoder_sim import Controller
+from groundsbot.fixtures.render import Renderer
+from groundsbot.fixtures.scene import tags_of
+from groundsbot.fixtures.session import Options, Picture, Session, prepare
+from groundsbot.fixtures.textures import ByteArray
+from groundsbot.fixtures.world import World, load_world
 from tests.board_views import good_views
 
 _NS_PER_S = 1_000_000_000

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.noise import NoiseParameters
-from fixtures.calibration import nominal_robot
-from fixtures.simulate import simulate
-from fixtures.world import Noise, load_world
-from offline.pipeline import build_map
-from offline.result import MapResult
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.fixtures.calibration import nominal_robot
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.fixtures.world import Noise, load_world
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
 from tests.benchmarks.accuracy import (
     METHODS,
     Drives,

@@ -4,18 +4,18 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from calib.board import DEFAULT_BOARD
-from calib.board_finder import BoardFinder
-from calib.board_finder import View as FoundView
-from calib.camera_model import CameraModel
-from calib.corner_fit import fitted_corners
-from calib.corner_surroundings import RADIUS_PX, Surroundings, bends
-from calib.intrinsics import calibrated
-from calib.lens_parameters import parameters_of
-from calib.projection_uncertainty import rms_px
-from fixtures.board_picture import BoardPainter, corners_of, drawn_views
-from fixtures.world import Pictures
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.board import DEFAULT_BOARD
+from groundsbot.calib.board_finder import BoardFinder
+from groundsbot.calib.board_finder import View as FoundView
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.corner_fit import fitted_corners
+from groundsbot.calib.corner_surroundings import RADIUS_PX, Surroundings, bends
+from groundsbot.calib.intrinsics import calibrated
+from groundsbot.calib.lens_parameters import parameters_of
+from groundsbot.calib.projection_uncertainty import rms_px
+from groundsbot.fixtures.board_picture import BoardPainter, corners_of, drawn_views
+from groundsbot.fixtures.world import Pictures
 from tests.board_cases import FISHEYE, NARROW, RATIONAL, taken_views
 
 FINDER = BoardFinder(DEFAULT_BOARD)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import CalibError
-from calib.files import folder_written_whole, written_whole
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.files import folder_written_whole, written_whole
 
 
 def spoilt(file: Path) -> None:

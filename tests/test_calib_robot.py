@@ -10,8 +10,8 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from calib.errors import CalibError
-from calib.robot import (
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.robot import (
     Devices,
     Mount,
     RecorderOptions,
@@ -22,7 +22,7 @@ from calib.robot import (
     read_robot_yaml,
     write_robot_yaml,
 )
-from calib.yaml_file import parse_mapping, validated
+from groundsbot.calib.yaml_file import parse_mapping, validated
 
 DOCUMENTATION = Path(__file__).parents[1] / "docs" / "robot_yaml.md"
 SECTIONS: dict[str, type[BaseModel]] = {

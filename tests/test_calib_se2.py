@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from calib import se2
-from calib.arrays import FloatArray
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
 
 PI = np.pi
 # At zero, where series take over from closed forms (0.5), and around half a turn.

@@ -8,16 +8,16 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from calib.errors import CalibError
-from calib.robot import TagFamily
-from calib.tag_family import families, family_size, tag_bits
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.robot import TagFamily
+from groundsbot.calib.tag_family import families, family_size, tag_bits
 
 # Detectors crash when they are taken down, so each lives in a process that leaves without doing so.
 READ_BACK = """
 import json, os, sys
 import numpy as np
 from pupil_apriltags import Detector
-from calib.tag_family import family_size, tag_bits
+from groundsbot.calib.tag_family import family_size, tag_bits
 
 family, cell, top, left = sys.argv[1], 10, 40, 50
 detector = Detector(families=family, nthreads=1, quad_decimate=1.0)

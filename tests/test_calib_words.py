@@ -1,6 +1,6 @@
 """Numbers in sentences."""
 
-from calib.words import counted
+from groundsbot.calib.words import counted
 
 
 def test_one_is_no_plural() -> None:

@@ -21,8 +21,8 @@ import yaml
 from markdown_it import MarkdownIt
 from typer.main import get_command
 
-import fixtures.world
-from calib.robot import write_robot_yaml
+import groundsbot.fixtures.world
+from groundsbot.calib.robot import write_robot_yaml
 from tests.made_bags import BagOfLog
 from tests.made_drives import START_NS, MadeTag, S, made_drive, made_robot, write_drive
 from tests.tag_pictures import draw_tag
@@ -31,10 +31,10 @@ from tests.test_robot_page import blocks as blocks_of_robot_setup
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAMS = {
-    "groundsbot-calib": "calib.cli",
-    "groundsbot-onboard": "onboard.cli",
-    "groundsbot-offline": "offline.cli",
-    "python -m fixtures": "fixtures.__main__",
+    "groundsbot-calib": "groundsbot.calib.cli",
+    "groundsbot-onboard": "groundsbot.onboard.cli",
+    "groundsbot-offline": "groundsbot.offline.cli",
+    "python -m fixtures": "groundsbot.fixtures.__main__",
 }
 # What is no command of ours is neither run nor parsed.
 NOT_OURS = {
@@ -174,11 +174,11 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (hallway / "odom.csv").write_text("".join(f"{i + 1},0.10,0.10\n" for i in range(40)))
     rows = [f"{i + 1},{tag},{3.0 - 0.024 * i:.3f},{tag - 1.0:.3f},0\n" for i in range(0, 40, 4) for tag in range(3)]
     (hallway / "landmarks.csv").write_text("".join(rows))
-    small = fixtures.world.load_world("room").model_dump(mode="json", exclude_none=True)
+    small = groundsbot.fixtures.world.load_world("room").model_dump(mode="json", exclude_none=True)
     (folder / "worlds").mkdir()
     (folder / "worlds" / "nsh.yaml").write_text(yaml.safe_dump(small))
     places = SimpleNamespace(files=lambda _package: folder / "worlds", as_file=resources.as_file)
-    monkeypatch.setattr(fixtures.world, "resources", places)
+    monkeypatch.setattr(groundsbot.fixtures.world, "resources", places)
 
 
 def run_elsewhere(page: str, text: str) -> bool:

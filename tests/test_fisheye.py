@@ -5,8 +5,8 @@ from pathlib import Path
 
 from scipy.stats import chi2
 
-from fixtures.simulate import simulate
-from fixtures.world import load_world
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.fixtures.world import load_world
 from tests.programs import Run
 
 FISHEYE = {

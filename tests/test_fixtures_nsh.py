@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from fixtures.calibration import nominal_robot, true_tag_sizes_m
-from fixtures.render import Renderer
-from fixtures.scene import tags_of
-from fixtures.session import Options, Picture, Session, prepare
-from fixtures.visibility import sightings
-from fixtures.world import World, load_world
-from onboard.tag_detector import TagDetector
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.fixtures.calibration import nominal_robot, true_tag_sizes_m
+from groundsbot.fixtures.render import Renderer
+from groundsbot.fixtures.scene import tags_of
+from groundsbot.fixtures.session import Options, Picture, Session, prepare
+from groundsbot.fixtures.visibility import sightings
+from groundsbot.fixtures.world import World, load_world
+from groundsbot.onboard.tag_detector import TagDetector
 
 SEEDS = range(3)
 ROBOTS = ("hallway", "loop")

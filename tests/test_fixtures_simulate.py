@@ -12,17 +12,17 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.robot import read_robot_yaml
-from calib.tag_edges import moved_out
-from calib.wheels import advance
-from fixtures.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
-from fixtures.errors import FixturesError
-from fixtures.simulate import simulate
-from fixtures.world import World, load_world
-from onboard.log_reader import read_log
-from onboard.messages import TagDetections, WheelEncoders
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.robot import read_robot_yaml
+from groundsbot.calib.tag_edges import moved_out
+from groundsbot.calib.wheels import advance
+from groundsbot.fixtures.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
+from groundsbot.fixtures.errors import FixturesError
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.fixtures.world import World, load_world
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.messages import TagDetections, WheelEncoders
 from tests.programs import on_terminal
 
 

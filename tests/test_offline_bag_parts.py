@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.camera_file import write_camera_yaml
-from calib.errors import GroundsbotError
-from calib.robot import Mount, write_robot_yaml
-from offline.bag_frames import FixedFrames, mount_of
-from offline.bag_import import import_bag
-from offline.bag_pictures import picture_of
-from offline.bag_positions import planar_covariance
-from offline.bag_reader import BagTopic, open_bag
-from offline.bag_tags import Sighting, read_look
-from offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
-from offline.import_robot import ImportOptions
-from offline.imported_run import ImportReport
-from offline.run import Run, load_run
-from offline.run_tags import TagKey
+from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.robot import Mount, write_robot_yaml
+from groundsbot.offline.bag_frames import FixedFrames, mount_of
+from groundsbot.offline.bag_import import import_bag
+from groundsbot.offline.bag_pictures import picture_of
+from groundsbot.offline.bag_positions import planar_covariance
+from groundsbot.offline.bag_reader import BagTopic, open_bag
+from groundsbot.offline.bag_tags import Sighting, read_look
+from groundsbot.offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
+from groundsbot.offline.import_robot import ImportOptions
+from groundsbot.offline.imported_run import ImportReport
+from groundsbot.offline.run import Run, load_run
+from groundsbot.offline.run_tags import TagKey
 from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
 from tests.made_drives import CAMERA as LENS
 from tests.made_drives import HALL, PINHOLE, made_drive, made_robot, write_drive

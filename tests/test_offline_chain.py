@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from calib.arrays import IntArray
-from calib.noise import NoiseParameters
-from offline.chain import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, Chain, chains_of
-from offline.odometry import WheelTrack
-from offline.run_tags import TagKey
+from groundsbot.calib.arrays import IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, Chain, chains_of
+from groundsbot.offline.odometry import WheelTrack
+from groundsbot.offline.run_tags import TagKey
 from tests.made_drives import FAMILY, START_NS, MadeDrive, S, made_drive, made_positions, made_run
 
 NOISE = NoiseParameters()

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from calib.tag_edges import outward
-from offline.corner_factors import CornerFactors, SpatialState
-from offline.corner_sides import facing_as_predicted
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.tag_edges import outward
+from groundsbot.offline.corner_factors import CornerFactors, SpatialState
+from groundsbot.offline.corner_sides import facing_as_predicted
 from tests.test_offline_corner_factors import CAMERAS, made_factors, made_state
 
 

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from fixtures.simulate import simulate
-from offline.corner_graph import corner_graph
-from offline.corner_solver import solve_corners
-from offline.pipeline import build_map, read_runs
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline.corner_graph import corner_graph
+from groundsbot.offline.corner_solver import solve_corners
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 
 
 def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part(tmp_path: Path) -> None:

@@ -10,35 +10,35 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from calib.tag_edges import outward
-from fixtures.simulate import TRUTH_FILE, simulate
-from offline import corner_map
-from offline.arrowhead_build import compiled_motions
-from offline.corner_factors import SpatialState
-from offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
-from offline.corner_graph import corner_graph
-from offline.corner_map import refine
-from offline.corner_noise import refined_bias_px
-from offline.corner_problem import CornerProblem
-from offline.corner_sides import facing_as_predicted
-from offline.corner_solver import CornerSolution, solve_corners
-from offline.corner_start import hung_otherwise, tags_rehung
-from offline.edges import edges_of
-from offline.evaluation import evaluate
-from offline.global_map import component_of
-from offline.graph import Graph
-from offline.map_io import read_map, write_map
-from offline.map_model import MapModel
-from offline.pipeline import build_map, read_runs
-from offline.result import FloorSigmas, MapResult
-from offline.run import Run, load_run
-from offline.run_tags import Detections
-from offline.truth import read_truth
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.tag_edges import outward
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.offline import corner_map
+from groundsbot.offline.arrowhead_build import compiled_motions
+from groundsbot.offline.corner_factors import SpatialState
+from groundsbot.offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
+from groundsbot.offline.corner_graph import corner_graph
+from groundsbot.offline.corner_map import refine
+from groundsbot.offline.corner_noise import refined_bias_px
+from groundsbot.offline.corner_problem import CornerProblem
+from groundsbot.offline.corner_sides import facing_as_predicted
+from groundsbot.offline.corner_solver import CornerSolution, solve_corners
+from groundsbot.offline.corner_start import hung_otherwise, tags_rehung
+from groundsbot.offline.edges import edges_of
+from groundsbot.offline.evaluation import evaluate
+from groundsbot.offline.global_map import component_of
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.map_io import read_map, write_map
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import FloorSigmas, MapResult
+from groundsbot.offline.run import Run, load_run
+from groundsbot.offline.run_tags import Detections
+from groundsbot.offline.truth import read_truth
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
 from tests.programs import Run as Program
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from calib.tag_edges import moved_out
-from offline.map_model import MapModel
-from offline.parameter_results import CalibrationResult
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run, load_run
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.tag_edges import moved_out
+from groundsbot.offline.map_model import MapModel
+from groundsbot.offline.parameter_results import CalibrationResult
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run, load_run
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 
 START = [0.5, 2.0, 0.0]

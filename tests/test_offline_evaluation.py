@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.evaluation import aligned, evaluate
-from offline.result import Component
-from offline.truth import TrueRun, Truth, read_truth
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation import aligned, evaluate
+from groundsbot.offline.result import Component
+from groundsbot.offline.truth import TrueRun, Truth, read_truth
 from tests.made_maps import STEP_NS, made_component, made_map, made_truth
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import offline
-from calib.noise import NoiseParameters
-from offline.kept import arrays_of, chain_from
-from offline.map_io import read_map, write_map
-from offline.measured import TapeOptions
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run
+import groundsbot
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.kept import arrays_of, chain_from
+from groundsbot.offline.map_io import read_map, write_map
+from groundsbot.offline.measured import TapeOptions
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
 from tests.made_drives import HALL, MadeTag, made_drive, made_robot, write_drive
 from tests.programs import Run as Program
 
@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def runs_of(folder: Path, names: str) -> list[Run]:
-    return [offline.load_run(folder / "logs" / name / "one") for name in names]
+    return [groundsbot.load_run(folder / "logs" / name / "one") for name in names]
 
 
 def test_it_is_the_joint_solve_of_all_runs(folder: Path) -> None:
@@ -84,7 +84,7 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
     known = read_map(folder / "map")
 
     def told(**changed: object) -> str:
-        with pytest.raises(offline.GroundsbotError) as caught:
+        with pytest.raises(groundsbot.GroundsbotError) as caught:
             build_map(**{"runs": runs_of(folder, "c"), "extending": known} | changed)  # type: ignore[arg-type]
         return str(caught.value)
 

@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline import goodness, pipeline
-from offline.chain import Chain, chains_of
-from offline.covariance_parts import CovarianceParts
-from offline.effort import Effort
-from offline.goodness import Goodness, fitted_windows, in_windows
-from offline.graph import build_graph
-from offline.local_map import LocalMap, solve_local_map
-from offline.run_tags import TagKey
-from offline.solver import Solution, solve
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline import goodness, pipeline
+from groundsbot.offline.chain import Chain, chains_of
+from groundsbot.offline.covariance_parts import CovarianceParts
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.goodness import Goodness, fitted_windows, in_windows
+from groundsbot.offline.graph import build_graph
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution, solve
 from tests.made_drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
 from tests.made_long_drives import made_long_drive, with_a_moved_tag
 

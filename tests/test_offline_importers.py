@@ -11,14 +11,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib import se2, wheels
-from calib.errors import GroundsbotError
-from calib.robot import parse_robot_yaml
-from offline.import_forms import WheelScale, read_odometry
-from offline.import_robot import ImportOptions
-from offline.importers import import_folder
-from onboard.log_reader import read_log
-from onboard.message_decoder import LogMessage
+from groundsbot.calib import se2, wheels
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.offline.import_forms import WheelScale, read_odometry
+from groundsbot.offline.import_robot import ImportOptions
+from groundsbot.offline.importers import import_folder
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.message_decoder import LogMessage
 from tests.made_imports import (
     OBSERVATIONS,
     ODOMETRY,

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import GroundsbotError
-from offline.csv_table import read_table
-from offline.import_robot import ImportOptions
-from offline.importers import import_folder
-from onboard.log_writer import LogWriter
-from onboard.messages import PlanarOdometry
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.offline.csv_table import read_table
+from groundsbot.offline.import_robot import ImportOptions
+from groundsbot.offline.importers import import_folder
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.messages import PlanarOdometry
 from tests.made_imports import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, imported
 
 BAD_ODOMETRY = [

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import GroundsbotError
-from calib.robot import Robot, Wheels
-from offline.info import LogInfo, describe_log
-from onboard.log_writer import LogWriter
-from onboard.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.robot import Robot, Wheels
+from groundsbot.offline.info import LogInfo, describe_log
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
 
 MS = 1_000_000
 ROBOT = Robot(

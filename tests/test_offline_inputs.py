@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from offline.errors import OfflineError
-from offline.inputs import ALONE, Inputs, size_bytes
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.inputs import ALONE, Inputs, size_bytes
 
 
 def test_drives_that_were_driven_may_be_any_number() -> None:

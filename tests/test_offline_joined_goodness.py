@@ -5,15 +5,15 @@ from functools import cache
 
 import pytest
 
-from calib.noise import NoiseParameters
-from offline.global_map import solve_global_map
-from offline.goodness import Goodness, fitted_windows
-from offline.joined_goodness import joined_goodness
-from offline.local_map import LocalMap, solve_local_map
-from offline.merge import merge
-from offline.run_noise import fit_and_weigh
-from offline.solver import Solution
-from offline.stages import Stages
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.global_map import solve_global_map
+from groundsbot.offline.goodness import Goodness, fitted_windows
+from groundsbot.offline.joined_goodness import joined_goodness
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.merge import merge
+from groundsbot.offline.run_noise import fit_and_weigh
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.stages import Stages
 from tests.made_moves import CLEAN, MOVED, made_scene
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from offline.factors import Columns, Linearised, State, stacked, whitening
-from offline.measured_factors import KnownPlaces
-from offline.solver import PLAIN_SQUARES, Problem, solve
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.factors import Columns, Linearised, State, stacked, whitening
+from groundsbot.offline.measured_factors import KnownPlaces
+from groundsbot.offline.solver import PLAIN_SQUARES, Problem, solve
 from tests.made_graphs import made_graph, with_measured
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import offline
+import groundsbot
 from tests.made_drives import HALL, made_drive, made_robot, write_drive
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "library.md"
@@ -45,18 +45,18 @@ def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.C
 
 
 def test_the_library_gives_what_the_command_does(recordings: Path) -> None:
-    from offline.map_command import MapOptions, make_map
+    from groundsbot.offline.map_command import MapOptions, make_map
 
-    logs = offline.find_logs([recordings])
-    by_hand = offline.build_map([offline.load_run(log) for log in logs])
+    logs = groundsbot.find_logs([recordings])
+    by_hand = groundsbot.build_map([groundsbot.load_run(log) for log in logs])
     by_command, _ = make_map(MapOptions(logs, recordings.parent / "map"))
     np.testing.assert_array_equal(by_hand.components[0].joint_covariance, by_command.components[0].joint_covariance)
 
 
 def test_every_name_is_there_and_others_are_not() -> None:
-    for name in offline.__all__:
-        assert getattr(offline, name).__name__ == name
-    assert not hasattr(offline, "build_maps")
+    for name in groundsbot.__all__:
+        assert getattr(groundsbot, name).__name__ == name
+    assert not hasattr(groundsbot, "build_maps")
 
 
 def test_importing_it_loads_nothing_heavy() -> None:

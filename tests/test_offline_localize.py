@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import offline
-from calib import se2
-from calib.arrays import FloatArray
-from offline.localizing import localize
-from offline.map_io import read_map, write_map
-from offline.result import Component, MapResult
-from offline.run import Run
-from offline.run_tags import TagKey
+import groundsbot
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.localizing import localize
+from groundsbot.offline.map_io import read_map, write_map
+from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import TagKey
 from tests.made_drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Run as Program
 
@@ -43,7 +43,7 @@ def run_of(
 @pytest.fixture(scope="module")
 def known() -> MapResult:
     """Of two drives past all tags."""
-    return offline.build_map([run_of("a", (1, 2, 3, 4)), run_of("b", (3, 4, 5, 6, 1))])
+    return groundsbot.build_map([run_of("a", (1, 2, 3, 4)), run_of("b", (3, 4, 5, 6, 1))])
 
 
 def sigmas_off(estimate: FloatArray, covariance: FloatArray, true: FloatArray) -> float:
@@ -61,7 +61,7 @@ def test_the_trajectory_is_that_of_the_joint_solve_but_for_what_the_run_tells_of
     true = made_drive(STARTS["c"], LEGS, step_ns=100_000_000).at(located.stamps_ns)
     for k in (0, -1):
         assert sigmas_off(located.T_map_base[k], located.covariance[k], true[k]) < 4.0
-    joint = offline.build_map([run], extending=known).components[0].runs[2]
+    joint = groundsbot.build_map([run], extending=known).components[0].runs[2]
     sigma = np.sqrt(np.diag(located.covariance[0]))
     # The joint solve is the same estimate: the map's runs enter it whole, here condensed to their tags.
     assert (np.abs(joint.T_map_start - located.T_map_base[0]) < 0.05 * sigma).all()
@@ -136,14 +136,14 @@ def with_second_places(known: MapResult, places: dict[int, tuple[float, float]])
 )
 def test_a_run_that_cannot_be_placed_is_refused(known: MapResult, tags: tuple[int, ...], told: str) -> None:
     places = {7: (3.0, 2.0), 8: (2.0, 3.0)}
-    with pytest.raises(offline.GroundsbotError) as caught:
+    with pytest.raises(groundsbot.GroundsbotError) as caught:
         localize(run_of("c", tags, places), known, Path("map"))
     assert told in str(caught.value)
 
 
 def test_tags_that_all_lie_otherwise_are_the_wrong_map(known: MapResult) -> None:
     otherwise = {1: (0.0, 0.0), 2: (3.0, 3.0), 4: (6.0, -1.0)}
-    with pytest.raises(offline.GroundsbotError, match="no two of them lie the same way in both maps"):
+    with pytest.raises(groundsbot.GroundsbotError, match="no two of them lie the same way in both maps"):
         localize(run_of("c", (1, 2, 4), otherwise), known)
 
 
@@ -156,7 +156,7 @@ def test_a_map_of_two_components_is_looked_through(known: MapResult) -> None:
     told = localize(run_of("c", (1, 2, 4)), twice).not_located[0]
     assert "in component 0 and tags 1, 2, 4 in component 1" in told.reason
     assert localize(run_of("c", (1, 2, 4)), twice, component=1).is_located
-    with pytest.raises(offline.GroundsbotError, match=r"--component 2: .* has 2 components, 0 to 1"):
+    with pytest.raises(groundsbot.GroundsbotError, match=r"--component 2: .* has 2 components, 0 to 1"):
         localize(run_of("c", (1, 2, 4)), twice, Path("map"), component=2)
 
 
@@ -177,7 +177,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
         drive = made_drive(start, [(0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)], step_ns=50_000_000)
         logs[name] = write_drive(folder / "logs", drive, TAGS, made_robot(name), corner_sigma_px=0.2)
     (folder / "map").mkdir()
-    write_map(offline.build_map([offline.load_run(logs[name]) for name in "ab"]), folder / "map")
+    write_map(groundsbot.build_map([groundsbot.load_run(logs[name]) for name in "ab"]), folder / "map")
     return folder
 
 

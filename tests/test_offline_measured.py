@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.factors import Columns, State, whitening
-from offline.measured import (
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.factors import Columns, State, whitening
+from groundsbot.offline.measured import (
     MeasuredDistance,
     Measurements,
     TapeOptions,
@@ -15,8 +15,8 @@ from offline.measured import (
     parse_measurements,
     parse_start,
 )
-from offline.measured_factors import DistanceFactors, StartFactors
-from offline.run_tags import TagKey
+from groundsbot.offline.measured_factors import DistanceFactors, StartFactors
+from groundsbot.offline.run_tags import TagKey
 
 RUNS = ("a_one", "b_one", "c=d_one")
 TAGS = (TagKey("tag36h11", 7), TagKey("tag25h9", 7), TagKey("tag36h11", 8))

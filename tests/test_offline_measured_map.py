@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from calib.robot import Robot
-from offline.errors import OfflineError
-from offline.measured import TapeOptions
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run
-from offline.run_tags import TagKey
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.measured import TapeOptions
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.stages import Stages
 from tests.made_drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Outcome
 from tests.programs import Run as Program

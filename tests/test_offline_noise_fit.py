@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.noise import NoiseParameters
-from fixtures.simulate import simulate
-from offline import noise_fit
-from offline.chain import Chain, chains_of
-from offline.local_map import LocalMap, solve_local_map
-from offline.odometry import ODOMETRY_NOISE
-from offline.pipeline import build_map, read_runs
-from offline.run import load_run
-from offline.run_noise import NOT_NEEDED, fit_and_weigh, weighed_as
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline import noise_fit
+from groundsbot.offline.chain import Chain, chains_of
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.odometry import ODOMETRY_NOISE
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.run import load_run
+from groundsbot.offline.run_noise import NOT_NEEDED, fit_and_weigh, weighed_as
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.noise_study import Mapped, study_seed, summary
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 

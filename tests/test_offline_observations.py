@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.errors import GroundsbotError
-from calib.noise import NoiseParameters
-from calib.robot import Robot
-from calib.tag_edges import moved_out
-from offline.corner_noise import refined_bias_px
-from offline.observations import check_tag_sizes, read_detections, read_positions
-from offline.readings import Readings
-from offline.run import Run
-from offline.run_tags import Detections, Positions, TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot
+from groundsbot.calib.tag_edges import moved_out
+from groundsbot.offline.corner_noise import refined_bias_px
+from groundsbot.offline.observations import check_tag_sizes, read_detections, read_positions
+from groundsbot.offline.readings import Readings
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, Positions, TagKey
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, seen_corners_px
 
 NOISE = NoiseParameters()

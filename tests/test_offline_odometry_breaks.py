@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import se2
-from offline.grown_parts import Grown
-from offline.local_map import solve_local_map
-from offline.odometry import WheelTrack
-from offline.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run_tags import TagKey
+from groundsbot.calib import se2
+from groundsbot.offline.grown_parts import Grown
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.odometry import WheelTrack
+from groundsbot.offline.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run_tags import TagKey
 from tests.benchmarks.breaks_study import broken_drive, outcome_of, summary
 from tests.made_breaks import made_clean_drive
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import offline
-from offline.chain import Chain
-from offline.errors import OfflineError
-from offline.localization import LocatedRun
-from offline.localizing import localize_maps
-from offline.online_drive import TagReading
-from offline.online_localizer import OnlineLocalizer
+import groundsbot
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.localization import LocatedRun
+from groundsbot.offline.localizing import localize_maps
+from groundsbot.offline.online_drive import TagReading
+from groundsbot.offline.online_localizer import OnlineLocalizer
 from tests.benchmarks.localize_study import Scene, against, filtered, judged, made_scene, missed, taken_one_by_one
 
 
@@ -116,7 +116,7 @@ def test_readings_that_are_no_numbers_and_components_that_are_not_there_are_refu
     online = OnlineLocalizer(scene.known, robot)
     with pytest.raises(OfflineError, match="holds no numbers"):
         online.add_reading(TagReading("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
-    with pytest.raises(offline.GroundsbotError, match="component 1: the map has 1"):
+    with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has 1"):
         OnlineLocalizer(scene.known, robot, component=1)
 
 

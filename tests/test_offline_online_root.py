@@ -6,18 +6,18 @@ from itertools import repeat
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline import online_root
-from offline.factors import State, stacked
-from offline.graph import Graph, build_graph, unheld
-from offline.online_drive import Table
-from offline.online_localizer import OnlineLocalizer
-from offline.online_prior import OnlinePrior
-from offline.online_root import OnlineRoot
-from offline.online_turn import Known, pose_among, turned
-from offline.run_tags import TagKey
-from offline.solver import HUBER_THRESHOLD
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline import online_root
+from groundsbot.offline.factors import State, stacked
+from groundsbot.offline.graph import Graph, build_graph, unheld
+from groundsbot.offline.online_drive import Table
+from groundsbot.offline.online_localizer import OnlineLocalizer
+from groundsbot.offline.online_prior import OnlinePrior
+from groundsbot.offline.online_root import OnlineRoot
+from groundsbot.offline.online_turn import Known, pose_among, turned
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import HUBER_THRESHOLD
 from tests.benchmarks.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one
 
 

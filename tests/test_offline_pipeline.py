@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World, load_world
-from offline.chain import chains_of
-from offline.errors import OfflineError
-from offline.evaluation import evaluate
-from offline.local_map import solve_local_map
-from offline.pipeline import build_map, read_runs
-from offline.result import Component, MapResult
-from offline.run import load_run
-from offline.truth import read_truth
-from onboard.log_reader import find_logs, read_log
-from onboard.messages import TagDetections
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World, load_world
+from groundsbot.offline.chain import chains_of
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation import evaluate
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.run import load_run
+from groundsbot.offline.truth import read_truth
+from groundsbot.onboard.log_reader import find_logs, read_log
+from groundsbot.onboard.messages import TagDetections
 from tests.benchmarks.accuracy_study import medians, missed_bounds, run_study, study_seed
 from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, made_run, write_drive
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from calib import se2
-from calib.camera_file import write_camera_yaml
-from calib.errors import GroundsbotError
-from calib.robot import write_robot_yaml
-from calib.tag_edges import outward
-from offline.run import RobotFile, load_run, read_robot_file
-from offline.run_tags import TagKey
-from offline.stretches import wheel_distances
-from onboard.log_head import log_head
-from onboard.log_writer import LogWriter
-from onboard.messages import (
+from groundsbot.calib import se2
+from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.robot import write_robot_yaml
+from groundsbot.calib.tag_edges import outward
+from groundsbot.offline.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.stretches import wheel_distances
+from groundsbot.onboard.log_head import log_head
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.messages import (
     CameraCalibration,
     PlanarOdometry,
     RunInfo,

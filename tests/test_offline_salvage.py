@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import GroundsbotError
-from offline.errors import OfflineError
-from offline.new_log import new_log
-from offline.salvage import salvage
-from onboard.errors import LogError
-from onboard.log_writer import LogWriter
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.new_log import new_log
+from groundsbot.offline.salvage import salvage
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_writer import LogWriter
 from tests.made_logs import drive, write_log
 
 

@@ -8,29 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera_file import read_camera_yaml
-from calib.noise import NoiseParameters
-from calib.robot import Robot, read_robot_yaml, write_robot_yaml
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import load_world
-from offline.chain import chains_of
-from offline.corner_factors import FOCAL_SCALE
-from offline.effort import Effort
-from offline.errors import OfflineError
-from offline.graph import TAG_SCALE, Parameter, parameters_of_wheels
-from offline.local_map import solve_local_map
-from offline.map_io import read_map, write_map
-from offline.odometry import WHEEL_PARAMETERS
-from offline.parameter_results import CalibrationChoice
-from offline.pipeline import build_map, read_runs
-from offline.result import MapResult
-from offline.run import RobotFile, load_run, read_robot_file
-from offline.self_calibration_gate import TELLS_LESS, Told, choose
-from offline.self_calibration_option import NAMES, Calibrate, parse_calibrate
-from offline.self_calibration_robot import LIMITS, Learnt, Owned, all_open, corrected, opened
-from offline.self_calibration_told import told_by
-from offline.self_calibration_words import DRIVES, freed_lines
-from onboard.log_reader import find_logs
+from groundsbot.calib.camera_file import read_camera_yaml
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot import Robot, read_robot_yaml, write_robot_yaml
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import load_world
+from groundsbot.offline.chain import chains_of
+from groundsbot.offline.corner_factors import FOCAL_SCALE
+from groundsbot.offline.effort import Effort
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.graph import TAG_SCALE, Parameter, parameters_of_wheels
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.map_io import read_map, write_map
+from groundsbot.offline.odometry import WHEEL_PARAMETERS
+from groundsbot.offline.parameter_results import CalibrationChoice
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.self_calibration_gate import TELLS_LESS, Told, choose
+from groundsbot.offline.self_calibration_option import NAMES, Calibrate, parse_calibrate
+from groundsbot.offline.self_calibration_robot import LIMITS, Learnt, Owned, all_open, corrected, opened
+from groundsbot.offline.self_calibration_told import told_by
+from groundsbot.offline.self_calibration_words import DRIVES, freed_lines
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.accuracy import with_wide_priors
 from tests.made_drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
 from tests.programs import Run as Program

@@ -5,18 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from offline.factors import State
-from offline.goodness import fitted_windows, in_windows
-from offline.graph import Graph, build_graph
-from offline.measured_factors import DistanceFactors, Measured, StartFactors
-from offline.shared_errors import SharedErrors, fit_shared_errors
-from offline.solver import PLAIN_SQUARES, solve
-from tests.made_long_drives import (
-    LongDrive,
-    made_long_drive,
-    with_a_moved_tag,
-    with_drifting_readings,
-)
+from groundsbot.offline.factors import State
+from groundsbot.offline.goodness import fitted_windows, in_windows
+from groundsbot.offline.graph import Graph, build_graph
+from groundsbot.offline.measured_factors import DistanceFactors, Measured, StartFactors
+from groundsbot.offline.shared_errors import SharedErrors, fit_shared_errors
+from groundsbot.offline.solver import PLAIN_SQUARES, solve
+from tests.made_long_drives import LongDrive, made_long_drive, with_a_moved_tag, with_drifting_readings
 
 LENGTH_M = 500.0
 SIGMAS = 1.5

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import se2, wheels
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.chain import chains_of
-from offline.factors import OdometryFactors, State
-from offline.local_map import LocalMap, solve_local_map
-from offline.odometry import WheelTrack, chained
-from offline.robust import cauchy, losses_and_weights
-from offline.run_tags import TagKey
-from offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
+from groundsbot.calib import se2, wheels
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import chains_of
+from groundsbot.offline.factors import OdometryFactors, State
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.odometry import WheelTrack, chained
+from groundsbot.offline.robust import cauchy, losses_and_weights
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, START_NS, made_positions, made_robot, made_run
 from tests.made_problems import CHAINS, N_TAGS, made_problem, random_state

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World
-from offline.evaluation import evaluate
-from offline.pipeline import build_map, read_runs
-from offline.result import Component
-from offline.run import load_run
-from offline.truth import read_truth
-from onboard.log_reader import find_logs
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World
+from groundsbot.offline.evaluation import evaluate
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import Component
+from groundsbot.offline.run import load_run
+from groundsbot.offline.truth import read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.made_drives import MadeDrive, MadeTag, made_drive, made_robot, write_drive
 
 HALL = [

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.arrowhead import Arrowhead
-from offline.factors import State
-from offline.graph import build_graph
-from offline.solver import PLAIN_SQUARES, solve
-from offline.step_taken import Before, take_step
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.arrowhead import Arrowhead
+from groundsbot.offline.factors import State
+from groundsbot.offline.graph import build_graph
+from groundsbot.offline.solver import PLAIN_SQUARES, solve
+from groundsbot.offline.step_taken import Before, take_step
 from tests.made_graphs import made_graph
 from tests.made_long_drives import made_long_drive
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from offline.errors import OfflineError
-from offline.result import Component, MapResult, TagResult
-from offline.survey import SurveyEntry, judge_survey, read_survey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.result import Component, MapResult, TagResult
+from groundsbot.offline.survey import SurveyEntry, judge_survey, read_survey
 from tests.made_maps import made_component, made_map
 
 _N_TAGS = 15

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import BoolArray, FloatArray
-from calib.camera_model import CameraModel
-from calib.robot import Robot
-from offline.observations import MAX_RANGE_SIGMA_PER_M
-from offline.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.calib.arrays import BoolArray, FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.observations import MAX_RANGE_SIGMA_PER_M
+from groundsbot.offline.tag_pose import TagReadings, general_readings, upright_readings
 from tests.made_drives import CAMERA, MadeTag, made_robot, seen_corners_px
 
 SIGMA_PX = 0.2
@@ -54,7 +54,7 @@ def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAM
 
 
 def used(found: TagReadings) -> BoolArray:
-    """As offline.observations gates the range."""
+    """As groundsbot.offline.observations gates the range."""
     gate = (MAX_RANGE_SIGMA_PER_M * found.range_bearing[:, 0]) ** 2
     return np.asarray(found.valid & (found.covariance[:, 0, 0] < gate))
 

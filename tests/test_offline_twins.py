@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from calib.arrays import IntArray
-from calib.noise import NoiseParameters
-from offline.chain import chains_of
-from offline.local_map import LocalMap, solve_local_map
-from offline.pipeline import build_map
-from offline.run import Run
-from offline.run_tags import Detections, TagKey
-from offline.suspects import split_alone
-from offline.twins import told_apart
+from groundsbot.calib.arrays import IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import chains_of
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.run import Run
+from groundsbot.offline.run_tags import Detections, TagKey
+from groundsbot.offline.suspects import split_alone
+from groundsbot.offline.twins import told_apart
 from tests.made_drives import (
     CAMERA,
     FAMILY,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calib.arrays import FloatArray
-from offline.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
-from offline.variance_look import Components, Part
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
+from groundsbot.offline.variance_look import Components, Part
 from tests.made_problems import MadeProblem, made_problem
 
 _NOISE = 0.7

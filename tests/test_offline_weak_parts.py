@@ -10,21 +10,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.errors import GroundsbotError
-from calib.noise import NoiseParameters
-from offline.chain import Chain, chains_of
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
-from offline.graph import Graph, build_graph
-from offline.import_robot import ImportOptions
-from offline.importers import import_folder
-from offline.map_json import map_as_json
-from offline.pipeline import build_map, read_runs
-from offline.result import MapResult
-from offline.run_tags import TagKey
-from offline.solver import PLAIN_SQUARES, Problem, Solution, solve
-from offline.weak_parts import weak_parts
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain, chains_of
+from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.graph import Graph, build_graph
+from groundsbot.offline.import_robot import ImportOptions
+from groundsbot.offline.importers import import_folder
+from groundsbot.offline.map_json import map_as_json
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import PLAIN_SQUARES, Problem, Solution, solve
+from groundsbot.offline.weak_parts import weak_parts
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, MadeDrive, made_drive, made_positions, made_robot, made_run
 from tests.made_graphs import made_graph, with_measured

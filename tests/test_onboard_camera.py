@@ -8,21 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.picture_bytes import is_jpeg
-from onboard.camera import (
-    Camera,
-    CameraEndedError,
-    CameraLostError,
-    CameraSettings,
-    VideoCamera,
-    camera_for,
-)
-from onboard.clock import RunClock
-from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
-from onboard.errors import OnboardError
-from onboard.messages import StampSource
-from onboard.picture_folder import FolderCamera
-from onboard.v4l2_camera import V4l2Camera
+from groundsbot.calib.picture_bytes import is_jpeg
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, VideoCamera, camera_for
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.messages import StampSource
+from groundsbot.onboard.picture_folder import FolderCamera
+from groundsbot.onboard.v4l2_camera import V4l2Camera
 from tests.fake_capture import FakeCapture
 from tests.live_recording import has_ended
 from tests.tag_pictures import draw_tag

@@ -18,17 +18,17 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from calib.board import DEFAULT_BOARD
-from fixtures.devices import PictureFolder
-from onboard import cli
-from onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
-from onboard.capture import Capture
-from onboard.capture_guide import Advice, CaptureGuide
-from onboard.capture_view import CaptureView
-from onboard.clock import RunClock
-from onboard.detection_process import Picture
-from onboard.errors import OnboardError
-from onboard.messages import StampSource
+from groundsbot.calib.board import DEFAULT_BOARD
+from groundsbot.fixtures.devices import PictureFolder
+from groundsbot.onboard import cli
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
+from groundsbot.onboard.capture import Capture
+from groundsbot.onboard.capture_guide import Advice, CaptureGuide
+from groundsbot.onboard.capture_view import CaptureView
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.messages import StampSource
 from tests.board_views import good_views, rendered
 from tests.live_recording import PATIENCE_S, until
 from tests.programs import running
@@ -223,7 +223,7 @@ def test_a_camera_that_falls_silent_is_not_waited_for_forever(tmp_path: Path, mo
         def read(self, timeout_s: float) -> list[Frame]:
             return []
 
-    monkeypatch.setattr("onboard.capture._SILENT_NS", 50 * MS)
+    monkeypatch.setattr("groundsbot.onboard.capture._SILENT_NS", 50 * MS)
     camera = Silent([])
     guide, said = CaptureGuide(DEFAULT_BOARD, 3), list[object]()
     capture = Capture(
@@ -269,7 +269,7 @@ devices: {camera: camera}
 def program(folder: Path, *options: str) -> Iterator["subprocess.Popen[str]"]:
     """`groundsbot-onboard capture` of a robot whose camera is a folder; it has no calibration yet."""
     (folder / "robot.yaml").write_text(ROBOT)
-    command = [sys.executable, "-m", "onboard.cli", "capture", "--robot", str(folder / "robot.yaml")]
+    command = [sys.executable, "-m", "groundsbot.onboard.cli", "capture", "--robot", str(folder / "robot.yaml")]
     command += ["--output", str(folder / "pictures"), *options]
     with running(command) as process:
         yield process

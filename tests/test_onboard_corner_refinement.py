@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.arrays import FloatArray
-from calib.camera_model import CameraModel
-from onboard.corner_refinement import refined_corners
-from onboard.tag_detector import TagDetector
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.onboard.corner_refinement import refined_corners
+from groundsbot.onboard.tag_detector import TagDetector
 from tests.benchmarks.corner_error_study import CASES, Case, Errors, pictures_of, study_case
 from tests.tag_pictures import draw_tag
 

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from onboard import detection_process
-from onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
-from onboard.tag_detector import TagDetector
+from groundsbot.onboard import detection_process
+from groundsbot.onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
+from groundsbot.onboard.tag_detector import TagDetector
 from tests.live_recording import has_ended, tag_jpeg, until
 
 LIMIT_S = 60.0  # only what hangs comes near

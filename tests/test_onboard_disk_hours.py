@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from calib.robot import parse_robot_yaml
-from onboard import check
-from onboard.camera import Camera, CameraEndedError, CameraSettings, Frame
-from onboard.clock import RunClock
-from onboard.disk_hours import Load, hours_until_full
-from onboard.disk_room import DiskRoom, space_policy
-from onboard.encoder_protocol import WheelLine, format_line
-from onboard.log_keeper import LogKeeper
-from onboard.log_segments import SegmentLimits
-from onboard.log_thread import _PERIOD_S
-from onboard.messages import StampSource
-from onboard.recorder import RecorderCore, Run
-from onboard.robot_files import RobotFiles
-from onboard.status import Look, Rates
-from onboard.storage import Disk
-from onboard.tag_detector import Detection
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.onboard import check
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraSettings, Frame
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.disk_hours import Load, hours_until_full
+from groundsbot.onboard.disk_room import DiskRoom, space_policy
+from groundsbot.onboard.encoder_protocol import WheelLine, format_line
+from groundsbot.onboard.log_keeper import LogKeeper
+from groundsbot.onboard.log_segments import SegmentLimits
+from groundsbot.onboard.log_thread import _PERIOD_S
+from groundsbot.onboard.messages import StampSource
+from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.onboard.robot_files import RobotFiles
+from groundsbot.onboard.status import Look, Rates
+from groundsbot.onboard.storage import Disk
+from groundsbot.onboard.tag_detector import Detection
 from tests.live_recording import robot_yaml
 from tests.made_cores import CAMERA, MS, ROBOT_YAML, START_NS, S
 

@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from onboard.encoder_protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, WheelUnwrapper, crc16, format_line
+from groundsbot.onboard.encoder_protocol import (
+    LINE_LIMIT_BYTES,
+    EncoderParser,
+    WheelLine,
+    WheelUnwrapper,
+    crc16,
+    format_line,
+)
 
 LINES = st.builds(
     WheelLine,

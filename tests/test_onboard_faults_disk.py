@@ -10,25 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onboard import log_thread as log_thread_module
-from onboard.disk_room import one_recorder
-from onboard.errors import LogError, OnboardError
-from onboard.log_keeper import LogKeeper
-from onboard.log_reader import read_log
-from onboard.log_segments import SegmentLimits
-from onboard.log_thread import LogThread
+from groundsbot.onboard import log_thread as log_thread_module
+from groundsbot.onboard.disk_room import one_recorder
+from groundsbot.onboard.errors import LogError, OnboardError
+from groundsbot.onboard.log_keeper import LogKeeper
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.log_segments import SegmentLimits
+from groundsbot.onboard.log_thread import LogThread
 from tests.fake_disks import MortalDisk, TroubledDisk
-from tests.kept_logs import (
-    CORE,
-    LIMIT_S,
-    S,
-    make_keeper,
-    names,
-    record,
-    seen_in,
-    stepped,
-    texts,
-)
+from tests.kept_logs import CORE, LIMIT_S, S, make_keeper, names, record, seen_in, stepped, texts
 from tests.made_logs import MS, START_NS, drive, picture_entry, read_all, seen, wheel_entry, write_log
 
 

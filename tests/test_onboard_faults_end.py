@@ -16,10 +16,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from fixtures.devices import PictureFolder, PtyPort, paced, wheel_line
-from onboard.errors import OnboardError
-from onboard.log_reader import find_logs, read_log
-from onboard.status import read_status
+from groundsbot.fixtures.devices import PictureFolder, PtyPort, paced, wheel_line
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log_reader import find_logs, read_log
+from groundsbot.onboard.status import read_status
 from tests.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
 from tests.made_cores import frames_of, wheels_of
 from tests.processor_wait import ended_within
@@ -38,8 +38,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Devices that never come back from a read, and a detection that never answers.
 BLOCKED = """
 import os, signal, time
-from onboard.encoder_port import EncoderPort
-from onboard.picture_folder import FolderCamera
+from groundsbot.onboard.encoder_port import EncoderPort
+from groundsbot.onboard.picture_folder import FolderCamera
 from functools import partial
 from onboard import live_recorder
 reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}
@@ -79,7 +79,7 @@ def recorder(
     environment: Mapping[str, str] | None = None,
 ) -> AbstractContextManager["subprocess.Popen[str]"]:
     """`groundsbot-onboard record` as a process of its own, working in `folder`."""
-    program = f"import sys\n{TOLD_BY_SIGNALS}\n{before}\nfrom onboard.cli import main\nmain()"
+    program = f"import sys\n{TOLD_BY_SIGNALS}\n{before}\nfrom groundsbot.onboard.cli import main\nmain()"
     command = [sys.executable, "-c", program, "record", "--robot", str(robot), "--output", "logs"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **(environment or {})}
     return running(command, folder=folder, stdout=stdout, environment=environment, own_group=True)

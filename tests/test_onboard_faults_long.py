@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from fixtures.devices import PictureFolder
-from onboard.clock import RunClock
-from onboard.encoder_protocol import WheelLine, format_line
-from onboard.messages import StampSource
-from onboard.picture_folder import FolderCamera
+from groundsbot.fixtures.devices import PictureFolder
+from groundsbot.onboard.clock import RunClock
+from groundsbot.onboard.encoder_protocol import WheelLine, format_line
+from groundsbot.onboard.messages import StampSource
+from groundsbot.onboard.picture_folder import FolderCamera
 from tests.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.made_cores import MS, START_NS, S, made_core
 

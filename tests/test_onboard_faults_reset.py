@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se2
-from calib.robot import Wheels
-from fixtures import recording as simulated
-from fixtures.drive import Drive
-from fixtures.encoder_sim import Controller, TimedLine
-from fixtures.simulate import simulate
-from fixtures.world import Waypoint, World, load_world
-from offline.run import load_run
-from onboard.encoder_protocol import format_line, parse_line
-from onboard.log_reader import find_logs
-from onboard.messages import EventKind
+from groundsbot.calib import se2
+from groundsbot.calib.robot import Wheels
+from groundsbot.fixtures import recording as simulated
+from groundsbot.fixtures.drive import Drive
+from groundsbot.fixtures.encoder_sim import Controller, TimedLine
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.fixtures.world import Waypoint, World, load_world
+from groundsbot.offline.run import load_run
+from groundsbot.onboard.encoder_protocol import format_line, parse_line
+from groundsbot.onboard.log_reader import find_logs
+from groundsbot.onboard.messages import EventKind
 from tests.made_cores import PERIOD_NS, START_NS, S, events_of, line_of, made_core, send, wheels_of
 from tests.programs import Run
 

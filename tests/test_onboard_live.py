@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fixtures.devices import PtyPort, paced, wheel_line
-from onboard.log_reader import find_logs, read_log, read_run_info
-from onboard.messages import Event, TagDetections, WheelEncoders
-from onboard.picture_schedule import PictureSchedule
+from groundsbot.fixtures.devices import PtyPort, paced, wheel_line
+from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.messages import Event, TagDetections, WheelEncoders
+from groundsbot.onboard.picture_schedule import PictureSchedule
 from tests.live_recording import CORNERS, PATIENCE_S, PATIENT, robot_yaml
 from tests.made_cores import frames_of, wheels_of
 from tests.programs import running
@@ -34,7 +34,7 @@ def send(port: PtyPort, index: int) -> int | None:
 
 
 def program(*arguments: str | Path, before: str = "") -> AbstractContextManager["subprocess.Popen[str]"]:
-    return running([sys.executable, "-c", f"{before}\nfrom onboard.cli import main\nmain()", *arguments])
+    return running([sys.executable, "-c", f"{before}\nfrom groundsbot.onboard.cli import main\nmain()", *arguments])
 
 
 def wait_for(output: IO[str] | None, *words: str) -> list[str]:

@@ -12,14 +12,14 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from calib.camera_model import CameraModel
-from calib.robot import Mount, parse_robot_yaml
-from onboard.errors import LogError, MessageRefusedError
-from onboard.log_head import camera_from_message, log_head, mount_message
-from onboard.log_reader import find_logs, read_log, read_run_info
-from onboard.log_writer import LogWriter
-from onboard.message_decoder import LogMessage
-from onboard.messages import (
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import Mount, parse_robot_yaml
+from groundsbot.onboard.errors import LogError, MessageRefusedError
+from groundsbot.onboard.log_head import camera_from_message, log_head, mount_message
+from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.onboard.messages import (
     CameraCalibration,
     ClockAnchor,
     CompressedImage,

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from onboard.disk_room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
-from onboard.errors import OnboardError
-from onboard.log_keeper import LogKeeper
-from onboard.log_segments import LogSegments, SegmentLimits
-from onboard.log_thread import LogThread
-from onboard.log_writer import head_records
-from onboard.storage import Disk
+from groundsbot.onboard.disk_room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log_keeper import LogKeeper
+from groundsbot.onboard.log_segments import LogSegments, SegmentLimits
+from groundsbot.onboard.log_thread import LogThread
+from groundsbot.onboard.log_writer import head_records
+from groundsbot.onboard.storage import Disk
 from tests.fake_disks import TroubledDisk
 from tests.kept_logs import LIMIT_S, MB, S, make_keeper, seen_in, texts
 from tests.live_recording import until

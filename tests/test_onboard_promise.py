@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from calib.robot import parse_robot_yaml
-from onboard import log_thread
-from onboard.disk_room import DiskRoom, SpacePolicy
-from onboard.encoder_protocol import format_line
-from onboard.errors import LogError
-from onboard.log_keeper import LogKeeper
-from onboard.log_segments import SegmentLimits
-from onboard.log_thread import LogThread
-from onboard.messages import StampSource, TagDetections, WheelEncoders
-from onboard.recorder import RecorderCore, Run
-from onboard.storage import StoredFile
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.onboard import log_thread
+from groundsbot.onboard.disk_room import DiskRoom, SpacePolicy
+from groundsbot.onboard.encoder_protocol import format_line
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_keeper import LogKeeper
+from groundsbot.onboard.log_segments import SegmentLimits
+from groundsbot.onboard.log_thread import LogThread
+from groundsbot.onboard.messages import StampSource, TagDetections, WheelEncoders
+from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.onboard.storage import StoredFile
 from tests.fake_disks import MortalDisk
 from tests.made_cores import CAMERA, ROBOT_YAML, START_NS, UPTIME_NS, line_of
 from tests.made_logs import MS, read_all

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera_model import CameraModel
-from calib.robot import parse_robot_yaml
-from onboard.encoder_protocol import WheelLine, format_line
-from onboard.errors import LogError
-from onboard.log_reader import read_log
-from onboard.messages import Event, EventKind, StampSource, TagDetections
-from onboard.recorder import RecorderCore, Run
-from onboard.tag_detector import Detection
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.onboard.encoder_protocol import WheelLine, format_line
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.messages import Event, EventKind, StampSource, TagDetections
+from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.onboard.tag_detector import Detection
 
 ROBOT_YAML = """
 robot_id: gb1

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from offline.cli import app
-from onboard.log_reader import find_logs, read_run_info
+from groundsbot.offline.cli import app
+from groundsbot.onboard.log_reader import find_logs, read_run_info
 from tests.recordings import RECORDINGS, needs_recordings
 
 ROOT = Path(__file__).parents[1]

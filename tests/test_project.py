@@ -12,29 +12,29 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf", "reportlab")
 COMMANDS = [
-    ("calib.cli",),
-    ("calib.cli", "board"),
-    ("calib.cli", "tags"),
-    ("calib.cli", "camera"),
-    ("calib.cli", "check"),
-    ("onboard.cli",),
-    ("onboard.cli", "record"),
-    ("onboard.cli", "check"),
-    ("onboard.cli", "capture"),
-    ("onboard.cli", "status"),
-    ("offline.cli",),
-    ("offline.cli", "map"),
-    ("offline.cli", "calibrate"),
-    ("offline.cli", "localize"),
-    ("offline.cli", "import"),
-    ("offline.cli", "info"),
-    ("offline.cli", "salvage"),
-    ("offline.cli", "detect"),
-    ("offline.cli", "compare"),
-    ("offline.cli", "export"),
-    ("fixtures.__main__",),
-    ("fixtures.__main__", "simulate"),
-    ("fixtures.__main__", "demo"),
+    ("groundsbot.calib.cli",),
+    ("groundsbot.calib.cli", "board"),
+    ("groundsbot.calib.cli", "tags"),
+    ("groundsbot.calib.cli", "camera"),
+    ("groundsbot.calib.cli", "check"),
+    ("groundsbot.onboard.cli",),
+    ("groundsbot.onboard.cli", "record"),
+    ("groundsbot.onboard.cli", "check"),
+    ("groundsbot.onboard.cli", "capture"),
+    ("groundsbot.onboard.cli", "status"),
+    ("groundsbot.offline.cli",),
+    ("groundsbot.offline.cli", "map"),
+    ("groundsbot.offline.cli", "calibrate"),
+    ("groundsbot.offline.cli", "localize"),
+    ("groundsbot.offline.cli", "import"),
+    ("groundsbot.offline.cli", "info"),
+    ("groundsbot.offline.cli", "salvage"),
+    ("groundsbot.offline.cli", "detect"),
+    ("groundsbot.offline.cli", "compare"),
+    ("groundsbot.offline.cli", "export"),
+    ("groundsbot.fixtures.__main__",),
+    ("groundsbot.fixtures.__main__", "simulate"),
+    ("groundsbot.fixtures.__main__", "demo"),
 ]
 
 
@@ -60,7 +60,10 @@ sys.exit("; ".join(wrong) or None)
     assert found.returncode == 0, found.stderr
 
 
-@pytest.mark.parametrize("module", ["calib.cli", "onboard.cli", "offline.cli", "fixtures.__main__"])
+@pytest.mark.parametrize(
+    "module",
+    ["groundsbot.calib.cli", "groundsbot.onboard.cli", "groundsbot.offline.cli", "groundsbot.fixtures.__main__"],
+)
 def test_version_is_that_of_the_distribution(
     module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,18 +75,18 @@ def test_version_is_that_of_the_distribution(
 
 
 def test_every_command_is_among_those_whose_help_is_tested() -> None:
-    from calib.cli import app as calib_app
-    from fixtures.__main__ import app as fixtures_app
-    from offline.cli import app as offline_app
-    from onboard.cli import app as onboard_app
+    from groundsbot.calib.cli import app as calib_app
+    from groundsbot.fixtures.__main__ import app as fixtures_app
+    from groundsbot.offline.cli import app as offline_app
+    from groundsbot.onboard.cli import app as onboard_app
 
     registered = {
         (module, command.name or (command.callback.__name__ if command.callback else ""))
         for module, app in (
-            ("calib.cli", calib_app),
-            ("onboard.cli", onboard_app),
-            ("offline.cli", offline_app),
-            ("fixtures.__main__", fixtures_app),
+            ("groundsbot.calib.cli", calib_app),
+            ("groundsbot.onboard.cli", onboard_app),
+            ("groundsbot.offline.cli", offline_app),
+            ("groundsbot.fixtures.__main__", fixtures_app),
         )
         for command in app.registered_commands
     }
@@ -106,7 +109,7 @@ def test_simulate_works_from_an_installed_wheel_in_an_empty_folder(tmp_path: Pat
     simulate = [sys.executable, "-m", "fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render"]
     _run([*simulate, "--output", "logs"], empty, installed)
     assert (empty / "logs" / "truth.json").is_file()
-    _run([sys.executable, "-m", "offline.cli", "map", "logs", "-o", "map"], empty, installed)
+    _run([sys.executable, "-m", "groundsbot.offline.cli", "map", "logs", "-o", "map"], empty, installed)
     assert (empty / "map" / "tags.csv").read_text().startswith("tag_id,")
 
 

@@ -13,14 +13,14 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-from calib.camera_file import read_camera_yaml
+from groundsbot.calib.camera_file import read_camera_yaml
 from tests.simulated_robot import SimulatedRobot
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "robot_setup.md"
 PROGRAMS = {
-    "groundsbot-calib": "calib.cli",
-    "groundsbot-onboard": "onboard.cli",
-    "groundsbot-offline": "offline.cli",
+    "groundsbot-calib": "groundsbot.calib.cli",
+    "groundsbot-onboard": "groundsbot.onboard.cli",
+    "groundsbot-offline": "groundsbot.offline.cli",
 }
 CAPTURE, CHECK, RECORD, STATUS = (("groundsbot-onboard", word) for word in ("capture", "check", "record", "status"))
 FILES = {"yaml": "robot.yaml", "csv": "survey.csv"}

@@ -3,9 +3,9 @@
 import random
 from itertools import pairwise
 
-from onboard import clock, encoder_protocol, wheel_intake
-from onboard.encoder_protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
-from onboard.wheel_intake import StampedReading, WheelIntake
+from groundsbot.onboard import clock, encoder_protocol, wheel_intake
+from groundsbot.onboard.encoder_protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
+from groundsbot.onboard.wheel_intake import StampedReading, WheelIntake
 
 MODULES = [str(module.__file__) for module in (encoder_protocol, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))

@@ -7,10 +7,10 @@ from pathlib import Path
 import typer
 from typer.testing import CliRunner
 
-from calib.cli import app as calib
-from fixtures.__main__ import app as fixtures
-from offline.cli import app as offline
-from onboard.cli import app as onboard
+from groundsbot.calib.cli import app as calib
+from groundsbot.fixtures.__main__ import app as fixtures
+from groundsbot.offline.cli import app as offline
+from groundsbot.onboard.cli import app as onboard
 
 PAGE = Path(__file__).resolve().parent.parent / "commands.md"
 PROGRAMS = {

@@ -24,15 +24,15 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from calib.files import written_whole
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World, load_world
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run, load_run
-from offline.self_calibration_option import Calibrate
-from offline.truth import Truth, read_truth
-from onboard.log_reader import find_logs
+from groundsbot.calib.files import written_whole
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World, load_world
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run, load_run
+from groundsbot.offline.self_calibration_option import Calibrate
+from groundsbot.offline.truth import Truth, read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.baselines import dead_reckoning, paper_scheme
 from tests.benchmarks.command_line import exit_code, say, seeds_of

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World
-from offline.evaluation import evaluate
-from offline.pipeline import build_map, read_runs
-from offline.result import MapResult
-from offline.truth import Truth, read_truth
-from onboard.log_reader import find_logs
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World
+from groundsbot.offline.evaluation import evaluate
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.truth import Truth, read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 
 # Medians over seeds. With the calibration drawn the paper's own figure is 1.8 %.

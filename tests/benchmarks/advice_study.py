@@ -20,21 +20,21 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.advice import Candidates, candidates_of, judged, known_of
-from offline.advice_passes import Pass, most_length_m
-from offline.advice_tags import Place, is_in_view, place_beside
-from offline.chain import Chain
-from offline.global_map import solve_global_map
-from offline.graph import Graph, build_graph
-from offline.local_map import LocalMap, solve_local_map
-from offline.merge import merge
-from offline.readings import joined
-from offline.run_tags import TagKey
-from offline.solver import Solution
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.advice import Candidates, candidates_of, judged, known_of
+from groundsbot.offline.advice_passes import Pass, most_length_m
+from groundsbot.offline.advice_tags import Place, is_in_view, place_beside
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.global_map import solve_global_map
+from groundsbot.offline.graph import Graph, build_graph
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.merge import merge
+from groundsbot.offline.readings import joined
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.solver import Solution
+from groundsbot.offline.stages import Stages
 from tests.benchmarks.command_line import say, seeds_of
 from tests.made_drives import FAMILY
 from tests.made_long_drives import READ_SHARE, SIGMA_READING, LongDrive, made_long_drive, made_town

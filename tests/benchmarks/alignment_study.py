@@ -22,14 +22,14 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import BoolArray, FloatArray, IntArray
-from calib.noise import NoiseParameters
-from offline.alignment import Alignment, align
-from offline.alignment_rivals import GROUP_MARGIN
-from offline.condensed import CondensedMap, condense
-from offline.local_map import solve_local_map
-from offline.run_tags import TagKey
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.alignment import Alignment, align
+from groundsbot.offline.alignment_rivals import GROUP_MARGIN
+from groundsbot.offline.condensed import CondensedMap, condense
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.run_tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import Town, made_long_drive, made_town
 

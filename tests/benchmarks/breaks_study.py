@@ -21,16 +21,16 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from offline.alignment import align, fit_transform
-from offline.condensed import condense
-from offline.global_map import solve_global_map
-from offline.grown_parts import FALSE_ALARM
-from offline.local_map import LocalMap, solve_local_map
-from offline.merge import merge
-from offline.odometry_breaks import split_where_broken
-from offline.solver import solve
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.offline.alignment import align, fit_transform
+from groundsbot.offline.condensed import condense
+from groundsbot.offline.global_map import solve_global_map
+from groundsbot.offline.grown_parts import FALSE_ALARM
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.merge import merge
+from groundsbot.offline.odometry_breaks import split_where_broken
+from groundsbot.offline.solver import solve
+from groundsbot.offline.stages import Stages
 from tests.benchmarks.command_line import seeds_of
 from tests.made_breaks import BrokenDrive, carried, made_clean_drive, slipped
 

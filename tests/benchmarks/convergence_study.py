@@ -18,11 +18,11 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from offline.goodness import fitted_windows
-from offline.graph import build_graph
-from offline.local_map import solve_local_map
-from offline.solver import Solution, solve
+from groundsbot.calib import se2
+from groundsbot.offline.goodness import fitted_windows
+from groundsbot.offline.graph import build_graph
+from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.solver import Solution, solve
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import made_long_drive
 

@@ -18,17 +18,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from calib.files import written_whole
-from fixtures.simulate import simulate
-from offline.corner_floor import guessed_wobble
-from offline.corner_graph import corner_graph
-from offline.corner_map import refine
-from offline.corner_solver import solve_corners
-from offline.pipeline import build_map, read_runs
-from offline.run import Run
-from offline.stages import Stages
-from offline.workings import Workings
-from onboard.log_reader import find_logs
+from groundsbot.calib.files import written_whole
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline.corner_floor import guessed_wobble
+from groundsbot.offline.corner_graph import corner_graph
+from groundsbot.offline.corner_map import refine
+from groundsbot.offline.corner_solver import solve_corners
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.run import Run
+from groundsbot.offline.stages import Stages
+from groundsbot.offline.workings import Workings
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT
 from tests.benchmarks.stages_bench import SOLVE

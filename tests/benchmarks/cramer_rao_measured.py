@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import FloatArray, IntArray
-from calib.camera_model import CameraModel
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.camera_model import CameraModel
 
 ComplexArray = NDArray[np.complex128]
 
@@ -33,7 +33,7 @@ _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigmas, as `calib.noise` and docs/worlds.md have them."""
+    """Sigmas, as `groundsbot.calib.noise` and docs/worlds.md have them."""
 
     distance_m_per_sqrt_m: float
     lateral_m_per_sqrt_m: float

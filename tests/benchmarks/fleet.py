@@ -22,10 +22,10 @@ from typing import Any, Final
 
 import yaml
 
-from calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
-from calib.files import written_whole
-from offline.map_command import stage_lines
-from offline.stages import StageCost
+from groundsbot.calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from groundsbot.calib.files import written_whole
+from groundsbot.offline.map_command import stage_lines
+from groundsbot.offline.stages import StageCost
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet_world import MOST_TAGS, fleet_world
 
@@ -116,7 +116,7 @@ def _n_messages(logs: Path) -> int:
 
 def _offline(*arguments: str) -> Any:  # whatever the command prints as JSON
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "offline.cli", *arguments]
+    command = [sys.executable, "-m", "groundsbot.offline.cli", *arguments]
     done = subprocess.run(command, cwd=ROOT, env=environment, check=False, stdout=subprocess.PIPE)
     if done.returncode not in (EXIT_DONE, EXIT_WITH_LOSSES):
         raise subprocess.CalledProcessError(done.returncode, command)

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib import se2
-from calib.noise import NoiseParameters
-from offline.corner_map import refine
-from offline.factors import State
-from offline.global_map import component_of
-from offline.graph import Graph
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run
-from offline.solver import solve
-from offline.truth import Truth
-from offline.workings import Workings
+from groundsbot.calib import se2
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.corner_map import refine
+from groundsbot.offline.factors import State
+from groundsbot.offline.global_map import component_of
+from groundsbot.offline.graph import Graph
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run
+from groundsbot.offline.solver import solve
+from groundsbot.offline.truth import Truth
+from groundsbot.offline.workings import Workings
 
 
 def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParameters = NoiseParameters()) -> MapResult:

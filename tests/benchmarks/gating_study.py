@@ -18,13 +18,13 @@ from typing import Final
 
 import numpy as np
 
-from calib.noise import NoiseParameters
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World
-from offline.pipeline import build_map, read_runs
-from offline.self_calibration_option import Calibrate
-from offline.truth import read_truth
-from onboard.log_reader import find_logs
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.self_calibration_option import Calibrate
+from groundsbot.offline.truth import read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.accuracy import study_worlds
 from tests.benchmarks.accuracy_study import figures_of
 from tests.benchmarks.command_line import say, seeds_of

@@ -31,21 +31,21 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.chain import Chain
-from offline.errors import OfflineError
-from offline.global_map import component_of, solve_global_map
-from offline.kept_maps import kept_of, local_map_of
-from offline.local_map import LocalMap, solve_local_map
-from offline.localization import LocatedRun
-from offline.localizing import localize_maps
-from offline.merge import merge
-from offline.online_drive import TagReading
-from offline.online_localizer import OnlineLocalizer
-from offline.result import Component, MapResult
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.chain import Chain
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.global_map import component_of, solve_global_map
+from groundsbot.offline.kept_maps import kept_of, local_map_of
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.localization import LocatedRun
+from groundsbot.offline.localizing import localize_maps
+from groundsbot.offline.merge import merge
+from groundsbot.offline.online_drive import TagReading
+from groundsbot.offline.online_localizer import OnlineLocalizer
+from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.stages import Stages
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 

@@ -38,7 +38,7 @@ def say(text: str) -> None:
 def _timed() -> float:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "offline.cli", "map", str(LOGS), "-o", str(Path(folder) / "map")]
+        command = [sys.executable, "-m", "groundsbot.offline.cli", "map", str(LOGS), "-o", str(Path(folder) / "map")]
         began = time.perf_counter()
         subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
         return time.perf_counter() - began

@@ -17,15 +17,15 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray
-from calib.noise import NoiseParameters
-from offline.global_map import solve_global_map
-from offline.local_map import LocalMap, solve_local_map
-from offline.merge import merge
-from offline.merge_report import merge_warnings
-from offline.run_tags import TagKey
-from offline.stages import Stages
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.offline.global_map import solve_global_map
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.merge import merge
+from groundsbot.offline.merge_report import merge_warnings
+from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.stages import Stages
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town
 

@@ -4,10 +4,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from calib.arrays import FloatArray
-from offline.factors import Linearised, State, stacked
-from offline.robust import SQUARES, Loss, losses_and_weights
-from offline.solver import PLAIN_SQUARES, Losses, Problem
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.offline.factors import Linearised, State, stacked
+from groundsbot.offline.robust import SQUARES, Loss, losses_and_weights
+from groundsbot.offline.solver import PLAIN_SQUARES, Losses, Problem
 
 _MAX_ITERATIONS = 100
 

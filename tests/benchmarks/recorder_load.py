@@ -25,11 +25,11 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from calib.camera_file import write_camera_yaml
-from calib.camera_model import CameraModel
-from fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
-from onboard.log_reader import find_logs, read_log, read_run_info
-from onboard.messages import TagDetections, WheelEncoders
+from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.camera_model import CameraModel
+from groundsbot.fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
+from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.messages import TagDetections, WheelEncoders
 from tests.tag_pictures import draw_tag
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
@@ -172,7 +172,7 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     ]
     for each in devices:
         each.start()
-    command = [sys.executable, "-m", "onboard.cli", "record", "--robot", str(_robot(load, folder))]
+    command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
     with subprocess.Popen([*command, "--output", str(folder / "logs")], stdout=subprocess.PIPE, text=True) as recorder:
         try:
             assert recorder.stdout is not None

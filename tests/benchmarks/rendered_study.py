@@ -21,11 +21,11 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from fixtures.simulate import TRUTH_FILE, simulate
-from fixtures.world import World
-from offline.pipeline import build_map, read_runs
-from offline.truth import read_truth
-from onboard.log_reader import find_logs
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.world import World
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.truth import read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.command_line import say, seeds_of
 

@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from calib import se2
-from calib.arrays import FloatArray, IntArray
-from offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
-from offline.odometry import chained
-from offline.solver import Problem
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
+from groundsbot.offline.odometry import chained
+from groundsbot.offline.solver import Problem
 
 ROAD_M: Final = 6.0
 STEP_M: Final = 0.25

@@ -13,12 +13,12 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from calib.files import written_whole
-from fixtures.simulate import TRUTH_FILE, simulate
-from offline.pipeline import build_map, read_runs
-from offline.run import Run
-from offline.stages import Stages
-from onboard.log_reader import find_logs
+from groundsbot.calib.files import written_whole
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.run import Run
+from groundsbot.offline.stages import Stages
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT, simulated_fleet
 

@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from calib import se2
-from calib.arrays import FloatArray
-from fixtures.simulate import TRUTH_FILE, simulate
-from offline.pipeline import build_map
-from offline.result import MapResult
-from offline.run import Run, load_run
-from offline.run_tags import Detections
-from offline.truth import Truth, read_truth
-from onboard.log_reader import find_logs
+from groundsbot.calib import se2
+from groundsbot.calib.arrays import FloatArray
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.offline.pipeline import build_map
+from groundsbot.offline.result import MapResult
+from groundsbot.offline.run import Run, load_run
+from groundsbot.offline.run_tags import Detections
+from groundsbot.offline.truth import Truth, read_truth
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.command_line import seeds_of
 
 _LEAST_LOOKS = 5

@@ -19,14 +19,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.files import written_whole
-from calib.noise import NoiseParameters
-from fixtures.simulate import simulate
-from offline import chain
-from offline.pipeline import build_map, read_runs
-from offline.result import Component
-from offline.run import Run
-from onboard.log_reader import find_logs
+from groundsbot.calib.files import written_whole
+from groundsbot.calib.noise import NoiseParameters
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline import chain
+from groundsbot.offline.pipeline import build_map, read_runs
+from groundsbot.offline.result import Component
+from groundsbot.offline.run import Run
+from groundsbot.onboard.log_reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT
 
