@@ -1,1 +1,1 @@
-"""The ground floor: frames, cameras, wheels and the robot's file."""
+"""Frames, cameras, boards, wheels and the robot's file: what every other package builds on."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from groundsbot.calib.command_line import EXIT_WITH_LOSSES, new_app, run
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES, new_app, run
 
 app = new_app("Prints calibration boards and tags, calibrates a camera, and tells whether a calibration still fits.")
 
@@ -31,7 +31,7 @@ def board(
     by the word that is printed on it.
     """
     from groundsbot.calib.board import MARKER_SHARE, Board
-    from groundsbot.calib.board_sheet import print_board
+    from groundsbot.calib.printing import print_board
 
     made = Board(columns, rows, square_mm, MARKER_SHARE * square_mm if marker_mm is None else marker_mm, dictionary)
     print_board(made, paper, output, overwrite)
@@ -52,9 +52,9 @@ def tags(
 
     A tag's size is the outer edge of its black border. The white margin belongs to the tag: cut outside of it.
     """
-    from groundsbot.calib.tag_ids import parse_tag_ids
-    from groundsbot.calib.tag_sheet import print_tags
-    from groundsbot.calib.words import counted
+    from groundsbot.calib.foundation import counted
+    from groundsbot.calib.printing import print_tags
+    from groundsbot.calib.tags import parse_tag_ids
 
     wanted = parse_tag_ids(ids, family)
     n_sheets = print_tags(family, wanted, size_mm, paper, output, packed, overwrite)
@@ -92,7 +92,7 @@ def camera(
 
     The page lies beside FILE as .html: how many pixels predictions may be off where, views, residuals, what is missing.
     """
-    from groundsbot.calib.camera_command import calibrate_camera
+    from groundsbot.calib.intrinsics import calibrate_camera
 
     for line in calibrate_camera(pictures, output, board, model, ruler_mm, name, most_views, overwrite):
         typer.echo(line)
@@ -108,7 +108,7 @@ def check(
 
     Exit code 0: it fits; 3: it does not any more.
     """
-    from groundsbot.calib.camera_command import check_camera
+    from groundsbot.calib.intrinsics import check_camera
 
     result = check_camera(camera, pictures, board)
     for line in result.lines:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
-from groundsbot.calib.command_line import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
+from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
 
 if TYPE_CHECKING:
-    from groundsbot.onboard.messages import Event
+    from groundsbot.onboard.log import Event
 
 PRIORITY = -10  # the recorder's among the processes of its computer, as `nice` counts
 KEPT_BYTES = 16 << 20  # free memory that stays with the recorder: several chunks of pictures on their way to the disk
@@ -40,14 +40,9 @@ def record(
     import os
     import sys
 
-    from groundsbot.onboard.console_lines import ConsoleLines
-    from groundsbot.onboard.ending import told_to_end
-    from groundsbot.onboard.housekeeping import Housekeeper
-    from groundsbot.onboard.live_recorder import LiveRecorder
-    from groundsbot.onboard.process_memory import keep_memory
-    from groundsbot.onboard.robot_files import RobotFiles
-    from groundsbot.onboard.status import STATUS_SUFFIX
-    from groundsbot.onboard.systemd import Notifier
+    from groundsbot.onboard.monitoring import STATUS_SUFFIX, Housekeeper
+    from groundsbot.onboard.process import ConsoleLines, Notifier, keep_memory, told_to_end
+    from groundsbot.onboard.recorder import LiveRecorder, RobotFiles
 
     stop = told_to_end()
     with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
@@ -93,8 +88,8 @@ def check(
 
     Exit code 1 if one fails.
     """
-    from groundsbot.onboard.check import check_robot
-    from groundsbot.onboard.robot_files import RobotFiles
+    from groundsbot.onboard.monitoring import check_robot
+    from groundsbot.onboard.recorder import RobotFiles
 
     failed = False
     for result in check_robot(RobotFiles(robot), output, picture or robot.with_name("check.jpg")):
@@ -132,12 +127,9 @@ def capture(
 
     from groundsbot.calib.board import parse_board
     from groundsbot.onboard.camera import camera_for
-    from groundsbot.onboard.capture import Capture, summary
-    from groundsbot.onboard.capture_guide import CaptureGuide
-    from groundsbot.onboard.capture_view import CaptureView
-    from groundsbot.onboard.clock import RunClock
-    from groundsbot.onboard.ending import told_to_end
-    from groundsbot.onboard.robot_files import capture_settings
+    from groundsbot.onboard.capture import Capture, CaptureGuide, CaptureView, summary
+    from groundsbot.onboard.process import RunClock, told_to_end
+    from groundsbot.onboard.recorder import capture_settings
 
     guide = CaptureGuide(parse_board(board), views)
     clock = RunClock()
@@ -169,8 +161,7 @@ def status(
     """
     from rich.console import Console
 
-    from groundsbot.onboard.status import is_alive
-    from groundsbot.onboard.status_view import print_once, show_live
+    from groundsbot.onboard.monitoring import is_alive, print_once, show_live
 
     console = Console()
     if not once and console.is_terminal:

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.board_finder import BoardFinder, View
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.board_picture import BoardPainter, Glare, drawn_views
-from groundsbot.fixtures.board_picture import View as Taken
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.finder import BoardFinder, View
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, Glare, drawn_views
+from groundsbot.fixtures.pictures.board_picture import View as Taken
 
 NARROW: Final = CameraModel(
     "narrow", 640, 480, 800.0, 801.0, 318.0, 243.0, "plumb_bob", (-0.1, 0.05, 0.0005, -0.0003, 0.0)

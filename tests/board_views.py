@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.board_picture import BoardPainter, View, corners_of
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of
 
 CAMERA = CameraModel("front", 640, 480, 500.0, 500.0, 318.0, 242.0, "plumb_bob", (-0.1, 0.03, 0.0, 0.0, 0.0))
 PLAIN = CameraModel("front", 640, 480, 500.0, 500.0, 319.5, 239.5, "plumb_bob", (0.0,) * 5)

@@ -16,7 +16,7 @@ from hypothesis import settings
 from tests.programs import Outcome, Run
 
 if TYPE_CHECKING:
-    from groundsbot.fixtures.devices import PtyPort
+    from groundsbot.fixtures.recording.devices import PtyPort
 
 # A busy machine must not fail a property test.
 settings.register_profile("groundsbot", deadline=None)
@@ -61,7 +61,7 @@ def _calling(
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """`groundsbot-offline ARGUMENTS`, as the program."""
     from groundsbot.offline import cli
-    from groundsbot.offline.jit import COMPILING
+    from groundsbot.offline.foundation.jit import COMPILING
 
     program = _calling(cli.main, "groundsbot-offline", monkeypatch, capsys)
 
@@ -86,7 +86,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def plug_in() -> Iterator[Callable[..., "PtyPort"]]:
     """`PtyPort(LINK, ...)`, unplugged after the test."""
-    from groundsbot.fixtures.devices import PtyPort
+    from groundsbot.fixtures.recording.devices import PtyPort
 
     with ExitStack() as ports:
 
@@ -101,7 +101,7 @@ def plug_in() -> Iterator[Callable[..., "PtyPort"]]:
 @pytest.fixture
 def signals_back() -> Iterator[None]:
     """Whatever `told_to_end` takes over is given back after the test, and its thread ends."""
-    from groundsbot.onboard.ending import ENDING_SIGNALS
+    from groundsbot.onboard.process.ending import ENDING_SIGNALS
 
     handlers = {each: signal.getsignal(each) for each in ENDING_SIGNALS}
     before = signal.set_wakeup_fd(-1)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.offline.map_command import MapOptions, make_map
+from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from tests.made_drives import HALL, made_drive, made_robot, write_drive
 
 TAGS = [HALL[i] for i in (0, 1, 2, 4, 6, 7)]

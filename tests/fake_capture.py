@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.onboard.camera import Camera, CameraSettings
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.v4l2_camera import V4l2Camera
+from groundsbot.onboard.camera.camera import Camera, CameraSettings
+from groundsbot.onboard.camera.v4l2 import V4l2Camera
+from groundsbot.onboard.process.clock import RunClock
 
 MJPG = float(cv2.VideoWriter.fourcc(*"MJPG"))
 _MS = 1_000_000

@@ -1,4 +1,4 @@
-"""Disks that fill up, fail, block and lose power, behind the seam of `groundsbot.onboard.storage`."""
+"""Disks that fill up, fail, block and lose power, behind the seam of `groundsbot.onboard.log.writing.storage`."""
 
 import errno
 import os
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.onboard.disk_room import BALLAST_BYTES
-from groundsbot.onboard.storage import Disk, StoredFile
+from groundsbot.onboard.log.writing.storage import Disk, StoredFile
+from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES
 
 PAGE_BYTES = 4096
 

@@ -17,7 +17,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 
-from groundsbot.offline.map_io import ARRAYS_FILE, JSON_FILE, write_map
+from groundsbot.offline.maps.files import ARRAYS_FILE, JSON_FILE, write_map
 from tests.hostile_folders import FOLDERS, RUN_FOLDERS
 from tests.hostile_logs import HOSTILE, yaml_bomb
 from tests.made_bags import STORE1, STORE2, Sent, header, made_message, write_bag

@@ -6,7 +6,14 @@ from typing import Final, TypedDict
 
 from mcap.records import Channel, Schema
 
-from groundsbot.onboard.messages import TOPICS, PlanarOdometry, RunInfo, TagObservation, TagObservations, WheelEncoders
+from groundsbot.onboard.log.messages import (
+    TOPICS,
+    PlanarOdometry,
+    RunInfo,
+    TagObservation,
+    TagObservations,
+    WheelEncoders,
+)
 from tests.hostile_logs import LIMIT_BYTES, MS, NUMBERS, bytes_of, chunk, log, message, observed
 from tests.made_logs import ROBOT_YAML, START_NS
 

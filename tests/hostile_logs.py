@@ -13,7 +13,7 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema, Statis
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from groundsbot.onboard.messages import (
+from groundsbot.onboard.log.messages import (
     TOPICS,
     CameraCalibration,
     CompressedImage,

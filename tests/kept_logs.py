@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from groundsbot.onboard.disk_room import DiskRoom, SpacePolicy
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_segments import SegmentLimits
-from groundsbot.onboard.storage import Storage
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.log.writing.storage import Storage
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
 from tests.made_logs import MS, START_NS, Entry, Seen, head, read_all
 
 S = 1000 * MS

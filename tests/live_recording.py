@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from groundsbot.calib.camera_file import write_camera_yaml
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.devices import PictureFolder, PtyPort, wheel_line
-from groundsbot.onboard.detection_process import ChildDetector
-from groundsbot.onboard.live_recorder import LiveRecorder
-from groundsbot.onboard.messages import Event
-from groundsbot.onboard.robot_files import RobotFiles
+from groundsbot.calib.camera.file import write_camera_yaml
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, wheel_line
+from groundsbot.onboard.detection.child_process import ChildDetector
+from groundsbot.onboard.log.messages import Event
+from groundsbot.onboard.recorder.live_recorder import LiveRecorder
+from groundsbot.onboard.recorder.robot_files import RobotFiles
 from tests.made_cores import wheels_of
 from tests.tag_pictures import draw_tag
 
@@ -25,7 +25,7 @@ PATIENCE_S = 120.0  # only what hangs comes near
 # For a recorder's process: whatever the devices still hold is taken in, however long a busy machine takes for it.
 PATIENT = """
 from onboard import live_recorder, recorder, waiting_detections
-from groundsbot.onboard.picture_folder import FolderCamera
+from groundsbot.onboard.camera.folder import FolderCamera
 live_recorder._END_LIMIT_NS = 120_000_000_000
 FolderCamera.patience_s = 120.0
 recorder.WAIT_FOR_WHEELS_NS = waiting_detections.WAIT_FOR_WHEELS_NS = 120_000_000_000

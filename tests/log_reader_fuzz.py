@@ -13,12 +13,17 @@ import zstandard
 from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, IndexType, Writer
 
-from groundsbot.onboard import chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log_losses import LogLosses
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.message_decoder import LogMessage
-from groundsbot.onboard.messages import TOPICS
+from groundsbot.onboard.log import losses as log_losses
+from groundsbot.onboard.log.losses import LogLosses
+from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.reading import chunks as chunk_reader
+from groundsbot.onboard.log.reading import decoder as message_decoder
+from groundsbot.onboard.log.reading import reader as log_reader
+from groundsbot.onboard.log.reading import record_bytes
+from groundsbot.onboard.log.reading import summary as mcap_summary
+from groundsbot.onboard.log.reading.decoder import LogMessage
+from groundsbot.onboard.log.reading.reader import read_log
 from tests.made_logs import Entry, drive, head
 
 _READER = (chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes)

@@ -17,15 +17,16 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import wheels
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Mount
-from groundsbot.offline.bag_definitions import DEFINITIONS
-from groundsbot.offline.odometry import WheelTrack, chained
-from groundsbot.offline.run import Run, load_run
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import TagDetections, TagObservations
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import wheels
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.robot import Mount
+from groundsbot.offline.importing.bags.reader import DEFINITIONS
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.onboard.log.messages import TagDetections, TagObservations
+from groundsbot.onboard.log.reading.reader import read_log
 
 S = 1_000_000_000
 BASE, CAMERA, ODOM = "base_link", "camera_optical", "odom"

@@ -5,11 +5,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from groundsbot.calib.arrays import IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import Chain
-from groundsbot.offline.covariance_parts import CovarianceParts
-from groundsbot.offline.odometry import ChainOdometry
+from groundsbot.calib.foundation.arrays import IntArray
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 
 NOISE = NoiseParameters()

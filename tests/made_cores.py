@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
-from groundsbot.onboard.log_losses import LogLosses
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import Event, TagDetections, WheelEncoders
-from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.onboard.log.losses import LogLosses
+from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
 ROBOT_YAML = """
 robot_id: gb1

@@ -8,16 +8,17 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2, wheels
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Robot
-from groundsbot.offline.odometry import WheelTrack, chained
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import Detections, Positions, TagKey
-from groundsbot.onboard.log_head import log_head
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import TagDetection, TagDetections, WheelEncoders
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.geometry import se2, wheels
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.robot import Robot
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.onboard.log.head import log_head
+from groundsbot.onboard.log.messages import TagDetection, TagDetections, WheelEncoders
+from groundsbot.onboard.log.writing.writer import LogWriter
 
 S = 1_000_000_000
 START_NS = 1_800_000_000_000_000_003  # loses its last digits in a float

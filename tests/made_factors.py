@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.offline.factors import OdometryFactors, ReadingFactors, State, whitening
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.planar import OdometryFactors, ReadingFactors, State, whitening
 
 
 def odometry_of(

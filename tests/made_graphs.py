@@ -5,12 +5,19 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
-from groundsbot.offline.measured_factors import DistanceFactors, Measured, StartFactors
-from groundsbot.offline.readings import CAMERA_PARAMETERS
-from groundsbot.offline.solver import Problem
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
+from groundsbot.offline.sam.factors.planar import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+    whitening,
+)
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
+from groundsbot.offline.sam.solver import Problem
 from tests.made_factors import odometry_of, readings_of
 
 _ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * 8)  # wheels, mount, what else of the camera

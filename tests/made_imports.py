@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.imported_run import ImportReport
-from groundsbot.offline.importers import import_folder
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import PlanarOdometry, RunInfo, TagObservations
+from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.robot import ImportOptions
+from groundsbot.offline.importing.run_writer import ImportReport
+from groundsbot.onboard.log.messages import PlanarOdometry, RunInfo, TagObservations
+from groundsbot.onboard.log.reading.reader import read_log
 
 TRACK = ImportOptions(track_width_m=0.5)
 PAPER = ImportOptions(track_width_m=0.508, state_rate_hz=4.2)

@@ -11,13 +11,11 @@ from mcap.records import Channel, Chunk
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.onboard.log_head import log_head
-from groundsbot.onboard.log_losses import LogLosses
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import (
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.onboard.log.head import log_head
+from groundsbot.onboard.log.losses import LogLosses
+from groundsbot.onboard.log.messages import (
     ClockAnchor,
     CompressedImage,
     Event,
@@ -26,7 +24,9 @@ from groundsbot.onboard.messages import (
     WheelEncoders,
     timestamp,
 )
-from groundsbot.onboard.record_bytes import RECORD_HEAD
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.reading.record_bytes import RECORD_HEAD
+from groundsbot.onboard.log.writing.writer import LogWriter
 
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000

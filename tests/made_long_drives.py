@@ -8,15 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.robot import Robot
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.factors import State
-from groundsbot.offline.graph import Graph
-from groundsbot.offline.odometry import WheelTrack
-from groundsbot.offline.run_tags import Positions, TagKey
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.robot import Robot
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import Positions, TagKey
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import Graph
 from tests.made_drives import FAMILY, START_NS, S, made_robot, made_run
 
 ROAD_M: Final = 25.0

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.fit_results import AlignmentResult, MeasurementResult
-from groundsbot.offline.parameter_results import CalibrationResult, CheckResult, MetreResult
-from groundsbot.offline.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
-from groundsbot.offline.truth import TrueRun, Truth
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.evaluation.truth import TrueRun, Truth
+from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult
+from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult, MetreResult
+from groundsbot.offline.maps.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
 
 STEP_NS = 100_000_001  # so that stamps do not fit into a float of seconds
 

@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import Chain
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.made_drives import FAMILY, S
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 

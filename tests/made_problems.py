@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.factors import CalibrationPrior, Columns, ReadingFactors, State
-from groundsbot.offline.solver import Problem
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, ReadingFactors, State
+from groundsbot.offline.sam.solver import Problem
 from tests.made_factors import odometry_of, readings_of
 
 # Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, four more of the camera.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
 
 
 def covariances_of_steps(poses: FloatArray) -> FloatArray:

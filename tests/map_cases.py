@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import Message
 
-from groundsbot.onboard.log_head import log_head
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log.head import log_head
+from groundsbot.onboard.log.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.made_drives import FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
 
 TAGS = [

@@ -14,17 +14,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.board_picture import BoardPainter, drawn_views
-from groundsbot.fixtures.calibration import true_tag_sizes_m
-from groundsbot.fixtures.devices import PictureFolder, PtyPort, wheel_line
-from groundsbot.fixtures.encoder_sim import Controller
-from groundsbot.fixtures.render import Renderer
-from groundsbot.fixtures.scene import tags_of
-from groundsbot.fixtures.session import Options, Picture, Session, prepare
-from groundsbot.fixtures.textures import ByteArray
-from groundsbot.fixtures.world import World, load_world
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.fixtures.drives.calibration import true_tag_sizes_m
+from groundsbot.fixtures.drives.wheel_controller import Controller
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, drawn_views
+from groundsbot.fixtures.pictures.render import Renderer
+from groundsbot.fixtures.pictures.textures import ByteArray
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, wheel_line
+from groundsbot.fixtures.recording.session import Options, Picture, Session, prepare
+from groundsbot.fixtures.worlds.scene import tags_of
+from groundsbot.fixtures.worlds.world import World, load_world
 from tests.board_views import good_views
 
 _NS_PER_S = 1_000_000_000

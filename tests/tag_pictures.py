@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.tag_family import tag_bits
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.tags.family import tag_bits
 
 SUPERSAMPLING = 8
 

@@ -24,50 +24,53 @@ class Form(NamedTuple):
     words: str
 
 
-_MAP: Final = "groundsbot.offline.map_command"
+_MAP: Final = "groundsbot.offline.commands.map_drives"
 LOG_FORMS: Final = {
-    "info": Form("groundsbot.offline.info", "info FILE"),
-    "salvage": Form("groundsbot.offline.salvage", "salvage FILE -o OUT.mcap"),
-    "detect": Form("groundsbot.offline.detect,groundsbot.onboard.picture", "detect FILE -o OUT"),
+    "info": Form("groundsbot.offline.logs.info", "info FILE"),
+    "salvage": Form("groundsbot.offline.logs.salvaging", "salvage FILE -o OUT.mcap"),
+    "detect": Form("groundsbot.offline.logs.redetection,groundsbot.onboard.log.picture", "detect FILE -o OUT"),
     "map": Form(_MAP, "map FILE -o OUT"),
     "corners": Form(_MAP, "map --model corners FILE -o OUT"),
     "extend": Form(_MAP, "map --extend MAP/map.json FILE -o OUT"),
-    "calibrate": Form("groundsbot.offline.calibrate_command", "calibrate FILE -o OUT.yaml"),
-    "localize": Form("groundsbot.offline.localize_command", "localize FILE --map MAP -o OUT"),
+    "calibrate": Form("groundsbot.offline.commands.calibrate_robots", "calibrate FILE -o OUT.yaml"),
+    "localize": Form("groundsbot.offline.commands.localize_drive", "localize FILE --map MAP -o OUT"),
 }
 """All commands that take logs."""
 
 LOGS_FORMS: Final = {name: LOG_FORMS[name] for name in ("info", "map", "corners", "extend", "calibrate")}
 """Those that take several."""
 
-RUN_FORMS: Final = LOG_FORMS | {"salvage": Form("groundsbot.offline.salvage", "salvage FILE -o OUT")}
+RUN_FORMS: Final = LOG_FORMS | {"salvage": Form("groundsbot.offline.logs.salvaging", "salvage FILE -o OUT")}
 """All of them on the folder of a run."""
 
 MAP_FORMS: Final = {
     "compare": Form(
-        "groundsbot.offline.evaluation,groundsbot.offline.map_io,groundsbot.offline.survey",
+        "groundsbot.offline.evaluation.against_truth,groundsbot.offline.maps.files,groundsbot.offline.evaluation.survey",
         "compare FILE --truth TRUTH",
     ),
     "survey": Form(
-        "groundsbot.offline.evaluation,groundsbot.offline.map_io,groundsbot.offline.survey",
+        "groundsbot.offline.evaluation.against_truth,groundsbot.offline.maps.files,groundsbot.offline.evaluation.survey",
         "compare FILE --survey SURVEY",
     ),
-    "g2o": Form("groundsbot.offline.map_io,groundsbot.offline.export", "export FILE --format g2o -o OUT"),
-    "tum": Form("groundsbot.offline.map_io,groundsbot.offline.export", "export FILE --format tum -o OUT"),
+    "g2o": Form("groundsbot.offline.maps.files,groundsbot.offline.export.export", "export FILE --format g2o -o OUT"),
+    "tum": Form("groundsbot.offline.maps.files,groundsbot.offline.export.export", "export FILE --format tum -o OUT"),
     "extend": Form(_MAP, "map --extend FILE/map.json LOG -o OUT"),
-    "localize": Form("groundsbot.offline.localize_command", "localize LOG --map FILE -o OUT"),
+    "localize": Form("groundsbot.offline.commands.localize_drive", "localize LOG --map FILE -o OUT"),
 }
 """All that take a map's folder."""
 
 OTHER_FORMS: Final = {
     "import": Form(
-        "groundsbot.offline.importers,groundsbot.offline.bag_import", "import FILE -o OUT --track-width-m 0.5"
+        "groundsbot.offline.importing.csv.importer,groundsbot.offline.importing.bags.importer",
+        "import FILE -o OUT --track-width-m 0.5",
     ),
     "truth": Form(
-        "groundsbot.offline.evaluation,groundsbot.offline.map_io,groundsbot.offline.survey", "compare MAP --truth FILE"
+        "groundsbot.offline.evaluation.against_truth,groundsbot.offline.maps.files,groundsbot.offline.evaluation.survey",
+        "compare MAP --truth FILE",
     ),
     "survey": Form(
-        "groundsbot.offline.evaluation,groundsbot.offline.map_io,groundsbot.offline.survey", "compare MAP --survey FILE"
+        "groundsbot.offline.evaluation.against_truth,groundsbot.offline.maps.files,groundsbot.offline.evaluation.survey",
+        "compare MAP --survey FILE",
     ),
     "robot": Form(_MAP, "map LOG --robot FILE -o OUT"),
     "noise": Form(_MAP, "map LOG --noise FILE -o OUT"),

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.fixtures.calibration import nominal_robot
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.fixtures.drives.calibration import nominal_robot
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import Noise, load_world
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
+from groundsbot.fixtures.worlds.world import Noise, load_world
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
 from tests.benchmarks.accuracy import (
     METHODS,
     Drives,

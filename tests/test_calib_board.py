@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.board import DEFAULT_BOARD, Board, parse_board
-from groundsbot.calib.board_sheet import print_board
+from groundsbot.calib.board.board import DEFAULT_BOARD, Board, parse_board
 from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.printing.board import print_board
 from tests.printed import n_pages, scanned, words
 
 DPI = 300.0

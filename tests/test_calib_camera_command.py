@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.camera_file import read_camera_yaml, read_estimate, write_camera_yaml
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.projection_uncertainty import PictureGrid, difference_px, rms_px
-from groundsbot.fixtures.board_picture import BoardPainter, View, drawn_views
-from groundsbot.fixtures.textures import ByteArray
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.camera.file import read_camera_yaml, read_estimate, write_camera_yaml
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, difference_px, rms_px
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, drawn_views
+from groundsbot.fixtures.pictures.textures import ByteArray
 from tests.board_cases import FISHEYE, NARROW, WIDE
 from tests.programs import Run
 
@@ -46,7 +46,7 @@ class Good:
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Good:
     """Pictures by a camera of 90 degrees, one of them blurred, and what is calibrated from them."""
-    from groundsbot.calib.camera_command import calibrate_camera
+    from groundsbot.calib.intrinsics.command import calibrate_camera
 
     folder = tmp_path_factory.mktemp("good")
     shown = pictures(WIDE, 10)

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_file import CameraEstimate, read_camera_yaml, read_estimate, write_camera_yaml
-from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.camera.file import CameraEstimate, read_camera_yaml, read_estimate, write_camera_yaml
+from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation.arrays import FloatArray
 
 PLUMB_BOB = CameraModel(
     "wide", 1280, 720, 901.3, 899.8, 645.2, 352.7, "plumb_bob", (-0.31, 0.12, 0.0007, -0.0004, -0.02)

@@ -4,18 +4,18 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.board_finder import BoardFinder
-from groundsbot.calib.board_finder import View as FoundView
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.corner_fit import fitted_corners
-from groundsbot.calib.corner_surroundings import RADIUS_PX, Surroundings, bends
-from groundsbot.calib.intrinsics import calibrated
-from groundsbot.calib.lens_parameters import parameters_of
-from groundsbot.calib.projection_uncertainty import rms_px
-from groundsbot.fixtures.board_picture import BoardPainter, corners_of, drawn_views
-from groundsbot.fixtures.world import Pictures
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.corner_fit import fitted_corners
+from groundsbot.calib.board.corner_surroundings import RADIUS_PX, Surroundings, bends
+from groundsbot.calib.board.finder import BoardFinder
+from groundsbot.calib.board.finder import View as FoundView
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.camera.parameters import parameters_of
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.intrinsics.model_choice import calibrated
+from groundsbot.calib.intrinsics.projection_uncertainty import rms_px
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, corners_of, drawn_views
+from groundsbot.fixtures.worlds.world import Pictures
 from tests.board_cases import FISHEYE, NARROW, RATIONAL, taken_views
 
 FINDER = BoardFinder(DEFAULT_BOARD)

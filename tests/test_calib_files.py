@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.files import folder_written_whole, written_whole
+from groundsbot.calib.foundation.files import folder_written_whole, written_whole
 
 
 def spoilt(file: Path) -> None:

@@ -4,23 +4,24 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.board_finder import BoardFinder
-from groundsbot.calib.board_finder import View as FoundView
-from groundsbot.calib.bundle import Observations, Poses, adjusted, board_pose
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.corner_fit import Corners
-from groundsbot.calib.intrinsics import KINDS, first_fit
-from groundsbot.calib.lens_fit import first_guess, fitted_lens
-from groundsbot.calib.lens_parameters import parameters_of, pixels_by_parameters, with_parameters
-from groundsbot.calib.projection_uncertainty import (
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.corner_fit import Corners
+from groundsbot.calib.board.finder import BoardFinder
+from groundsbot.calib.board.finder import View as FoundView
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
+from groundsbot.calib.camera.planar_pose import board_pose
+from groundsbot.calib.intrinsics.bundle import Observations, Poses, adjusted
+from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
+from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
     difference_px,
     expected_error_px,
     projection_covariance,
     rms_px,
 )
-from groundsbot.fixtures.board_picture import BoardPainter, View, corners_of, drawn_views
+from groundsbot.calib.intrinsics.robust_fit import first_guess, fitted_lens
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of, drawn_views
 from tests.board_cases import CASES, FISHEYE, NARROW, WIDE
 from tests.board_views import PLAIN
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.noise import NoiseParameters, read_noise_yaml
+from groundsbot.calib.robot.noise import NoiseParameters, read_noise_yaml
 
 
 def test_what_the_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.sheet import PAPERS_MM
-from groundsbot.calib.tag_family import families, family_size, tag_bits
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.printing.sheet import PAPERS_MM
+from groundsbot.calib.tags.family import families, family_size, tag_bits
+from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.printed import n_pages, ruler_ticks_mm, scanned, words
 from tests.programs import Run
 
@@ -182,7 +182,11 @@ def test_the_same_tags_make_the_same_file(calib: Run, tmp_path: Path) -> None:
 def test_a_robot_without_the_printing_library_says_so(
     calib: Run, tmp_path: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("groundsbot.calib.sheet", "groundsbot.calib.board_sheet", "groundsbot.calib.tag_sheet"):
+    for module in (
+        "groundsbot.calib.printing.sheet",
+        "groundsbot.calib.printing.board",
+        "groundsbot.calib.printing.tags",
+    ):
         monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setitem(sys.modules, "reportlab.lib.units", None)
     done = calib(*command, "-o", tmp_path / "page.pdf")

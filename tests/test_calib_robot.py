@@ -11,7 +11,8 @@ import yaml
 from pydantic import BaseModel
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.robot import (
+from groundsbot.calib.foundation.yaml_file import parse_mapping, validated
+from groundsbot.calib.robot.robot import (
     Devices,
     Mount,
     RecorderOptions,
@@ -22,7 +23,6 @@ from groundsbot.calib.robot import (
     read_robot_yaml,
     write_robot_yaml,
 )
-from groundsbot.calib.yaml_file import parse_mapping, validated
 
 DOCUMENTATION = Path(__file__).parents[1] / "docs" / "robot_yaml.md"
 SECTIONS: dict[str, type[BaseModel]] = {

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 
 PI = np.pi
 # At zero, where series take over from closed forms (0.5), and around half a turn.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.tag_edges import moved_out, outward
+from groundsbot.calib.tags.edges import moved_out, outward
 
 SQUARE = np.array([[10.0, 20.0], [50.0, 20.0], [50.0, 60.0], [10.0, 60.0]])
 SLANTED = np.array([[10.0, 20.0], [42.0, 27.0], [45.0, 51.0], [12.0, 66.0]])

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.robot import TagFamily
-from groundsbot.calib.tag_family import families, family_size, tag_bits
+from groundsbot.calib.robot.robot import TagFamily
+from groundsbot.calib.tags.family import families, family_size, tag_bits
 
 # Detectors crash when they are taken down, so each lives in a process that leaves without doing so.
 READ_BACK = """
 import json, os, sys
 import numpy as np
 from pupil_apriltags import Detector
-from groundsbot.calib.tag_family import family_size, tag_bits
+from groundsbot.calib.tags.family import family_size, tag_bits
 
 family, cell, top, left = sys.argv[1], 10, 40, 50
 detector = Detector(families=family, nthreads=1, quad_decimate=1.0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.view_spread import SeenBoard, Spread, seen_board
-from groundsbot.fixtures.board_picture import View
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.view_spread import SeenBoard, Spread, seen_board
+from groundsbot.fixtures.pictures.board_picture import View
 from tests.board_views import PLAIN, held, projected
 
 SIZE_PX = (PLAIN.width_px, PLAIN.height_px)

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from groundsbot.calib import se2, wheels
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2, wheels
 
 STEP = 1e-6
 TURNS = np.array([0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.5 - 1e-9, 0.5 + 1e-9, np.pi - 1e-9, np.pi, np.pi + 1e-9, 5.0])

@@ -1,6 +1,6 @@
 """Numbers in sentences."""
 
-from groundsbot.calib.words import counted
+from groundsbot.calib.foundation.words import counted
 
 
 def test_one_is_no_plural() -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.offline import chain
-from groundsbot.offline.run import Run, load_run
+from groundsbot.offline.measurements import chain
+from groundsbot.offline.measurements.run import Run, load_run
 from tests.benchmarks import corners_bench, thinning_bench
 from tests.made_drives import HALL, made_drive, made_robot, write_drive
 

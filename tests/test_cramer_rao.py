@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.world import load_world
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.fixtures.worlds.world import load_world
 from tests.benchmarks.cramer_rao import cramer_rao
 from tests.benchmarks.cramer_rao_measured import (
     CALIBRATION,

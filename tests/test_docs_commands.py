@@ -15,14 +15,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import groundsbot.fixtures.world
 import numpy as np
 import pytest
 import yaml
 from markdown_it import MarkdownIt
 from typer.main import get_command
 
-import groundsbot.fixtures.world
-from groundsbot.calib.robot import write_robot_yaml
+from groundsbot.calib.robot.robot import write_robot_yaml
 from tests.made_bags import BagOfLog
 from tests.made_drives import START_NS, MadeTag, S, made_drive, made_robot, write_drive
 from tests.tag_pictures import draw_tag
@@ -174,11 +174,11 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (hallway / "odom.csv").write_text("".join(f"{i + 1},0.10,0.10\n" for i in range(40)))
     rows = [f"{i + 1},{tag},{3.0 - 0.024 * i:.3f},{tag - 1.0:.3f},0\n" for i in range(0, 40, 4) for tag in range(3)]
     (hallway / "landmarks.csv").write_text("".join(rows))
-    small = groundsbot.fixtures.world.load_world("room").model_dump(mode="json", exclude_none=True)
+    small = groundsbot.fixtures.worlds.world.load_world("room").model_dump(mode="json", exclude_none=True)
     (folder / "worlds").mkdir()
     (folder / "worlds" / "nsh.yaml").write_text(yaml.safe_dump(small))
     places = SimpleNamespace(files=lambda _package: folder / "worlds", as_file=resources.as_file)
-    monkeypatch.setattr(groundsbot.fixtures.world, "resources", places)
+    monkeypatch.setattr(groundsbot.fixtures.worlds.world, "resources", places)
 
 
 def run_elsewhere(page: str, text: str) -> bool:

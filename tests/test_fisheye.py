@@ -6,7 +6,7 @@ from pathlib import Path
 from scipy.stats import chi2
 
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import load_world
+from groundsbot.fixtures.worlds.world import load_world
 from tests.programs import Run
 
 FISHEYE = {

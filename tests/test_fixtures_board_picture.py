@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.board_picture import (
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.fixtures.pictures.board_picture import (
     BoardPainter,
     Glare,
     View,
@@ -16,8 +16,8 @@ from groundsbot.fixtures.board_picture import (
     drawn_views,
     second_differences,
 )
-from groundsbot.fixtures.textures import ByteArray
-from groundsbot.fixtures.world import Pictures
+from groundsbot.fixtures.pictures.textures import ByteArray
+from groundsbot.fixtures.worlds.world import Pictures
 
 NARROW = CameraModel("narrow", 640, 480, 800.0, 801.0, 318.0, 243.0, "plumb_bob", (-0.1, 0.05, 0.0005, -0.0003, 0.0))
 FISHEYE = CameraModel("fisheye", 640, 480, 220.0, 220.5, 322.0, 237.0, "equidistant", (0.02, -0.005, 0.001, 0.0))

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.wheels import advance
-from groundsbot.fixtures.drive import Drive, drive, longest_drive_s
-from groundsbot.fixtures.driver import DEAD_TIME_S
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.wheels import advance
+from groundsbot.fixtures.drives.driver import DEAD_TIME_S
+from groundsbot.fixtures.drives.true_motion import Drive, drive, longest_drive_s
 from groundsbot.fixtures.errors import FixturesError
-from groundsbot.fixtures.route import pieces_of
-from groundsbot.fixtures.world import World, WorldRobot
+from groundsbot.fixtures.worlds.route import pieces_of
+from groundsbot.fixtures.worlds.world import World, WorldRobot
 
 TRACK_M = 0.4
 STILL = {

@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.fixtures.calibration import nominal_robot, true_tag_sizes_m
-from groundsbot.fixtures.render import Renderer
-from groundsbot.fixtures.scene import tags_of
-from groundsbot.fixtures.session import Options, Picture, Session, prepare
-from groundsbot.fixtures.visibility import sightings
-from groundsbot.fixtures.world import World, load_world
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.fixtures.drives.calibration import nominal_robot, true_tag_sizes_m
+from groundsbot.fixtures.pictures.render import Renderer
+from groundsbot.fixtures.pictures.visibility import sightings
+from groundsbot.fixtures.recording.session import Options, Picture, Session, prepare
+from groundsbot.fixtures.worlds.scene import tags_of
+from groundsbot.fixtures.worlds.world import World, load_world
+from groundsbot.onboard.detection.tag_detector import TagDetector
 
 SEEDS = range(3)
 ROBOTS = ("hallway", "loop")

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Mount
-from groundsbot.fixtures.drive import Drive
-from groundsbot.fixtures.render import Renderer
-from groundsbot.fixtures.scene import Faces, Tags, faces_of, tags_of
-from groundsbot.fixtures.textures import ByteArray
-from groundsbot.fixtures.visibility import Eye, sightings
-from groundsbot.fixtures.world import Box, Pictures, Wall, World, WorldTag
-from groundsbot.onboard.tag_detector import Detection, TagDetector
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.robot.robot import Mount
+from groundsbot.fixtures.drives.true_motion import Drive
+from groundsbot.fixtures.pictures.render import Renderer
+from groundsbot.fixtures.pictures.textures import ByteArray
+from groundsbot.fixtures.pictures.visibility import Eye, sightings
+from groundsbot.fixtures.worlds.scene import Faces, Tags, faces_of, tags_of
+from groundsbot.fixtures.worlds.world import Box, Pictures, Wall, World, WorldTag
+from groundsbot.onboard.detection.tag_detector import Detection, TagDetector
 
 SIZE_M = 0.15
 STRAIGHT = CameraModel("c", 640, 480, 600.0, 600.0, 319.5, 239.5, "plumb_bob", (0.0,) * 5)

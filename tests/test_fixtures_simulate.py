@@ -12,17 +12,17 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.robot import read_robot_yaml
-from groundsbot.calib.tag_edges import moved_out
-from groundsbot.calib.wheels import advance
-from groundsbot.fixtures.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.wheels import advance
+from groundsbot.calib.robot.robot import read_robot_yaml
+from groundsbot.calib.tags.edges import moved_out
+from groundsbot.fixtures.drives.calibration import camera_model, nominal_robot, true_robot, true_tag_sizes_m
 from groundsbot.fixtures.errors import FixturesError
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import World, load_world
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import TagDetections, WheelEncoders
+from groundsbot.fixtures.worlds.world import World, load_world
+from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
+from groundsbot.onboard.log.reading.reader import read_log
 from tests.programs import on_terminal
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from groundsbot.calib.yaml_file import LONGEST_TEXT
+from groundsbot.calib.foundation.yaml_file import LONGEST_TEXT
 from groundsbot.fixtures.errors import FixturesError
-from groundsbot.fixtures.world import World, load_world, parse_world, world_names
+from groundsbot.fixtures.worlds.world import World, load_world, parse_world, world_names
 
 ROOT = Path(__file__).resolve().parent.parent
 TINY = """

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.fixtures.world import parse_world
+from groundsbot.fixtures.worlds.world import parse_world
 from tests.benchmarks import fleet
 from tests.benchmarks.fleet_world import PITCH_M, ROAD_WIDTH_M, TAG_OFFSET_M, fleet_world
 

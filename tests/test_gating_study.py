@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from groundsbot.fixtures.world import load_world
+from groundsbot.fixtures.worlds.world import load_world
 from tests.benchmarks.gating_study import Pair, study_seed, summary
 
 GOOD = Pair("room", 0, 1.0, (0.1, 0.2), (0.1, 0.2), ())

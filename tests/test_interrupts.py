@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.calib.command_line import new_app, run
+from groundsbot.calib.foundation.command_line import new_app, run
 
 LIMIT_S = 30.0  # only a program that hangs comes near
 
@@ -101,7 +101,7 @@ def test_an_interrupted_map_leaves_what_was_there(
 # The first signal comes in a `__del__`, which swallows what it raises; the third while the second is cleaned up after.
 SWALLOWED = """
 import os, signal
-from groundsbot.calib.command_line import new_app, run
+from groundsbot.calib.foundation.command_line import new_app, run
 app = new_app("x")
 class Swallowing:
     def __del__(self):

@@ -1,6 +1,6 @@
 """The study of merging in small: order does not matter, and what cannot be told is not claimed."""
 
-from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.local_map.local_map import solve_local_map
 from tests.benchmarks.merge_study import SAME_M, apart, corridor, drives_of, in_other_building, spread_over_orders
 
 LENGTH_M = 200.0

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.advice import advise, candidates_of, judged, known_of
-from groundsbot.offline.advice_gain import Known
-from groundsbot.offline.advice_passes import gain_of_pass, most_length_m
-from groundsbot.offline.advice_seen import expected_sigmas_m, seen_shares
-from groundsbot.offline.advice_tags import Place, gain_of_place, place_beside
-from groundsbot.offline.chain import Chain
-from groundsbot.offline.factors import State
-from groundsbot.offline.graph import Graph, build_graph
-from groundsbot.offline.readings import joined
-from groundsbot.offline.report_words import advice_sentence
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import Solution
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.advice.advice import advise, candidates_of, judged, known_of
+from groundsbot.offline.advice.information_gain import Known
+from groundsbot.offline.advice.new_tags import Place, gain_of_place, place_beside
+from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
+from groundsbot.offline.advice.visibility import expected_sigmas_m, seen_shares
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.sensor_model.readings import joined
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.report.sentences import advice_sentence
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import Graph, build_graph
+from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.advice_study import Scene, made_scene, trial
 
 NEW = TagKey("tag36h11", 500)

@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.alignment import Alignment, align, covariance_union, fit_transform
-from groundsbot.offline.alignment_rivals import MARGIN_NATS
-from groundsbot.offline.condensed import CondensedMap
-from groundsbot.offline.measured import Placement
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.se2 import fit_transform
+from groundsbot.offline.alignment.condensed_map import CondensedMap
+from groundsbot.offline.alignment.model_selection import MARGIN_NATS
+from groundsbot.offline.alignment.pairwise import Alignment, align, covariance_union
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import Placement
 
 ANY = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)
 NEAR_PI = [np.pi, -np.pi, np.pi - 1e-9, -np.pi + 1e-9, 0.0, np.pi / 2]

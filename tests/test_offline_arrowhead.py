@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.arrowhead import Arrowhead, UnderDeterminedError
-from groundsbot.offline.arrowhead_build import build_arrowhead
-from groundsbot.offline.factors import Linearised, State
-from groundsbot.offline.robust import SQUARES, Loss, cauchy, graduated, huber, truncated
-from groundsbot.offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.sam.arrowhead.build import build_arrowhead
+from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber, truncated
+from groundsbot.offline.sam.factors.planar import Linearised, State
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_graphs import made_graph, with_measured
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.arrowhead import Skeleton
-from groundsbot.offline.factors import State
-from groundsbot.offline.solver import PLAIN_SQUARES, Problem, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.arrowhead.system import Skeleton
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.benchmarks.solver_world import made_fleet
 from tests.made_graphs import made_graph

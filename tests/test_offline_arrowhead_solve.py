@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundsbot.calib import se2
-from groundsbot.offline.factors import State
-from groundsbot.offline.robust import SQUARES, Loss, cauchy, graduated, huber
-from groundsbot.offline.solver import Losses, Problem, solve
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.solver import Losses, Problem, solve
 from tests.benchmarks.solver_world import SIGMA_START, Fleet, made_fleet
 from tests.made_graphs import made_graph, reordered
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import Mount, write_robot_yaml
-from groundsbot.offline.bag_frames import FixedFrames, mount_of
-from groundsbot.offline.bag_import import import_bag
-from groundsbot.offline.bag_pictures import picture_of
-from groundsbot.offline.bag_positions import planar_covariance
-from groundsbot.offline.bag_reader import BagTopic, open_bag
-from groundsbot.offline.bag_tags import Sighting, read_look
-from groundsbot.offline.bag_topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.imported_run import ImportReport
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.robot.robot import Mount, write_robot_yaml
+from groundsbot.offline.importing.bags.frames import FixedFrames, mount_of
+from groundsbot.offline.importing.bags.importer import import_bag
+from groundsbot.offline.importing.bags.pictures import picture_of
+from groundsbot.offline.importing.bags.positions import planar_covariance
+from groundsbot.offline.importing.bags.reader import BagTopic, open_bag
+from groundsbot.offline.importing.bags.tags import Sighting, read_look
+from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
+from groundsbot.offline.importing.robot import ImportOptions
+from groundsbot.offline.importing.run_writer import ImportReport
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.made_bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
 from tests.made_drives import CAMERA as LENS
 from tests.made_drives import HALL, PINHOLE, made_drive, made_robot, write_drive

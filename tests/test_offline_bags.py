@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.offline.bag_import import import_bag
-from groundsbot.offline.bag_topics import BagOptions
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.imported_run import ImportReport
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import load_run
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.importing.bags.importer import import_bag
+from groundsbot.offline.importing.bags.topics import BagOptions
+from groundsbot.offline.importing.robot import ImportOptions
+from groundsbot.offline.importing.run_writer import ImportReport
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.onboard.detection.tag_detector import TagDetector
+from groundsbot.onboard.log.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.made_bags import BagOfLog, without_definitions
 from tests.made_drives import HALL, PINHOLE, START_NS, S, made_drive, made_robot, picture_stamps, write_drive
 from tests.made_steps import accumulated, covariances_of_steps

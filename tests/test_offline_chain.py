@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, Chain, chains_of
-from groundsbot.offline.odometry import WheelTrack
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import IntArray
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.measurements.chain import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, Chain, chains_of
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.made_drives import FAMILY, START_NS, MadeDrive, S, made_drive, made_positions, made_run
 
 NOISE = NoiseParameters()

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.checks import check_warnings
-from groundsbot.offline.graph import TAG_SCALE
-from groundsbot.offline.map_warnings import calibration_warnings
-from groundsbot.offline.measured import TapeOptions
-from groundsbot.offline.parameter_results import CalibrationResult, CheckResult
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import TAG_SCALE
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.scale_checks import check_warnings
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.warnings import calibration_warnings
+from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import TapeOptions
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
 
 ROUND = [(0.5, 0.5, 4.0), (0.3, 0.5, 7.85), (0.5, 0.5, 4.0), (0.5, 0.3, 7.85), (0.2, -0.2, 7.85)]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.offline.map_io import write_map
+from groundsbot.offline.maps.files import write_map
 from tests.made_maps import made_component, made_map, made_truth
 from tests.programs import Run
 

@@ -6,18 +6,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.offline.corner_factors import CornerFactors, Looks, SpatialColumns, SpatialState
-from groundsbot.offline.corner_floor import guessed_wobble
-from groundsbot.offline.corner_pictures import pictures_at
-from groundsbot.offline.corner_problem import CornerProblem, columns_of
-from groundsbot.offline.corner_solver import solve_corners
-from groundsbot.offline.factors import CalibrationPrior, OdometryFactors, ReadingFactors
-from groundsbot.offline.front_kernels import System
-from groundsbot.offline.fronts import Fronts, Normal, NotPositiveError, build_fronts, common_ancestor
-from groundsbot.offline.measured_factors import NOTHING_MEASURED
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.corners.factors import CornerFactors, Looks, SpatialColumns, SpatialState
+from groundsbot.offline.corners.floor_noise import guessed_wobble
+from groundsbot.offline.corners.multifrontal.fronts import (
+    Fronts,
+    Normal,
+    NotPositiveError,
+    build_fronts,
+    common_ancestor,
+)
+from groundsbot.offline.corners.multifrontal.kernels import System
+from groundsbot.offline.corners.picture_tilt import pictures_at
+from groundsbot.offline.corners.problem import CornerProblem, columns_of
+from groundsbot.offline.corners.solver import solve_corners
+from groundsbot.offline.sam.factors.planar import CalibrationPrior, OdometryFactors, ReadingFactors
+from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED
 
 CAMERAS = {
     "plumb_bob": (-0.18, 0.07, 0.0006, -0.0004, 0.01),

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.tag_edges import outward
-from groundsbot.offline.corner_factors import CornerFactors, SpatialState
-from groundsbot.offline.corner_sides import facing_as_predicted
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.tags.edges import outward
+from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.factors import CornerFactors, SpatialState
 from tests.test_offline_corner_factors import CAMERAS, made_factors, made_state
 
 

@@ -3,11 +3,12 @@
 from pathlib import Path
 
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline.corner_graph import corner_graph
-from groundsbot.offline.corner_solver import solve_corners
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.workings import Workings
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.corners.graph import corner_graph
+from groundsbot.offline.corners.solver import solve_corners
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.onboard.log.reading.reader import find_logs
 
 
 def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part(tmp_path: Path) -> None:

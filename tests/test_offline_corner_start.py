@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2
-from groundsbot.calib.bundle import planar_poses
-from groundsbot.offline.corner_calibrated_start import calibrated
-from groundsbot.offline.corner_chosen_looks import ByTag, judges, looks_by_tag, posed
-from groundsbot.offline.corner_factors import spatial_values
-from groundsbot.offline.corner_problem import CORNER_LOSS, columns_of
-from groundsbot.offline.corner_start_kernels import POSES, allowed, fit, rays_of
-from groundsbot.offline.tag_pose import UNIT_CORNERS
+from groundsbot.calib.camera.planar_pose import planar_poses
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.corners.factors import spatial_values
+from groundsbot.offline.corners.initial_calibration import calibrated
+from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, allowed, fit, rays_of
+from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, looks_by_tag, posed
+from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
+from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
 from tests.test_offline_corner_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, made_problem
 
 

@@ -10,35 +10,36 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.tag_edges import outward
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.tags.edges import outward
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline import corner_map
-from groundsbot.offline.arrowhead_build import compiled_motions
-from groundsbot.offline.corner_factors import SpatialState
-from groundsbot.offline.corner_floor import fitted_wobble, guessed_wobble, with_wobble
-from groundsbot.offline.corner_graph import corner_graph
-from groundsbot.offline.corner_map import refine
-from groundsbot.offline.corner_noise import refined_bias_px
-from groundsbot.offline.corner_problem import CornerProblem
-from groundsbot.offline.corner_sides import facing_as_predicted
-from groundsbot.offline.corner_solver import CornerSolution, solve_corners
-from groundsbot.offline.corner_start import hung_otherwise, tags_rehung
-from groundsbot.offline.edges import edges_of
-from groundsbot.offline.evaluation import evaluate
-from groundsbot.offline.global_map import component_of
-from groundsbot.offline.graph import Graph
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.map_model import MapModel
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import FloorSigmas, MapResult
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.run_tags import Detections
-from groundsbot.offline.truth import read_truth
-from groundsbot.offline.workings import Workings
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.corners import refinement as corner_map
+from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.factors import SpatialState
+from groundsbot.offline.corners.floor_noise import fitted_wobble, guessed_wobble, with_wobble
+from groundsbot.offline.corners.graph import corner_graph
+from groundsbot.offline.corners.initial_tag_poses import hung_otherwise, tags_rehung
+from groundsbot.offline.corners.problem import CornerProblem
+from groundsbot.offline.corners.refinement import refine
+from groundsbot.offline.corners.solver import CornerSolution, solve_corners
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.global_map.edges import edges_of
+from groundsbot.offline.global_map.joint_solve import component_of
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.model import MapModel
+from groundsbot.offline.maps.result import FloorSigmas, MapResult
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
+from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.offline.sam.arrowhead.build import compiled_motions
+from groundsbot.offline.sam.graph import Graph
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
 from tests.programs import Run as Program
 

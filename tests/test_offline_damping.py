@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from groundsbot.offline.damping import Damping
+from groundsbot.offline.sam.damping import Damping
 
 
 def test_steps_are_gauss_newtons_until_one_is_rejected() -> None:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import Event, EventKind, StampSource, TagDetection, TagDetections
+from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetection, TagDetections
+from groundsbot.onboard.log.reading.reader import read_log
 from tests.made_logs import MS, START_NS, Entry, picture_entry, wheel_entry, write_log
 from tests.programs import Run
 from tests.tag_pictures import draw_tag

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.tag_edges import moved_out
-from groundsbot.offline.map_model import MapModel
-from groundsbot.offline.parameter_results import CalibrationResult
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run, load_run
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.tags.edges import moved_out
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.model import MapModel
+from groundsbot.offline.maps.parameter_results import CalibrationResult
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run, load_run
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 
 START = [0.5, 2.0, 0.0]

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import chains_of
-from groundsbot.offline.effort import Effort, efforts_of, size_of, step_work
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.odometry_breaks import split_where_broken
-from groundsbot.offline.run import load_run
-from groundsbot.offline.self_calibration_told import told_by
-from groundsbot.offline.solver import MAX_STEPS, Solution, solve
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.outliers.odometry_breaks import split_where_broken
+from groundsbot.offline.sam.budget import Effort, efforts_of, size_of, step_work
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
+from groundsbot.offline.self_calibration.information import told_by
 from tests.benchmarks.breaks_study import broken_drive
 from tests.hostile_logs import MS, observed, resets
 from tests.made_logs import START_NS
@@ -62,7 +62,7 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
 ) -> None:
     log = written(observed(4000, 10), tmp_path)
     assert len(load_run(log).positions.tag) == 8000
-    monkeypatch.setattr("groundsbot.offline.run_readings._FREE_READINGS", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_READINGS", 0)
     most = log.stat().st_size // 10
     assert most < 8000
     assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
@@ -71,7 +71,7 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
 def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundsbot.offline.run_readings._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_TO_USE", 0)
     log = written(observed(2000, 10), tmp_path)
     size = log.stat().st_size
     every = -(-4000 // (size // 64))
@@ -89,7 +89,7 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
 def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundsbot.offline.run_readings._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_TO_USE", 0)
     run = load_run(written(resets(1, 3, 500), tmp_path))
     assert 0 < len(run.picture_stamps_ns) < 500
     assert len(run.detections.tag) == 3 * len(run.picture_stamps_ns)
@@ -157,7 +157,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         taken.append(solution.n_linearised * step_work(solution.problem))
         return solution
 
-    monkeypatch.setattr("groundsbot.offline.goodness.solve", counted)
+    monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
     told_by([found], NoiseParameters(), [effort], corners=False)
     assert 0.0 < sum(taken) < 0.5 * effort.allowed
 

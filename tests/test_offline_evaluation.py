@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation import aligned, evaluate
-from groundsbot.offline.result import Component
-from groundsbot.offline.truth import TrueRun, Truth, read_truth
+from groundsbot.offline.evaluation.against_truth import aligned, evaluate
+from groundsbot.offline.evaluation.truth import TrueRun, Truth, read_truth
+from groundsbot.offline.maps.result import Component
 from tests.made_maps import STEP_NS, made_component, made_map, made_truth
 
 

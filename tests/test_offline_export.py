@@ -12,12 +12,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from groundsbot.calib import se2
-from groundsbot.offline.fit_results import SuspectTag
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.result import Component
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import TagDetections, WheelEncoders, nanoseconds
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.fit_results import SuspectTag
+from groundsbot.offline.maps.result import Component
+from groundsbot.onboard.log.messages import TagDetections, WheelEncoders, nanoseconds
+from groundsbot.onboard.log.reading.reader import read_log
 from tests.exported_map import make_small_map
 from tests.made_drives import made_robot
 from tests.made_maps import made_component, made_map

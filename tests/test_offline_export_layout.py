@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.result import Component, GraphEdges, TagPose, TagResult
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagResult
 from tests.made_maps import made_component, made_map
 from tests.programs import Run
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import groundsbot
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.kept import arrays_of, chain_from
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.measured import TapeOptions
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.archive import arrays_of, chain_from
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.tape import TapeOptions
 from tests.made_drives import HALL, MadeTag, made_drive, made_robot, write_drive
 from tests.programs import Run as Program
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.factors import Linearised, State, whitening
-from groundsbot.offline.robust import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
-from groundsbot.offline.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
+from groundsbot.offline.sam.factors.planar import Linearised, State, whitening
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_problems import CALIBRATION_SIGMA, N_CALIBRATION, made_problem, random_state
 

@@ -6,18 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline import goodness, pipeline
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.covariance_parts import CovarianceParts
-from groundsbot.offline.effort import Effort
-from groundsbot.offline.goodness import Goodness, fitted_windows, in_windows
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import Solution, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map import goodness_of_fit as goodness
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows, in_windows
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping import pipeline
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import Solution, solve
 from tests.made_drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
 from tests.made_long_drives import made_long_drive, with_a_moved_tag
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.offline.factors import ReadingFactors, State
-from groundsbot.offline.graduated import solve_graduated
-from groundsbot.offline.robust import SQUARES, huber, truncated
-from groundsbot.offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, Solution, solve
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.offline.sam.factors.losses import SQUARES, huber, truncated
+from groundsbot.offline.sam.factors.planar import ReadingFactors, State
+from groundsbot.offline.sam.graduated import solve_graduated
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, Solution, solve
 from tests.benchmarks.solver_world import SIGMA_START, Fleet, made_fleet
 
 # Beyond this lies one good reading in a million.

@@ -11,14 +11,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundsbot.calib import se2, wheels
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.offline.import_forms import WheelScale, read_odometry
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.importers import import_folder
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.message_decoder import LogMessage
+from groundsbot.calib.geometry import se2, wheels
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.offline.importing.csv.forms import read_odometry
+from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.robot import ImportOptions, WheelScale
+from groundsbot.onboard.log.reading.decoder import LogMessage
+from groundsbot.onboard.log.reading.reader import read_log
 from tests.made_imports import (
     OBSERVATIONS,
     ODOMETRY,

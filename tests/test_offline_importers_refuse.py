@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.offline.csv_table import read_table
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.importers import import_folder
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import PlanarOdometry
+from groundsbot.offline.foundation.csv_table import read_table
+from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.robot import ImportOptions
+from groundsbot.onboard.log.messages import PlanarOdometry
+from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.made_imports import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, imported
 
 BAD_ODOMETRY = [

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import Robot, Wheels
-from groundsbot.offline.info import LogInfo, describe_log
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
+from groundsbot.calib.robot.robot import Robot, Wheels
+from groundsbot.offline.logs.info import LogInfo, describe_log
+from groundsbot.onboard.log.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
+from groundsbot.onboard.log.writing.writer import LogWriter
 
 MS = 1_000_000
 ROBOT = Robot(

@@ -1,11 +1,11 @@
-"""How many drives may be mapped together: offline/inputs.py."""
+"""How many drives may be mapped together: offline/foundation/input_budget.py."""
 
 from pathlib import Path
 
 import pytest
 
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.inputs import ALONE, Inputs, size_bytes
+from groundsbot.offline.foundation.input_budget import ALONE, Inputs, size_bytes
 
 
 def test_drives_that_were_driven_may_be_any_number() -> None:

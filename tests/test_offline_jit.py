@@ -11,8 +11,8 @@ import numba
 import numpy as np
 import pytest
 
-from groundsbot.offline import jit
-from groundsbot.offline.jit import COMPILING, compilation_announced, jitted
+from groundsbot.offline.foundation import jit
+from groundsbot.offline.foundation.jit import COMPILING, compilation_announced, jitted
 
 
 def test_compiles_where_no_cache_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,11 +68,13 @@ def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> Non
     package = made_package(tmp_path)
     callee, caller = package / "callee.py", package / "caller.py"
     caller.write_text(
-        "from groundsbot.offline.callee import f\nfrom groundsbot.offline.jit import jitted\n@jitted\ndef g(x):\n    return f(x)\n"
+        "from groundsbot.offline.callee import f\nfrom groundsbot.offline.foundation.jit import jitted\n@jitted\ndef g(x):\n    return f(x)\n"
     )
     found = []
     for plus in ("1.0", "2.0"):
-        callee.write_text(f"from groundsbot.offline.jit import jitted\n@jitted\ndef f(x):\n    return x + {plus}\n")
+        callee.write_text(
+            f"from groundsbot.offline.foundation.jit import jitted\n@jitted\ndef f(x):\n    return x + {plus}\n"
+        )
         found.append(float(printed_by("from groundsbot.offline.caller import g; print(g(1.0))", tmp_path)))
     assert found == [2.0, 3.0]
 
@@ -85,7 +87,7 @@ def test_caches_that_nobody_used_for_long_are_removed(tmp_path: Path) -> None:
     for folder in folders.values():
         (folder / "inside").mkdir(parents=True)
         (folder / "inside" / "f.nbi").write_bytes(b"compiled")
-    program = "import numba, groundsbot.offline.jit; print(numba.config.CACHE_DIR)"
+    program = "import numba, groundsbot.offline.foundation.jit; print(numba.config.CACHE_DIR)"
     used = Path(printed_by(program, tmp_path, NUMBA_CACHE_DIR=str(caches)).strip())
     day_s, now_s = 86_400.0, time.time()
     for folder, age in zip((*folders.values(), used), (31.0, 29.0, 31.0, 31.0, 31.0), strict=True):

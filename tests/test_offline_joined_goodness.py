@@ -5,15 +5,15 @@ from functools import cache
 
 import pytest
 
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.goodness import Goodness, fitted_windows
-from groundsbot.offline.joined_goodness import joined_goodness
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import merge
-from groundsbot.offline.run_noise import fit_and_weigh
-from groundsbot.offline.solver import Solution
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.goodness_of_fit import joined_goodness
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.sam.solver import Solution
 from tests.made_moves import CLEAN, MOVED, made_scene
 
 

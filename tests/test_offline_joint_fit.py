@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.alignment import align
-from groundsbot.offline.condensed import condense
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.joint_fit import JointFit, hold
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import Group
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.condensed_map import condense
+from groundsbot.offline.alignment.joint_fit import JointFit, hold
+from groundsbot.offline.alignment.merging import Group
+from groundsbot.offline.alignment.pairwise import align
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from tests.made_long_drives import NOISE, made_long_drive, made_town
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.factors import Columns, Linearised, State, stacked, whitening
-from groundsbot.offline.measured_factors import KnownPlaces
-from groundsbot.offline.solver import PLAIN_SQUARES, Problem, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.sam.factors.planar import Columns, Linearised, State, stacked, whitening
+from groundsbot.offline.sam.factors.priors import KnownPlaces
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.made_graphs import made_graph, with_measured
 
 

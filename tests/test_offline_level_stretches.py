@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import load_world
-from groundsbot.offline.map_command import as_json, summary
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.run_tags import Detections
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import load_world
+from groundsbot.offline.commands.map_drives import as_json, summary
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.made_drives import HALL, MadeTag, S, made_drive, made_robot, write_drive
 
 WORD = "is not level with the rest"

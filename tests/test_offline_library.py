@@ -45,7 +45,7 @@ def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.C
 
 
 def test_the_library_gives_what_the_command_does(recordings: Path) -> None:
-    from groundsbot.offline.map_command import MapOptions, make_map
+    from groundsbot.offline.commands.map_drives import MapOptions, make_map
 
     logs = groundsbot.find_logs([recordings])
     by_hand = groundsbot.build_map([groundsbot.load_run(log) for log in logs])

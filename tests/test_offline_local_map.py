@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.offline import local_map
-from groundsbot.offline.chain import Chain
-from groundsbot.offline.coarse_chain import coarse_keyframes, coarsened, refined
-from groundsbot.offline.effort import Effort
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.solver import solve
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map import local_map
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.subsampling import coarse_keyframes, coarsened, refined
+from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.convergence_study import is_right, missed_bounds, study_seed
 from tests.made_long_drives import made_long_drive
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import groundsbot
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.localizing import localize
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.result import Component, MapResult
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.localization.localization import localize
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.made_drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Run as Program
 

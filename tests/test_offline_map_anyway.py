@@ -10,9 +10,9 @@ import pytest
 from google.protobuf.message import Message
 from mcap.reader import make_reader
 
-from groundsbot.calib.command_line import EXIT_WITH_LOSSES
-from groundsbot.offline.map_io import read_map
-from groundsbot.onboard.messages import RunInfo, TagDetections, WheelEncoders
+from groundsbot.calib.foundation.command_line import EXIT_WITH_LOSSES
+from groundsbot.offline.maps.files import read_map
+from groundsbot.onboard.log.messages import RunInfo, TagDetections, WheelEncoders
 from tests.made_drives import FAMILY, START_NS, MadeTag, made_drive, made_robot, write_drive
 from tests.map_cases import DRIVES, TAGS, imported_log, rewritten, spliced
 from tests.programs import Run

@@ -5,7 +5,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from groundsbot.offline.map_io import read_map
+from groundsbot.offline.maps.files import read_map
 from tests.made_drives import made_robot, write_drive
 from tests.map_cases import DRIVES, TAGS
 from tests.programs import Run

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.trajectory_file import read_tum, write_tum
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.maps.tum import read_tum, write_tum
 from tests.made_maps import START_B, made_component, made_map
 
 

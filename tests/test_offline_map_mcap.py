@@ -9,9 +9,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from groundsbot.offline.map_mcap import write_mcap
-from groundsbot.offline.result import MapResult, TagPose
-from groundsbot.onboard.messages import TOPICS, nanoseconds
+from groundsbot.offline.maps.mcap import write_mcap
+from groundsbot.offline.maps.result import MapResult, TagPose
+from groundsbot.onboard.log.messages import TOPICS, nanoseconds
 from tests.made_maps import made_component, made_map
 
 T_BASE_CAMERA = np.array([0.2, 0.05, 0.4, -0.5, 0.5, -0.5, 0.5])

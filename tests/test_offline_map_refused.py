@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib.camera_file import write_camera_yaml
-from groundsbot.calib.robot import write_robot_yaml
-from groundsbot.onboard.messages import WheelEncoders
+from groundsbot.calib.camera.file import write_camera_yaml
+from groundsbot.calib.robot.robot import write_robot_yaml
+from groundsbot.onboard.log.messages import WheelEncoders
 from tests.made_drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_robot, write_drive
 from tests.map_cases import DRIVES, TAGS, imported_log, rewritten
 from tests.programs import Run
@@ -107,7 +107,7 @@ def test_a_disk_that_is_full_leaves_everything_as_it_was(
         path.write_bytes(b"half a pic")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("groundsbot.offline.map_command.write_picture", full)
+    monkeypatch.setattr("groundsbot.offline.commands.map_drives.write_picture", full)
     assert "No space left on device" in refused(logs["b"], "--overwrite")
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
     assert "No space left on device" in refused(logs["b"], output=tmp_path / "new")

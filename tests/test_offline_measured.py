@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.factors import Columns, State, whitening
-from groundsbot.offline.measured import (
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import (
     MeasuredDistance,
     Measurements,
     TapeOptions,
@@ -15,8 +15,8 @@ from groundsbot.offline.measured import (
     parse_measurements,
     parse_start,
 )
-from groundsbot.offline.measured_factors import DistanceFactors, StartFactors
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.sam.factors.planar import Columns, State, whitening
+from groundsbot.offline.sam.factors.priors import DistanceFactors, StartFactors
 
 RUNS = ("a_one", "b_one", "c=d_one")
 TAGS = (TagKey("tag36h11", 7), TagKey("tag25h9", 7), TagKey("tag36h11", 8))

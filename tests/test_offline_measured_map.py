@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.robot import Robot
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.robot import Robot
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measured import TapeOptions
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.stages import Stages
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import TapeOptions
 from tests.made_drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.programs import Outcome
 from tests.programs import Run as Program

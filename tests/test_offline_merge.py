@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.alignment_effort import AlignmentEffort, AlignmentTooLongError
-from groundsbot.offline.chain import chains_of
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measured import Placement
-from groundsbot.offline.merge import Merge, merge
-from groundsbot.offline.merge_report import alignment_results, merge_warnings
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.budget import AlignmentEffort, AlignmentTooLongError
+from groundsbot.offline.alignment.merging import Merge, merge
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.merge_report import alignment_results, merge_warnings
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import Placement
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run
 
 HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(12)}

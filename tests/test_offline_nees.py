@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.nees import nees_per_dim, tangent_errors
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.evaluation.nees import nees_per_dim, tangent_errors
 
 _N_STEPS = 12
 _STEP_M = 5.0

@@ -6,17 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline import noise_fit
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.odometry import ODOMETRY_NOISE
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.run import load_run
-from groundsbot.offline.run_noise import NOT_NEEDED, fit_and_weigh, weighed_as
-from groundsbot.offline.workings import Workings
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.parameter_results import NOT_NEEDED
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.motion_model.odometry import ODOMETRY_NOISE
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.noise import fit as noise_fit
+from groundsbot.offline.noise.reweighing import fit_and_weigh, weighed_as
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.noise_study import Mapped, study_seed, summary
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 

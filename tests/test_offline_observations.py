@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.robot import Robot
-from groundsbot.calib.tag_edges import moved_out
-from groundsbot.offline.corner_noise import refined_bias_px
-from groundsbot.offline.observations import check_tag_sizes, read_detections, read_positions
-from groundsbot.offline.readings import Readings
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import Detections, Positions, TagKey
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.robot import Robot
+from groundsbot.calib.tags.edges import moved_out
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
+from groundsbot.offline.measurements.sensor_model.observations import check_tag_sizes, read_detections, read_positions
+from groundsbot.offline.measurements.sensor_model.readings import Readings
+from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, seen_corners_px
 
 NOISE = NoiseParameters()

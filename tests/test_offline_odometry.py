@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundsbot.calib import se2, wheels
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.odometry import ChainOdometry, WheelTrack, chained, compose_odometry
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2, wheels
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry, WheelTrack, compose_odometry
 from tests.made_drives import START_NS, MadeDrive, S, made_drive
 
 TRACK_M = 0.5
@@ -50,7 +51,7 @@ def test_how_finely_readings_are_spaced_makes_no_difference() -> None:
 
 @pytest.mark.parametrize("leg", [(0.5, 0.5), (0.3, 0.7), (-0.4, -0.2)])
 def test_covariance_is_that_of_the_noise_model(leg: tuple[float, float]) -> None:
-    """Against 4000 drives with the noise that groundsbot.calib.noise describes, small step by small step."""
+    """Against 4000 drives with the noise that groundsbot.calib.robot.noise describes, small step by small step."""
     made = made_drive([0.0, 0.0, 0.0], [(*leg, 2.0)], TRACK_M, S // 20)
     # Sideways noise beyond what robots have, so that it counts beside what the heading does.
     noise = NoiseParameters(sigma_lateral_m_per_sqrt_m=0.02)

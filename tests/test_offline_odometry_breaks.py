@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.offline.grown_parts import Grown
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.odometry import WheelTrack
-from groundsbot.offline.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers.grown_segments import Grown
+from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
 from tests.benchmarks.breaks_study import broken_drive, outcome_of, summary
 from tests.made_breaks import made_clean_drive
 from tests.made_drives import FAMILY, made_drive, made_positions, made_robot, made_run

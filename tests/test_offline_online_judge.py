@@ -6,9 +6,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from groundsbot.offline.online_judge import TagJudge
-from groundsbot.offline.online_root import Lifted, OnlineRoot
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.offline.localization.online.information_root import Lifted, OnlineRoot
+from groundsbot.offline.localization.online.tag_test import TagJudge
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 
 TAGS = [TagKey("tag36h11", i) for i in range(6)]
 HELD = {i: TAGS[i] for i in range(4)}

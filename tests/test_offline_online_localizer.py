@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import groundsbot
-from groundsbot.offline.chain import Chain
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.localization import LocatedRun
-from groundsbot.offline.localizing import localize_maps
-from groundsbot.offline.online_drive import TagReading
-from groundsbot.offline.online_localizer import OnlineLocalizer
+from groundsbot.offline.localization.localization import localize_maps
+from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
+from groundsbot.offline.localization.result import LocatedRun
+from groundsbot.offline.measurements.chain import Chain
 from tests.benchmarks.localize_study import Scene, against, filtered, judged, made_scene, missed, taken_one_by_one
 
 

@@ -6,18 +6,18 @@ from itertools import repeat
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline import online_root
-from groundsbot.offline.factors import State, stacked
-from groundsbot.offline.graph import Graph, build_graph, unheld
-from groundsbot.offline.online_drive import Table
-from groundsbot.offline.online_localizer import OnlineLocalizer
-from groundsbot.offline.online_prior import OnlinePrior
-from groundsbot.offline.online_root import OnlineRoot
-from groundsbot.offline.online_turn import Known, pose_among, turned
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import HUBER_THRESHOLD
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.localization.online import information_root as online_root
+from groundsbot.offline.localization.online.drive import Table
+from groundsbot.offline.localization.online.information_root import OnlineRoot
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
+from groundsbot.offline.localization.online.moving_frame import Known, pose_among, turned
+from groundsbot.offline.localization.online.prior import OnlinePrior
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.factors.planar import State, stacked
+from groundsbot.offline.sam.graph import Graph, build_graph, unheld
+from groundsbot.offline.sam.solver import HUBER_THRESHOLD
 from tests.benchmarks.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one
 
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
-from groundsbot.offline.label_places import place_labels
-from groundsbot.offline.picture import draw_map, write_picture
-from groundsbot.offline.result import Component, MapResult
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.report.label_places import place_labels
+from groundsbot.offline.report.picture import draw_map, write_picture
 from tests.made_maps import START_B, made_component, made_map, made_run
 
 

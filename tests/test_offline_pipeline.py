@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World, load_world
-from groundsbot.offline.chain import chains_of
+from groundsbot.fixtures.worlds.world import World, load_world
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation import evaluate
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import Component, MapResult
-from groundsbot.offline.run import load_run
-from groundsbot.offline.truth import read_truth
-from groundsbot.onboard.log_reader import find_logs, read_log
-from groundsbot.onboard.messages import TagDetections
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.onboard.log.messages import TagDetections
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.benchmarks.accuracy_study import medians, missed_bounds, run_study, study_seed
 from tests.made_drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, made_run, write_drive
 

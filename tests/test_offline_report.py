@@ -8,17 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.offline.map_command import MapOptions, make_map
-from groundsbot.offline.map_json import map_as_json
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.report import write_report
-from groundsbot.offline.report_data import figures
-from groundsbot.offline.report_page import as_script_data, page
-from groundsbot.offline.report_tables import tables
-from groundsbot.offline.report_words import sentences
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import RunEvent
-from groundsbot.offline.workings import Workings
+from groundsbot.offline.commands.map_drives import MapOptions, make_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import RunEvent
+from groundsbot.offline.report.figures import figures
+from groundsbot.offline.report.page import as_script_data, page
+from groundsbot.offline.report.report import write_report
+from groundsbot.offline.report.sentences import sentences
+from groundsbot.offline.report.tables import tables
 from tests.browser import Page, browser, chromium
 from tests.made_drives import START_NS, S, made_robot, write_drive
 from tests.map_cases import DRIVES, TAGS
@@ -240,9 +241,9 @@ def test_several_components(logs: list[Path], tmp_path: Path) -> None:
 
 def test_long_drives_are_thinned(inside: Inside) -> None:
     # Ten runs of 10,000 keyframes: what a figure takes may not grow with the drive.
-    from groundsbot.offline.report_data import _MOST_POINTS, _trace
-    from groundsbot.offline.report_timeline import _MOST_POINTS as _MOST_TIMES
-    from groundsbot.offline.report_timeline import timeline
+    from groundsbot.offline.report.figures import _MOST_POINTS, _trace
+    from groundsbot.offline.report.timeline import _MOST_POINTS as _MOST_TIMES
+    from groundsbot.offline.report.timeline import timeline
 
     poses = np.cumsum(np.full((10_000, 3), 0.0421), axis=0) * 10.0
     trace = _trace("a_one", {"a_one": "#000000"}, poses)

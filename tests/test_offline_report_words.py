@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from groundsbot.offline.map_json import map_as_json
-from groundsbot.offline.report_joins import essential_tags
-from groundsbot.offline.report_tables import tables
-from groundsbot.offline.report_words import largest_sigma_m, sentences
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.report.join_tables import essential_tags
+from groundsbot.offline.report.sentences import largest_sigma_m, sentences
+from groundsbot.offline.report.tables import tables
 from tests.made_maps import made_component, made_map
 
 

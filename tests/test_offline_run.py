@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib import se2
-from groundsbot.calib.camera_file import write_camera_yaml
+from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import write_robot_yaml
-from groundsbot.calib.tag_edges import outward
-from groundsbot.offline.run import RobotFile, load_run, read_robot_file
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.stretches import wheel_distances
-from groundsbot.onboard.log_head import log_head
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.messages import (
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.robot import write_robot_yaml
+from groundsbot.calib.tags.edges import outward
+from groundsbot.offline.measurements.motion_model.stretches import wheel_distances
+from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.onboard.log.head import log_head
+from groundsbot.onboard.log.messages import (
     CameraCalibration,
     PlanarOdometry,
     RunInfo,
@@ -28,6 +27,7 @@ from groundsbot.onboard.messages import (
     TagObservations,
     WheelEncoders,
 )
+from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.made_drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
 
 ROBOT = made_robot(wheels={"radius_left_m": 0.1, "radius_right_m": 0.11, "track_m": 0.5, "ticks_per_turn": 1000.0})

@@ -6,10 +6,10 @@ import pytest
 
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.new_log import new_log
-from groundsbot.offline.salvage import salvage
+from groundsbot.offline.logs.new_log import new_log
+from groundsbot.offline.logs.salvaging import salvage
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log_writer import LogWriter
+from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.made_logs import drive, write_log
 
 

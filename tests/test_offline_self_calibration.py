@@ -8,29 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.camera_file import read_camera_yaml
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.calib.robot import Robot, read_robot_yaml, write_robot_yaml
+from groundsbot.calib.camera.file import read_camera_yaml
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS
+from groundsbot.calib.robot.robot import Robot, read_robot_yaml, write_robot_yaml
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import load_world
-from groundsbot.offline.chain import chains_of
-from groundsbot.offline.corner_factors import FOCAL_SCALE
-from groundsbot.offline.effort import Effort
+from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.graph import TAG_SCALE, Parameter, parameters_of_wheels
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.odometry import WHEEL_PARAMETERS
-from groundsbot.offline.parameter_results import CalibrationChoice
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import RobotFile, load_run, read_robot_file
-from groundsbot.offline.self_calibration_gate import TELLS_LESS, Told, choose
-from groundsbot.offline.self_calibration_option import NAMES, Calibrate, parse_calibrate
-from groundsbot.offline.self_calibration_robot import LIMITS, Learnt, Owned, all_open, corrected, opened
-from groundsbot.offline.self_calibration_told import told_by
-from groundsbot.offline.self_calibration_words import DRIVES, freed_lines
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.parameter_results import CalibrationChoice
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
+from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
+from groundsbot.offline.self_calibration.robot import LIMITS, Learnt, Owned, all_open, corrected, opened
+from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose
+from groundsbot.offline.self_calibration.words import DRIVES, freed_lines
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy import with_wide_priors
 from tests.made_drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
 from tests.programs import Run as Program

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.offline.factors import State
-from groundsbot.offline.goodness import fitted_windows, in_windows
-from groundsbot.offline.graph import Graph, build_graph
-from groundsbot.offline.measured_factors import DistanceFactors, Measured, StartFactors
-from groundsbot.offline.shared_errors import SharedErrors, fit_shared_errors
-from groundsbot.offline.solver import PLAIN_SQUARES, solve
+from groundsbot.offline.local_map.correlated_errors import SharedErrors, fit_shared_errors
+from groundsbot.offline.local_map.goodness_of_fit import fitted_windows, in_windows
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
+from groundsbot.offline.sam.graph import Graph, build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.made_long_drives import LongDrive, made_long_drive, with_a_moved_tag, with_drifting_readings
 
 LENGTH_M = 500.0

@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2, wheels
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import chains_of
-from groundsbot.offline.factors import OdometryFactors, State
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.odometry import WheelTrack, chained
-from groundsbot.offline.robust import cauchy, losses_and_weights
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2, wheels
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.factors.losses import cauchy, losses_and_weights
+from groundsbot.offline.sam.factors.planar import OdometryFactors, State
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, START_NS, made_positions, made_robot, made_run
 from tests.made_problems import CHAINS, N_TAGS, made_problem, random_state

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.offline import stages as stages_module
-from groundsbot.offline.stages import Stages
+from groundsbot.offline.foundation import stages as stages_module
+from groundsbot.offline.foundation.stages import Stages
 from tests.made_drives import MadeTag, made_drive, made_robot, write_drive
 from tests.programs import Run, on_terminal
 
@@ -43,9 +43,9 @@ def test_beginning_and_progress_are_told() -> None:
 
 def test_a_stage_in_parts_is_one_stage_and_failures_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([1.0, 3.5, 10.0, 10.25, 20.0, 21.0])
-    monkeypatch.setattr("groundsbot.offline.stages.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("groundsbot.offline.foundation.stages.time.perf_counter", lambda: next(clock))
     cpu_clock = iter([0.0, 2.0, 3.0, 3.25, 4.0, 4.5])
-    monkeypatch.setattr("groundsbot.offline.stages.time.process_time", lambda: next(cpu_clock))
+    monkeypatch.setattr("groundsbot.offline.foundation.stages.time.process_time", lambda: next(cpu_clock))
     stages = Stages()
     with stages.stage("graph"):
         pass

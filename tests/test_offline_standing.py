@@ -8,13 +8,14 @@ import pytest
 from scipy.stats import chi2
 
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World
-from groundsbot.offline.evaluation import evaluate
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import Component
-from groundsbot.offline.run import load_run
-from groundsbot.offline.truth import read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import World
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import Component
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.made_drives import MadeDrive, MadeTag, made_drive, made_robot, write_drive
 
 HALL = [

@@ -5,12 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.odometry import WheelTrack, compose_odometry
-from groundsbot.offline.step_covariance import given_covariances, growth
-from groundsbot.onboard.messages import PlanarOdometry
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances, growth
+from groundsbot.onboard.log.messages import PlanarOdometry
 from tests.made_drives import S, made_drive
 from tests.made_steps import accumulated, covariances_of_steps
 

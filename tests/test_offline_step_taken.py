@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.arrowhead import Arrowhead
-from groundsbot.offline.factors import State
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.solver import PLAIN_SQUARES, solve
-from groundsbot.offline.step_taken import Before, take_step
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.arrowhead.system import Arrowhead
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
+from groundsbot.offline.sam.step import Before, take_step
 from tests.made_graphs import made_graph
 from tests.made_long_drives import made_long_drive
 

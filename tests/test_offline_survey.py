@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.result import Component, MapResult, TagResult
-from groundsbot.offline.survey import SurveyEntry, judge_survey, read_survey
+from groundsbot.offline.evaluation.survey import SurveyEntry, judge_survey, read_survey
+from groundsbot.offline.maps.result import Component, MapResult, TagResult
 from tests.made_maps import made_component, made_map
 
 _N_TAGS = 15

@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline import arrowhead_covariance
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.map_command import exit_code, summary
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.map_json import map_as_json
-from groundsbot.offline.merge import merge
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import PLAIN_SQUARES, solve
-from groundsbot.offline.stages import Stages
-from groundsbot.offline.suspects import Searched, split_together
-from groundsbot.offline.suspects_evidence import gathered, heard, noise_scales
-from groundsbot.offline.suspects_information import rows_of
-from groundsbot.offline.suspects_phantoms import Views, chances
-from groundsbot.offline.suspects_places import NOWHERE, gain_of, settled
-from groundsbot.offline.suspects_sightings import Sightings, instances, sightings_of, with_instances
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.commands.map_drives import exit_code, summary
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
+from groundsbot.offline.outliers.false_detections import Views, chances
+from groundsbot.offline.outliers.joint_information import rows_of
+from groundsbot.offline.outliers.places import NOWHERE, gain_of, settled
+from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
+from groundsbot.offline.outliers.split import Searched, split_together
+from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.made_drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
 from tests.made_moves import made_scene
 

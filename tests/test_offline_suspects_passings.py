@@ -5,16 +5,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline import suspects_passings
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.graph import Graph, build_graph
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.suspects import split_alone
-from groundsbot.offline.suspects_passings import few_of_each_tag
-from groundsbot.offline.suspects_sightings import sightings_of
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers import grouping as suspects_passings
+from groundsbot.offline.outliers.grouping import few_of_each_tag
+from groundsbot.offline.outliers.sightings import sightings_of
+from groundsbot.offline.outliers.split import split_alone
+from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.made_drives import FAMILY, S, made_drive, made_positions, made_run
 
 TAGS_M = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0], [0.5, -1.5]])

@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from groundsbot.offline.alignment_rivals import chance_nats
-from groundsbot.offline.tag_fit import TAG_GATE, ill_fitting, log_wrong, squared_sigmas, worth_nats
+from groundsbot.offline.alignment.model_selection import chance_nats
+from groundsbot.offline.alignment.tag_gate import TAG_GATE, ill_fitting, log_wrong, squared_sigmas, worth_nats
 
 
 def test_a_wrong_tag_is_somewhere_and_each_order_of_magnitude_is_as_likely() -> None:

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.map_io import read_map, write_map
-from groundsbot.offline.map_json import map_as_json
-from groundsbot.offline.measured import TapeOptions
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.report_tables import tables
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.run_tags import Detections
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.offline.measurements.tape import TapeOptions
+from groundsbot.offline.report.tables import tables
 from tests.benchmarks.tag_join_study import study_seed
 from tests.made_drives import HALL, made_drive, made_robot, write_drive
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import BoolArray, FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Robot
-from groundsbot.offline.observations import MAX_RANGE_SIGMA_PER_M
-from groundsbot.offline.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray
+from groundsbot.calib.robot.robot import Robot
+from groundsbot.offline.measurements.sensor_model.observations import MAX_RANGE_SIGMA_PER_M
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
 from tests.made_drives import CAMERA, MadeTag, made_robot, seen_corners_px
 
 SIGMA_PX = 0.2
@@ -54,7 +54,7 @@ def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAM
 
 
 def used(found: TagReadings) -> BoolArray:
-    """As groundsbot.offline.observations gates the range."""
+    """As groundsbot.offline.measurements.sensor_model.observations gates the range."""
     gate = (MAX_RANGE_SIGMA_PER_M * found.range_bearing[:, 0]) ** 2
     return np.asarray(found.valid & (found.covariance[:, 0, 0] < gate))
 

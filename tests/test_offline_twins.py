@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.arrays import IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import chains_of
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import Detections, TagKey
-from groundsbot.offline.suspects import split_alone
-from groundsbot.offline.twins import told_apart
+from groundsbot.calib.foundation.arrays import IntArray
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
+from groundsbot.offline.outliers.duplicate_ids import told_apart
+from groundsbot.offline.outliers.split import split_alone
 from tests.made_drives import (
     CAMERA,
     FAMILY,

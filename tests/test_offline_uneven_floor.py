@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import load_world
-from groundsbot.offline.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
-from groundsbot.offline.observations import read_detections
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.rolling_shutter import read_at_once
-from groundsbot.offline.run_tags import Detections, TagKey
-from groundsbot.offline.tag_pose import TagReadings, upright_readings
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import load_world
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
+from groundsbot.offline.measurements.sensor_model.observations import read_detections
+from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
+from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy import rough
 from tests.made_drives import CAMERA, FAMILY, MadeTag, made_drive, made_robot, made_run, seen_corners_px
 

@@ -8,14 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.corner_factors import SpatialColumns, SpatialState
-from groundsbot.offline.map_model import MapModel
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.upright import UprightFactors
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.corners.factors import SpatialColumns, SpatialState
+from groundsbot.offline.corners.upright_prior import UprightFactors
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.model import MapModel
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run, load_run
 from tests.made_drives import HALL, MadeTag, made_drive, made_robot, write_drive
 from tests.programs import Run as Program
 from tests.test_offline_tag_joins import seeing

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
-from groundsbot.offline.variance_look import Components, Part
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.noise.likelihood import Components, Part
+from groundsbot.offline.noise.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
 from tests.made_problems import MadeProblem, made_problem
 
 _NOISE = 0.7

@@ -10,21 +10,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
-from groundsbot.offline.graph import Graph, build_graph
-from groundsbot.offline.import_robot import ImportOptions
-from groundsbot.offline.importers import import_folder
-from groundsbot.offline.map_json import map_as_json
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import PLAIN_SQUARES, Problem, Solution, solve
-from groundsbot.offline.weak_parts import weak_parts
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.global_map.weak_constraints import weak_parts
+from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.robot import ImportOptions
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.graph import Graph, build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.plain_solver import plain_normal_equations
 from tests.made_drives import FAMILY, MadeDrive, made_drive, made_positions, made_robot, made_run
 from tests.made_graphs import made_graph, with_measured

@@ -8,14 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.picture_bytes import is_jpeg
-from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, VideoCamera, camera_for
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
+from groundsbot.calib.foundation.picture_bytes import is_jpeg
+from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, VideoCamera
+from groundsbot.onboard.camera.factory import camera_for
+from groundsbot.onboard.camera.folder import FolderCamera
+from groundsbot.onboard.camera.v4l2 import V4l2Camera
+from groundsbot.onboard.detection.child_process import ChildDetector, DetectionResult, DetectorSettings
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.messages import StampSource
-from groundsbot.onboard.picture_folder import FolderCamera
-from groundsbot.onboard.v4l2_camera import V4l2Camera
+from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.process.clock import RunClock
 from tests.fake_capture import FakeCapture
 from tests.live_recording import has_ended
 from tests.tag_pictures import draw_tag

@@ -18,17 +18,17 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.fixtures.devices import PictureFolder
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.fixtures.recording.devices import PictureFolder
 from groundsbot.onboard import cli
-from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
-from groundsbot.onboard.capture import Capture
-from groundsbot.onboard.capture_guide import Advice, CaptureGuide
-from groundsbot.onboard.capture_view import CaptureView
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.detection_process import Picture
+from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraLostError, Frame
+from groundsbot.onboard.capture.capture import Capture
+from groundsbot.onboard.capture.guide import Advice, CaptureGuide
+from groundsbot.onboard.capture.view import CaptureView
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.messages import StampSource
+from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.log.picture import Picture
+from groundsbot.onboard.process.clock import RunClock
 from tests.board_views import good_views, rendered
 from tests.live_recording import PATIENCE_S, until
 from tests.programs import running
@@ -223,7 +223,7 @@ def test_a_camera_that_falls_silent_is_not_waited_for_forever(tmp_path: Path, mo
         def read(self, timeout_s: float) -> list[Frame]:
             return []
 
-    monkeypatch.setattr("groundsbot.onboard.capture._SILENT_NS", 50 * MS)
+    monkeypatch.setattr("groundsbot.onboard.capture.capture._SILENT_NS", 50 * MS)
     camera = Silent([])
     guide, said = CaptureGuide(DEFAULT_BOARD, 3), list[object]()
     capture = Capture(

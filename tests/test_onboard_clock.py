@@ -5,9 +5,9 @@ import random
 
 import pytest
 
-from groundsbot.onboard.clock import DeviceClockFilter, RunClock, read_clocks
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
-from groundsbot.onboard.wheel_intake import WheelIntake
+from groundsbot.onboard.process.clock import DeviceClockFilter, RunClock, read_clocks
+from groundsbot.onboard.wheels.intake import WheelIntake
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
 HOST_NS = 1_800_000_000_000_000_000
 MS = 1_000_000

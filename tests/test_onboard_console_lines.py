@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from groundsbot.onboard.console_lines import ConsoleLines
+from groundsbot.onboard.process.console_lines import ConsoleLines
 
 LIMIT_S = 60.0  # only what hangs comes near
 

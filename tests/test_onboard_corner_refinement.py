@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.onboard.corner_refinement import refined_corners
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.onboard.detection.corner_refinement import refined_corners
+from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.benchmarks.corner_error_study import CASES, Case, Errors, pictures_of, study_case
 from tests.tag_pictures import draw_tag
 

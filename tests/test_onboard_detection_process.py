@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.onboard import detection_process
-from groundsbot.onboard.detection_process import ChildDetector, DetectionResult, DetectorSettings
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.onboard.detection import child_process as detection_process
+from groundsbot.onboard.detection.child_process import ChildDetector, DetectionResult, DetectorSettings
+from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.live_recording import has_ended, tag_jpeg, until
 
 LIMIT_S = 60.0  # only what hangs comes near

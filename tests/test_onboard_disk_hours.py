@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.onboard import check
-from groundsbot.onboard.camera import Camera, CameraEndedError, CameraSettings, Frame
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.disk_hours import Load, hours_until_full
-from groundsbot.onboard.disk_room import DiskRoom, space_policy
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_segments import SegmentLimits
-from groundsbot.onboard.log_thread import _PERIOD_S
-from groundsbot.onboard.messages import StampSource
-from groundsbot.onboard.recorder import RecorderCore, Run
-from groundsbot.onboard.robot_files import RobotFiles
-from groundsbot.onboard.status import Look, Rates
-from groundsbot.onboard.storage import Disk
-from groundsbot.onboard.tag_detector import Detection
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraSettings, Frame
+from groundsbot.onboard.detection.tag_detector import Detection
+from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.log.writing.storage import Disk
+from groundsbot.onboard.monitoring import check
+from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
+from groundsbot.onboard.monitoring.status import Look, Rates
+from groundsbot.onboard.process.clock import RunClock
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.log_thread import _PERIOD_S
+from groundsbot.onboard.recorder.disk.room import DiskRoom, space_policy
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.live_recording import robot_yaml
 from tests.made_cores import CAMERA, MS, ROBOT_YAML, START_NS, S
 

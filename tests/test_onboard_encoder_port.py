@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.fixtures.devices import PtyPort
-from groundsbot.onboard.encoder_port import EncoderPort, PortLostError
+from groundsbot.fixtures.recording.devices import PtyPort
+from groundsbot.onboard.wheels.port import EncoderPort, PortLostError
 
 
 def test_a_port_that_a_recorder_reads_is_said_to_be_taken(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from groundsbot.onboard.encoder_protocol import (
+from groundsbot.onboard.wheels.protocol import (
     LINE_LIMIT_BYTES,
     EncoderParser,
     WheelLine,

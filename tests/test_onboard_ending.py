@@ -10,7 +10,7 @@ LIMIT_S = 30.0  # only a program that hangs comes near
 # The lock that the main thread holds for moments in `wait` and in `set`.
 TOLD_WHILE_LOCKED = """
 import os, signal
-from groundsbot.onboard.ending import told_to_end
+from groundsbot.onboard.process.ending import told_to_end
 stop = told_to_end()
 assert not stop.is_set()
 with stop._cond:
@@ -21,7 +21,7 @@ print(stop.wait(10.0))
 
 TOLD_WHAT_IS_IGNORED = """
 import os, signal
-from groundsbot.onboard.ending import told_to_end
+from groundsbot.onboard.process.ending import told_to_end
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
 stop = told_to_end()
 os.kill(os.getpid(), signal.SIGHUP)

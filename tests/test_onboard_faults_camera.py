@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from groundsbot.fixtures.devices import PictureFolder, at_rate
-from groundsbot.onboard.camera import CameraSettings
-from groundsbot.onboard.clock import ClockReading, RunClock
-from groundsbot.onboard.detection_process import ChildDetector, DetectorSettings
-from groundsbot.onboard.encoder_protocol import format_line
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import ClockAnchor, EventKind, StampSource
-from groundsbot.onboard.robot_files import RobotFiles
-from groundsbot.onboard.tag_detector import Detection, TagDetector
-from groundsbot.onboard.v4l2_camera import V4l2Camera
+from groundsbot.fixtures.recording.devices import PictureFolder, at_rate
+from groundsbot.onboard.camera.camera import CameraSettings
+from groundsbot.onboard.camera.v4l2 import V4l2Camera
+from groundsbot.onboard.detection.child_process import ChildDetector, DetectorSettings
+from groundsbot.onboard.detection.tag_detector import Detection, TagDetector
+from groundsbot.onboard.log.messages import ClockAnchor, EventKind, StampSource
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.process.clock import ClockReading, RunClock
+from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.wheels.protocol import format_line
 from tests.fake_capture import FakeCapture
 from tests.live_recording import Driver, check_gapless, recording, robot_yaml, show_until, tag_jpeg, until
 from tests.made_cores import MS, START_NS, UPTIME_NS, S, events_of, frames_of, line_of, made_core, wheels_of
@@ -143,7 +143,7 @@ def test_row_35_a_slow_detection_drops_pictures_and_does_not_fall_behind(
     tmp_path: Path, both: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RobotFiles, "detector_settings", property(lambda _: SlowSettings()))
-    monkeypatch.setattr("groundsbot.onboard.picture_folder.FolderCamera.patience_s", 0.5)
+    monkeypatch.setattr("groundsbot.onboard.camera.folder.FolderCamera.patience_s", 0.5)
     camera, picture, shown, under_way = PictureFolder(tmp_path / "pictures"), tag_jpeg(), list[int](), list[int]()
 
     def show(_index: int) -> None:
@@ -174,7 +174,9 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
     tmp_path: Path, both: Path, monkeypatch: pytest.MonkeyPatch, fault: signal.Signals, reason: str
 ) -> None:
     if fault == signal.SIGSTOP:
-        monkeypatch.setattr("groundsbot.onboard.live_recorder.ChildDetector", partial(ChildDetector, job_limit_s=2.0))
+        monkeypatch.setattr(
+            "groundsbot.onboard.recorder.live_recorder.ChildDetector", partial(ChildDetector, job_limit_s=2.0)
+        )
     camera, picture = PictureFolder(tmp_path / "pictures"), tag_jpeg()
     # More than the pipe to a process holds, so that one which takes nothing cannot be handed it.
     noise = np.random.default_rng(36).integers(0, 255, (1000, 1000), np.uint8)
@@ -243,7 +245,7 @@ def test_row_37_a_picture_named_before_a_step_keeps_its_time(monkeypatch: pytest
     monotonic_ns = UPTIME_NS
     offset_ns = START_NS - UPTIME_NS
     monkeypatch.setattr(
-        "groundsbot.onboard.clock.read_clocks", lambda: ClockReading(monotonic_ns, monotonic_ns + offset_ns)
+        "groundsbot.onboard.process.clock.read_clocks", lambda: ClockReading(monotonic_ns, monotonic_ns + offset_ns)
     )
     clock = RunClock()
     named_ns = monotonic_ns + offset_ns

@@ -14,13 +14,14 @@ from typing import Any
 import cv2
 import pytest
 
-from groundsbot.fixtures.devices import PictureFolder
-from groundsbot.onboard import check, device_threads
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.encoder_port import EncoderPort
-from groundsbot.onboard.messages import EventKind
-from groundsbot.onboard.picture_folder import FolderCamera
-from groundsbot.onboard.robot_files import RobotFiles
+from groundsbot.fixtures.recording.devices import PictureFolder
+from groundsbot.onboard.camera.folder import FolderCamera
+from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.monitoring import check
+from groundsbot.onboard.process.clock import RunClock
+from groundsbot.onboard.recorder import device_threads
+from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.wheels.port import EncoderPort
 from tests.fake_capture import FakeCapture, v4l2_camera_of
 from tests.live_recording import Driver, check_gapless, recording, robot_yaml, show_until, tag_jpeg, until
 from tests.made_cores import events_of, frames_of, wheels_of
@@ -117,7 +118,7 @@ def test_row_22_a_replug_under_another_name_is_found_by_the_link(tmp_path: Path,
 def test_row_32_a_camera_absent_unplugged_and_frozen_leaves_the_wheels_alone(
     tmp_path: Path, both: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundsbot.onboard.watches._CAMERA_SILENCE_NS", 300_000_000)
+    monkeypatch.setattr("groundsbot.onboard.recorder.watches._CAMERA_SILENCE_NS", 300_000_000)
     picture, folder = tag_jpeg(), tmp_path / "pictures"
     with Driver(tmp_path / "wheels") as driver:
         driver.plug_in()
@@ -206,7 +207,7 @@ def watched(name, *rest):
         print("seen")
     return load(name, *rest)
 builtins.__import__ = watched
-import groundsbot.onboard.cli, groundsbot.onboard.live_recorder, groundsbot.onboard.check
+import groundsbot.onboard.cli, groundsbot.onboard.recorder.live_recorder, groundsbot.onboard.monitoring.check
 """
     clean = {key: value for key, value in os.environ.items() if not key.startswith("OPENCV")}
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=clean)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.onboard import log_thread as log_thread_module
-from groundsbot.onboard.disk_room import one_recorder
 from groundsbot.onboard.errors import LogError, OnboardError
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.log_segments import SegmentLimits
-from groundsbot.onboard.log_thread import LogThread
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.recorder.disk import log_thread as log_thread_module
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.log_thread import LogThread
+from groundsbot.onboard.recorder.disk.room import one_recorder
 from tests.fake_disks import MortalDisk, TroubledDisk
 from tests.kept_logs import CORE, LIMIT_S, S, make_keeper, names, record, seen_in, stepped, texts
 from tests.made_logs import MS, START_NS, drive, picture_entry, read_all, seen, wheel_entry, write_log

@@ -16,10 +16,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from groundsbot.fixtures.devices import PictureFolder, PtyPort, paced, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, paced, wheel_line
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log_reader import find_logs, read_log
-from groundsbot.onboard.status import read_status
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from groundsbot.onboard.monitoring.status import read_status
 from tests.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
 from tests.made_cores import frames_of, wheels_of
 from tests.processor_wait import ended_within
@@ -38,8 +38,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Devices that never come back from a read, and a detection that never answers.
 BLOCKED = """
 import os, signal, time
-from groundsbot.onboard.encoder_port import EncoderPort
-from groundsbot.onboard.picture_folder import FolderCamera
+from groundsbot.onboard.wheels.port import EncoderPort
+from groundsbot.onboard.camera.folder import FolderCamera
 from functools import partial
 from onboard import live_recorder
 reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}

@@ -12,8 +12,8 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log_reader import read_log, read_run_info
-from groundsbot.onboard.messages import TOPICS, nanoseconds
+from groundsbot.onboard.log.messages import TOPICS, nanoseconds
+from groundsbot.onboard.log.reading.reader import read_log, read_run_info
 from tests.made_logs import HEADS, ChunkPlace, Seen, chunks_of, drive, read_all, write_log
 from tests.programs import Run
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.fixtures.devices import PtyPort
-from groundsbot.onboard.log_reader import find_logs, read_log
-from groundsbot.onboard.messages import Event, EventKind, StampSource
-from groundsbot.onboard.recorder import RecorderCore, Run
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.fixtures.recording.devices import PtyPort
+from groundsbot.onboard.log.messages import Event, EventKind, StampSource
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
 from tests.made_logs import CAMERA, MS, ROBOT_YAML, START_NS, drive, read_all, seen, wheel_entry, write_log
 
 ROOT = Path(__file__).parents[1]
@@ -26,11 +26,11 @@ LIMIT_S = 60.0  # only what hangs comes near
 RECORDER = """
 import itertools, os, sys, time
 from pathlib import Path
-from groundsbot.onboard.disk_room import DiskRoom, SpacePolicy
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_segments import SegmentLimits
-from groundsbot.onboard.log_thread import LogThread
-from groundsbot.onboard.storage import Disk
+from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.recorder.disk.log_thread import LogThread
+from groundsbot.onboard.log.writing.storage import Disk
 from tests.made_logs import START_NS, head, picture_entry, wheel_entry
 
 def record(folder):
@@ -59,7 +59,7 @@ sys.stdin.read()
 SALVAGER = """
 import os, signal, sys, time
 from pathlib import Path
-from groundsbot.offline.salvage import salvage
+from groundsbot.offline.logs.salvaging import salvage
 source, folder = Path(sys.argv[1]), Path(sys.argv[2])
 for delay_us in map(int, sys.argv[3:]):
     child = os.fork()
@@ -123,7 +123,7 @@ def test_row_43_salvage_killed_at_any_time(tmp_path: Path, count: int) -> None:
 
 
 def assert_salvages(source: Path, output: Path) -> None:
-    from groundsbot.offline.salvage import salvage
+    from groundsbot.offline.logs.salvaging import salvage
 
     assert all(each.is_whole for each in salvage(source, output))
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
-from groundsbot.onboard.messages import EventKind
-from groundsbot.onboard.wheel_intake import WheelIntake
+from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.wheels.intake import WheelIntake
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.guided_fuzz import fuzz
 from tests.made_cores import MS, PERIOD_NS, START_NS, S, events_of, line_of, made_core, send, wheels_of
 from tests.wheel_line_fuzz import MODULES, check, renumbered, sealed, seeds

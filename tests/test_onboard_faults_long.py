@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.fixtures.devices import PictureFolder
-from groundsbot.onboard.clock import RunClock
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
-from groundsbot.onboard.messages import StampSource
-from groundsbot.onboard.picture_folder import FolderCamera
+from groundsbot.fixtures.recording.devices import PictureFolder
+from groundsbot.onboard.camera.folder import FolderCamera
+from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.process.clock import RunClock
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.made_cores import MS, START_NS, S, made_core
 

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib import se2
-from groundsbot.calib.robot import Wheels
-from groundsbot.fixtures import recording as simulated
-from groundsbot.fixtures.drive import Drive
-from groundsbot.fixtures.encoder_sim import Controller, TimedLine
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.robot import Wheels
+from groundsbot.fixtures.drives.true_motion import Drive
+from groundsbot.fixtures.drives.wheel_controller import Controller, TimedLine
+from groundsbot.fixtures.recording import feed as simulated
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.fixtures.world import Waypoint, World, load_world
-from groundsbot.offline.run import load_run
-from groundsbot.onboard.encoder_protocol import format_line, parse_line
-from groundsbot.onboard.log_reader import find_logs
-from groundsbot.onboard.messages import EventKind
+from groundsbot.fixtures.worlds.world import Waypoint, World, load_world
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.log.reading.reader import find_logs
+from groundsbot.onboard.wheels.protocol import format_line, parse_line
 from tests.made_cores import PERIOD_NS, START_NS, S, events_of, line_of, made_core, send, wheels_of
 from tests.programs import Run
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.onboard.disk_room import BALLAST_BYTES, SpacePolicy
-from groundsbot.onboard.log_reader import read_log
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, SpacePolicy
 from tests.fake_disks import TroubledDisk
 from tests.kept_logs import CORE, MB, S, make_keeper, names, record, seen_in, stepped, texts
 from tests.made_logs import MS, START_NS, drive, picture_entry, read_all, seen, wheel_entry
@@ -61,8 +61,8 @@ def test_row_11_on_a_real_disk_that_is_full(tmp_path: Path) -> None:
     script = f"""
 import pathlib, sys
 sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.storage import Disk
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.writing.storage import Disk
 from tests.made_logs import drive
 from tests.kept_logs import make_keeper, stepped
 folder = pathlib.Path({str(tmp_path)!r})

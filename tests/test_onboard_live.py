@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.fixtures.devices import PtyPort, paced, wheel_line
-from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
-from groundsbot.onboard.messages import Event, TagDetections, WheelEncoders
-from groundsbot.onboard.picture_schedule import PictureSchedule
+from groundsbot.fixtures.recording.devices import PtyPort, paced, wheel_line
+from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
+from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.recorder.pictures import PictureSchedule
 from tests.live_recording import CORNERS, PATIENCE_S, PATIENT, robot_yaml
 from tests.made_cores import frames_of, wheels_of
 from tests.programs import running

@@ -12,14 +12,11 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Mount, parse_robot_yaml
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.robot.robot import Mount, parse_robot_yaml
 from groundsbot.onboard.errors import LogError, MessageRefusedError
-from groundsbot.onboard.log_head import camera_from_message, log_head, mount_message
-from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
-from groundsbot.onboard.log_writer import LogWriter
-from groundsbot.onboard.message_decoder import LogMessage
-from groundsbot.onboard.messages import (
+from groundsbot.onboard.log.head import camera_from_message, log_head, mount_message
+from groundsbot.onboard.log.messages import (
     CameraCalibration,
     ClockAnchor,
     CompressedImage,
@@ -30,6 +27,9 @@ from groundsbot.onboard.messages import (
     nanoseconds,
     timestamp,
 )
+from groundsbot.onboard.log.reading.decoder import LogMessage
+from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.log.writing.writer import LogWriter
 
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000

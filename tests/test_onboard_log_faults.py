@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.onboard.disk_room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_segments import LogSegments, SegmentLimits
-from groundsbot.onboard.log_thread import LogThread
-from groundsbot.onboard.log_writer import head_records
-from groundsbot.onboard.storage import Disk
+from groundsbot.onboard.log.writing.segments import LogSegments, SegmentLimits
+from groundsbot.onboard.log.writing.storage import Disk
+from groundsbot.onboard.log.writing.writer import head_records
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.log_thread import LogThread
+from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
 from tests.fake_disks import TroubledDisk
 from tests.kept_logs import LIMIT_S, MB, S, make_keeper, seen_in, texts
 from tests.live_recording import until

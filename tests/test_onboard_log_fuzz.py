@@ -4,7 +4,7 @@ from itertools import islice
 
 import pytest
 
-from groundsbot.onboard import chunk_reader
+from groundsbot.onboard.log.reading import chunks as chunk_reader
 from tests.guided_fuzz import fuzz
 from tests.log_reader_fuzz import LONGEST_BYTES, MODULES, MUTATIONS, check, seeds
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.picture_bytes import claimed_size
+from groundsbot.calib.foundation.picture_bytes import claimed_size
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.picture import decode, decode_grey
+from groundsbot.onboard.log.picture import decode, decode_grey
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

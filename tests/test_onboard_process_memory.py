@@ -9,7 +9,7 @@ import pytest
 # 40 times what a picture or a piece of a log takes: 8 MB in buffers of 1 MB, all of them written to, and gone again.
 PROGRAM = """
 import gc, resource, sys
-from groundsbot.onboard.process_memory import keep_memory
+from groundsbot.onboard.process.memory import keep_memory
 if sys.argv[1] == "kept":
     keep_memory(16 << 20)
 def faults():

@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.onboard import log_thread
-from groundsbot.onboard.disk_room import DiskRoom, SpacePolicy
-from groundsbot.onboard.encoder_protocol import format_line
+from groundsbot.calib.robot.robot import parse_robot_yaml
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log_keeper import LogKeeper
-from groundsbot.onboard.log_segments import SegmentLimits
-from groundsbot.onboard.log_thread import LogThread
-from groundsbot.onboard.messages import StampSource, TagDetections, WheelEncoders
-from groundsbot.onboard.recorder import RecorderCore, Run
-from groundsbot.onboard.storage import StoredFile
+from groundsbot.onboard.log.messages import StampSource, TagDetections, WheelEncoders
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.log.writing.storage import StoredFile
+from groundsbot.onboard.recorder.disk import log_thread
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.log_thread import LogThread
+from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.wheels.protocol import format_line
 from tests.fake_disks import MortalDisk
 from tests.made_cores import CAMERA, ROBOT_YAML, START_NS, UPTIME_NS, line_of
 from tests.made_logs import MS, read_all

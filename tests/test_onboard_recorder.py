@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import parse_robot_yaml
-from groundsbot.onboard.encoder_protocol import WheelLine, format_line
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log_reader import read_log
-from groundsbot.onboard.messages import Event, EventKind, StampSource, TagDetections
-from groundsbot.onboard.recorder import RecorderCore, Run
-from groundsbot.onboard.tag_detector import Detection
+from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetections
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
 ROBOT_YAML = """
 robot_id: gb1

@@ -10,13 +10,13 @@ from typing import Any, cast
 import pytest
 from typer.testing import CliRunner
 
-from groundsbot.fixtures.devices import PictureFolder
+from groundsbot.fixtures.recording.devices import PictureFolder
 from groundsbot.onboard.cli import app
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.housekeeping import Housekeeper
-from groundsbot.onboard.messages import EventKind
-from groundsbot.onboard.status import Look, Rates, Status, is_alive, read_status, write_status
-from groundsbot.onboard.systemd import Notifier
+from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.monitoring.housekeeping import Housekeeper
+from groundsbot.onboard.monitoring.status import Look, Rates, Status, is_alive, read_status, write_status
+from groundsbot.onboard.process.systemd import Notifier
 from tests.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.made_cores import START_NS, S
 

@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from groundsbot.onboard.detection.tag_detector import SMALLEST_SIDE_PX, TagDetector
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.tag_detector import SMALLEST_SIDE_PX, TagDetector
 from tests.tag_pictures import draw_tag
 
 LIBRARIES = [

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from groundsbot.offline.cli import app
-from groundsbot.onboard.log_reader import find_logs, read_run_info
+from groundsbot.onboard.log.reading.reader import find_logs, read_run_info
 from tests.recordings import RECORDINGS, needs_recordings
 
 ROOT = Path(__file__).parents[1]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-from groundsbot.calib.camera_file import read_camera_yaml
+from groundsbot.calib.camera.file import read_camera_yaml
 from tests.simulated_robot import SimulatedRobot
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "robot_setup.md"

@@ -3,9 +3,11 @@
 import random
 from itertools import pairwise
 
-from groundsbot.onboard import clock, encoder_protocol, wheel_intake
-from groundsbot.onboard.encoder_protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
-from groundsbot.onboard.wheel_intake import StampedReading, WheelIntake
+from groundsbot.onboard.process import clock
+from groundsbot.onboard.wheels import intake as wheel_intake
+from groundsbot.onboard.wheels import protocol as encoder_protocol
+from groundsbot.onboard.wheels.intake import StampedReading, WheelIntake
+from groundsbot.onboard.wheels.protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
 
 MODULES = [str(module.__file__) for module in (encoder_protocol, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))

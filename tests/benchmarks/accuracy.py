@@ -24,15 +24,15 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from groundsbot.calib.files import written_whole
+from groundsbot.calib.foundation.files import written_whole
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World, load_world
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.self_calibration_option import Calibrate
-from groundsbot.offline.truth import Truth, read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import World, load_world
+from groundsbot.offline.evaluation.truth import Truth, read_truth
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.self_calibration.option import Calibrate
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.baselines import dead_reckoning, paper_scheme
 from tests.benchmarks.command_line import exit_code, say, seeds_of

@@ -17,14 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World
-from groundsbot.offline.evaluation import evaluate
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.truth import Truth, read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import World
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import Truth, read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 
 # Medians over seeds. With the calibration drawn the paper's own figure is 1.8 %.

@@ -20,21 +20,21 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.advice import Candidates, candidates_of, judged, known_of
-from groundsbot.offline.advice_passes import Pass, most_length_m
-from groundsbot.offline.advice_tags import Place, is_in_view, place_beside
-from groundsbot.offline.chain import Chain
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.graph import Graph, build_graph
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import merge
-from groundsbot.offline.readings import joined
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.solver import Solution
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.advice.advice import Candidates, candidates_of, judged, known_of
+from groundsbot.offline.advice.new_tags import Place, is_in_view, place_beside
+from groundsbot.offline.advice.passes import Pass, most_length_m
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.sensor_model.readings import joined
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.graph import Graph, build_graph
+from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import say, seeds_of
 from tests.made_drives import FAMILY
 from tests.made_long_drives import READ_SHARE, SIGMA_READING, LongDrive, made_long_drive, made_town

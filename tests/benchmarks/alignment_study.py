@@ -22,14 +22,14 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.alignment import Alignment, align
-from groundsbot.offline.alignment_rivals import GROUP_MARGIN
-from groundsbot.offline.condensed import CondensedMap, condense
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
+from groundsbot.offline.alignment.model_selection import GROUP_MARGIN
+from groundsbot.offline.alignment.pairwise import Alignment, align
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import Town, made_long_drive, made_town
 

@@ -1,6 +1,6 @@
 """What maps are compared with: the wheels alone, and the scheme of the paper as it was.
 
-Both take keyframes and tag readings as `groundsbot.offline.chain` has them, so that only what is made of them differs, and lay
+Both take keyframes and tag readings as `groundsbot.offline.measurements.chain` has them, so that only what is made of them differs, and lay
 runs over each other by the tags that they share. Neither has covariances that could be believed, so none are stated.
 """
 
@@ -14,13 +14,13 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import Chain, chains_of
-from groundsbot.offline.result import Component, MapResult, RunResult, TagResult
-from groundsbot.offline.run import Run
-from groundsbot.offline.run_tags import TagKey
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 
 # The paper's solver: odometry's x, y, then heading; a tag reading's x and y.
 ODOMETRY_VARIANCE: Final = (2.5e-5, 2.5e-5, 2.5e-6)

@@ -21,16 +21,17 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.offline.alignment import align, fit_transform
-from groundsbot.offline.condensed import condense
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.grown_parts import FALSE_ALARM
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import merge
-from groundsbot.offline.odometry_breaks import split_where_broken
-from groundsbot.offline.solver import solve
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.se2 import fit_transform
+from groundsbot.offline.alignment.condensed_map import condense
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.alignment.pairwise import align
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
+from groundsbot.offline.outliers.odometry_breaks import split_where_broken
+from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.command_line import seeds_of
 from tests.made_breaks import BrokenDrive, carried, made_clean_drive, slipped
 

@@ -18,11 +18,11 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.offline.goodness import fitted_windows
-from groundsbot.offline.graph import build_graph
-from groundsbot.offline.local_map import solve_local_map
-from groundsbot.offline.solver import Solution, solve
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map.goodness_of_fit import fitted_windows
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import Solution, solve
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import made_long_drive
 

@@ -6,7 +6,7 @@ One tag a picture, in front of a wall, at another place among the pixels each ti
 seen at 20 degrees, sharp, still, lit evenly) one thing is changed at a time. Detectors: both AprilTag libraries,
 looking at all pixels (/1) and at half as many each way (/2, as on the robot), and OpenCV's ArUco detector with its own
 refinement for AprilTags. After each: its corners as they are, cv2.cornerSubPix on them, and
-`groundsbot.onboard.corner_refinement` without and with the lens.
+`groundsbot.onboard.detection.corner_refinement` without and with the lens.
 
 A cell is RMSE / bias in hundredths of a pixel and coordinate: the bias is the mean along the tag's diagonals, outward
 positive, which is what light that spreads does to a tag. Under it the spread of what is left. A last table has the
@@ -25,18 +25,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.calib.robot import Mount
-from groundsbot.fixtures.calibration import true_tag_sizes_m
-from groundsbot.fixtures.drive import Drive
-from groundsbot.fixtures.render import Renderer
-from groundsbot.fixtures.scene import Tags, faces_of, tags_of
-from groundsbot.fixtures.session import Options, prepare
-from groundsbot.fixtures.visibility import Eye
-from groundsbot.fixtures.world import Pictures, Wall, World, WorldTag, load_world
-from groundsbot.onboard.corner_refinement import refined_corners
-from groundsbot.onboard.tag_detector import TagDetector
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.robot.robot import Mount
+from groundsbot.fixtures.drives.calibration import true_tag_sizes_m
+from groundsbot.fixtures.drives.true_motion import Drive
+from groundsbot.fixtures.pictures.render import Renderer
+from groundsbot.fixtures.pictures.visibility import Eye
+from groundsbot.fixtures.recording.session import Options, prepare
+from groundsbot.fixtures.worlds.scene import Tags, faces_of, tags_of
+from groundsbot.fixtures.worlds.world import Pictures, Wall, World, WorldTag, load_world
+from groundsbot.onboard.detection.corner_refinement import refined_corners
+from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.benchmarks.command_line import say
 
 Grey = NDArray[np.uint8]
@@ -61,7 +61,7 @@ class Case:
     wall: float = 0.6  # brightness of what the tag hangs on
     lit: float = 0.0  # share by which light grows from the tag's left side to its right
     off_axis_px: float = 0.0  # that the picture is cut out of a larger one, down and right of the lens's axis
-    settings: dict[str, float] = field(default_factory=dict)  # of groundsbot.fixtures.world.Pictures
+    settings: dict[str, float] = field(default_factory=dict)  # of groundsbot.fixtures.worlds.world.Pictures
 
 
 CASES: Final = (

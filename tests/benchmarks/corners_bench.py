@@ -18,17 +18,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.files import written_whole
+from groundsbot.calib.foundation.files import written_whole
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline.corner_floor import guessed_wobble
-from groundsbot.offline.corner_graph import corner_graph
-from groundsbot.offline.corner_map import refine
-from groundsbot.offline.corner_solver import solve_corners
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.run import Run
-from groundsbot.offline.stages import Stages
-from groundsbot.offline.workings import Workings
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.corners.floor_noise import guessed_wobble
+from groundsbot.offline.corners.graph import corner_graph
+from groundsbot.offline.corners.refinement import refine
+from groundsbot.offline.corners.solver import solve_corners
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.measurements.run import Run
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT
 from tests.benchmarks.stages_bench import SOLVE

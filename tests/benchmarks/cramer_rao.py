@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import FloatArray, IntArray
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from tests.benchmarks.cramer_rao_measured import (
     N_WHEELS,
     CornerJacobians,

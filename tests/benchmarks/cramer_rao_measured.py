@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 
 ComplexArray = NDArray[np.complex128]
 
@@ -33,7 +33,7 @@ _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigmas, as `groundsbot.calib.noise` and docs/worlds.md have them."""
+    """Sigmas, as `groundsbot.calib.robot.noise` and docs/worlds.md have them."""
 
     distance_m_per_sqrt_m: float
     lateral_m_per_sqrt_m: float

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from groundsbot.calib.arrays import FloatArray, IntArray
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.robot import Robot
-from groundsbot.fixtures.calibration import nominal_robot, true_tag_sizes_m
-from groundsbot.fixtures.scene import Tags, tags_of
-from groundsbot.fixtures.session import Options, Session, prepare
-from groundsbot.fixtures.visibility import sightings
-from groundsbot.fixtures.world import World
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.robot.robot import Robot
+from groundsbot.fixtures.drives.calibration import nominal_robot, true_tag_sizes_m
+from groundsbot.fixtures.pictures.visibility import sightings
+from groundsbot.fixtures.recording.session import Options, Session, prepare
+from groundsbot.fixtures.worlds.scene import Tags, tags_of
+from groundsbot.fixtures.worlds.world import World
 from tests.benchmarks.cramer_rao import Bound, cramer_rao
 from tests.benchmarks.cramer_rao_measured import CALIBRATION, Noise, TrueRun, TrueTags
 

@@ -22,10 +22,10 @@ from typing import Any, Final
 
 import yaml
 
-from groundsbot.calib.command_line import EXIT_DONE, EXIT_WITH_LOSSES
-from groundsbot.calib.files import written_whole
-from groundsbot.offline.map_command import stage_lines
-from groundsbot.offline.stages import StageCost
+from groundsbot.calib.foundation.command_line import EXIT_DONE, EXIT_WITH_LOSSES
+from groundsbot.calib.foundation.files import written_whole
+from groundsbot.offline.commands.map_drives import stage_lines
+from groundsbot.offline.foundation.stages import StageCost
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet_world import MOST_TAGS, fleet_world
 

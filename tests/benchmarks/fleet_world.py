@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.fixtures.world import Box, Camera, Pictures, Route, Start, Waypoint, World, WorldRobot, WorldTag
+from groundsbot.fixtures.worlds.world import Box, Camera, Pictures, Route, Start, Waypoint, World, WorldRobot, WorldTag
 
 PITCH_M: Final = 9.0  # from one crossing to the next
 ROAD_WIDTH_M: Final = 3.0

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.corner_map import refine
-from groundsbot.offline.factors import State
-from groundsbot.offline.global_map import component_of
-from groundsbot.offline.graph import Graph
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run
-from groundsbot.offline.solver import solve
-from groundsbot.offline.truth import Truth
-from groundsbot.offline.workings import Workings
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.corners.refinement import refine
+from groundsbot.offline.evaluation.truth import Truth
+from groundsbot.offline.global_map.joint_solve import component_of
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import Graph
+from groundsbot.offline.sam.solver import solve
 
 
 def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParameters = NoiseParameters()) -> MapResult:

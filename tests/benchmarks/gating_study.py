@@ -18,13 +18,14 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.self_calibration_option import Calibrate
-from groundsbot.offline.truth import read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import World
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.self_calibration.option import Calibrate
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy import study_worlds
 from tests.benchmarks.accuracy_study import figures_of
 from tests.benchmarks.command_line import say, seeds_of

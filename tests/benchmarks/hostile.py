@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from groundsbot.offline.map_command import MapOptions, make_map
+from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from tests.hostile_files import FILES, LOGS, truth_and_survey
 from tests.hostile_logs import LIMIT_BYTES, honest
 from tests.taken_by_commands import LOG_FORMS, LOGS_FORMS, MAP_FORMS, OTHER_FORMS, RUN_FORMS, Form, measure

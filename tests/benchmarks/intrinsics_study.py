@@ -21,14 +21,14 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.board_finder import BoardFinder, View
-from groundsbot.calib.camera_model import CameraModel
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.finder import BoardFinder, View
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.camera.parameters import parameters_of, undistorted_camera, with_parameters
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.intrinsics import KINDS, calibrated
-from groundsbot.calib.lens_parameters import parameters_of, undistorted_camera, with_parameters
-from groundsbot.calib.projection_uncertainty import (
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.intrinsics.model_choice import KINDS, calibrated
+from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
     difference_px,
     expected_error_px,

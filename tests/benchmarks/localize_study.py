@@ -31,21 +31,21 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.chain import Chain
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.global_map import component_of, solve_global_map
-from groundsbot.offline.kept_maps import kept_of, local_map_of
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.localization import LocatedRun
-from groundsbot.offline.localizing import localize_maps
-from groundsbot.offline.merge import merge
-from groundsbot.offline.online_drive import TagReading
-from groundsbot.offline.online_localizer import OnlineLocalizer
-from groundsbot.offline.result import Component, MapResult
-from groundsbot.offline.stages import Stages
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import component_of, solve_global_map
+from groundsbot.offline.local_map.archive import kept_of, local_map_of
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.localization.localization import localize_maps
+from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
+from groundsbot.offline.localization.result import LocatedRun
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.measurements.chain import Chain
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.made_long_drives import LongDrive, Town, made_long_drive, made_town
 

@@ -17,15 +17,15 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import merge
-from groundsbot.offline.merge_report import merge_warnings
-from groundsbot.offline.run_tags import TagKey
-from groundsbot.offline.stages import Stages
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.merge_report import merge_warnings
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.made_long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town
 

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.evaluation import evaluate
-from groundsbot.offline.parameter_results import FittedParameter
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.run_noise import NOT_NEEDED
-from groundsbot.offline.truth import read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.parameter_results import NOT_NEEDED, FittedParameter
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say, seeds_of
 
 ENOUGH_REDUNDANCY = 100.0

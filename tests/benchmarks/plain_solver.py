@@ -4,10 +4,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.offline.factors import Linearised, State, stacked
-from groundsbot.offline.robust import SQUARES, Loss, losses_and_weights
-from groundsbot.offline.solver import PLAIN_SQUARES, Losses, Problem
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, losses_and_weights
+from groundsbot.offline.sam.factors.planar import Linearised, State, stacked
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Losses, Problem
 
 _MAX_ITERATIONS = 100
 

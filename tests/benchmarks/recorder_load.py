@@ -25,11 +25,11 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from groundsbot.calib.camera_file import write_camera_yaml
-from groundsbot.calib.camera_model import CameraModel
-from groundsbot.fixtures.devices import PictureFolder, PtyPort, at_rate, wheel_line
-from groundsbot.onboard.log_reader import find_logs, read_log, read_run_info
-from groundsbot.onboard.messages import TagDetections, WheelEncoders
+from groundsbot.calib.camera.file import write_camera_yaml
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, wheel_line
+from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
+from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
 from tests.tag_pictures import draw_tag
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")

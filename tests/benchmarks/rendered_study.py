@@ -22,10 +22,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.fixtures.world import World
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.truth import read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.fixtures.worlds.world import World
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy_study import Figures, figures_of
 from tests.benchmarks.command_line import say, seeds_of
 

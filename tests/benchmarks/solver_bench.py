@@ -28,10 +28,10 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from groundsbot.calib.arrays import FloatArray
-from groundsbot.calib.files import written_whole
-from groundsbot.offline.factors import State
-from groundsbot.offline.solver import PLAIN_SQUARES, Problem, Solution, solve
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.foundation.files import written_whole
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.plain_solver import plain_normal_equations, plain_solve, plain_step
 from tests.benchmarks.solver_world import SIGMA_START, Fleet, made_fleet
 

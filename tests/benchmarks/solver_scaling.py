@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.robust import SQUARES
-from groundsbot.offline.solver import Losses, solve
+from groundsbot.offline.sam.factors.losses import SQUARES
+from groundsbot.offline.sam.solver import Losses, solve
 from tests.benchmarks.solver_bench import least_seconds, memory_mib, our_start, reset_peak, warm_up
 from tests.benchmarks.solver_world import made_fleet
 

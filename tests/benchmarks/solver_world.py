@@ -8,11 +8,18 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray, IntArray
-from groundsbot.offline.factors import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State, whitening
-from groundsbot.offline.odometry import chained
-from groundsbot.offline.solver import Problem
+from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.offline.sam.factors.planar import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+    whitening,
+)
+from groundsbot.offline.sam.solver import Problem
 
 ROAD_M: Final = 6.0
 STEP_M: Final = 0.25

@@ -13,12 +13,13 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.files import written_whole
+from groundsbot.calib.foundation.files import written_whole
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.run import Run
-from groundsbot.offline.stages import Stages
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.measurements.run import Run
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT, simulated_fleet
 

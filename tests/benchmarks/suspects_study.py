@@ -19,21 +19,21 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import BoolArray, IntArray
-from groundsbot.calib.noise import NoiseParameters
-from groundsbot.offline.alignment import fit_transform
-from groundsbot.offline.fit_results import SuspectTag
-from groundsbot.offline.global_map import solve_global_map
-from groundsbot.offline.graph import Graph
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.merge import merge
-from groundsbot.offline.run_noise import fit_and_weigh
-from groundsbot.offline.solver import Solution
-from groundsbot.offline.stages import Stages
-from groundsbot.offline.suspects import Searched, split_alone, split_together, with_outliers_apart
-from groundsbot.offline.suspects_places import gain_of, settled
-from groundsbot.offline.suspects_report import suspect_tags
+from groundsbot.calib.foundation.arrays import BoolArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry.se2 import fit_transform
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.maps.fit_results import SuspectTag
+from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.outliers.places import gain_of, settled
+from groundsbot.offline.outliers.report import suspect_tags
+from groundsbot.offline.outliers.split import Searched, split_alone, split_together, with_outliers_apart
+from groundsbot.offline.sam.graph import Graph
+from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say
 from tests.benchmarks.suspects_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
 from tests.made_moves import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, made_scene, without

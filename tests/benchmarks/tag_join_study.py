@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib import se2
-from groundsbot.calib.arrays import FloatArray
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.pipeline import build_map
-from groundsbot.offline.result import MapResult
-from groundsbot.offline.run import Run, load_run
-from groundsbot.offline.run_tags import Detections
-from groundsbot.offline.truth import Truth, read_truth
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.evaluation.truth import Truth, read_truth
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import seeds_of
 
 _LEAST_LOOKS = 5

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.thinning_bench [--worlds room,nsh] [--seed 0]
 
 A picture becomes a keyframe when the robot moved or turned by a little, or when it shows a tag that the last one did
-not (`offline/chain.py`); others are passed over. Drives without rendering are mapped so and with every picture a
+not (`offline/measurements/chain.py`); others are passed over. Drives without rendering are mapped so and with every picture a
 keyframe, under the true noise, on places and on corners. Information of one dimension is that of the joint covariance
 of all tags' places, (det S)^(-1/n). Writes build/benchmarks/thinning.jsonl; exit 1 where more than a twentieth is lost.
 """
@@ -19,14 +19,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.files import written_whole
-from groundsbot.calib.noise import NoiseParameters
+from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline import chain
-from groundsbot.offline.pipeline import build_map, read_runs
-from groundsbot.offline.result import Component
-from groundsbot.offline.run import Run
-from groundsbot.onboard.log_reader import find_logs
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import Component
+from groundsbot.offline.measurements import chain
+from groundsbot.offline.measurements.run import Run
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say
 from tests.benchmarks.fleet import ROOT
 

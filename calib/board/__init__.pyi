@@ -1,0 +1,22 @@
+from .board import DEFAULT_BOARD, DEFAULT_VIEWS, MARKER_SHARE, Board, parse_board
+from .finder import BoardFinder, View
+from .missing import why_no_board
+from .picture_source import GreyPicture, grey_pictures
+from .view_spread import SeenBoard, Spread, region_shares, seen_board
+
+__all__ = [
+    "DEFAULT_BOARD",
+    "DEFAULT_VIEWS",
+    "MARKER_SHARE",
+    "Board",
+    "BoardFinder",
+    "GreyPicture",
+    "SeenBoard",
+    "Spread",
+    "View",
+    "grey_pictures",
+    "parse_board",
+    "region_shares",
+    "seen_board",
+    "why_no_board",
+]

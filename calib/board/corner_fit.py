@@ -1,0 +1,212 @@
+"""Where the corners of a chessboard are, to hundredths of a pixel: a picture of two edges fitted to what is there.
+
+Around a corner the light is modelled as
+
+    (1 + g . (x - c)) (a + b (erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2)) - m(x))),
+    l_k(x) = n_k . (x - c) - y_k(u) - y_k''(u) s_k^2 / 2,   u = t_k . (x - c)
+
+two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
+shutter was open. How they bend away from their tangents, y_k, is given: a lens bends lines, and a bend left out moves
+corners; so does blur, which draws a bent edge inwards by the bend's mean over it. Whatever makes black grow or shrink
+(too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and the corner not at all.
+Light that grows along an edge (g: the lens's falloff, a lamp) would move both halves alike.
+
+Blur carries the black of markers out into the white around them; m is how much of it, known from the first look's blur.
+Where squares grow across the picture one of the two markers is nearer than the other, and would draw the corner to
+itself. So where markers begin is told by a map of second order: by an affine one 0.001 px in a fisheye, and 0.008 px
+where the lens blurs by 1 px.
+
+What the light's noise moves a corner by falls with the root of the edges' length, so they are followed to the middle
+of the squares, where those of the next corner begin: no pixel tells of two corners.
+
+The fit gives each corner's covariance too, from the residuals themselves, and its blur.
+"""
+
+from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from groundsbot.calib.board.corner_surroundings import FIRST_RADIUS_PX, Surroundings
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+
+FIRST_BLUR_PX: Final = 0.7
+_ROUNDS: Final = 15
+_N: Final = 10  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2), g (2)
+_BLURS: Final = slice(6, 8)
+_SLOPE: Final = slice(8, 10)  # share of the light over the radius
+_ARRIVED_PX: Final = 1e-4
+_FARTHEST_SQUARES: Final = 0.3  # that a corner may lie from where it was thought to be
+_LEAST_CONTRAST: Final = 16.0  # grey levels between black and white: markers are hardly read below
+_ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than two edges
+_MOST_BLUR_SQUARES: Final = 0.25
+_LEAST_PIXELS: Final = 50  # five for each parameter
+
+
+@dataclass(frozen=True)
+class Corners:
+    """N corners in one picture.
+
+    Attributes:
+        ids: (N,) OpenCV's numbers of the board's inner corners.
+        pixels: (N, 2).
+        covariance: (N, 2, 2) px^2, from the light's noise alone.
+        blur_px: (N,) sigma of the edges' blur, the more blurred one's.
+        contrast: (N,) grey levels between white and black.
+    """
+
+    ids: IntArray
+    pixels: FloatArray
+    covariance: FloatArray
+    blur_px: FloatArray
+    contrast: FloatArray
+
+    def where(self, mask: BoolArray) -> "Corners":
+        """Those of the mask."""
+        return Corners(*(getattr(self, field.name)[mask] for field in dataclass_fields(self)))
+
+
+def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
+    """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
+    known = (around.pixels[:, None], around.squares_px, around.growth_px, around.bend)
+    inside = np.all([np.isfinite(each).all(axis=(1, 2)) for each in known], axis=0)
+    size = np.array(picture.shape[::-1])
+    inside &= ((around.pixels > FIRST_RADIUS_PX) & (around.pixels < size - 1 - FIRST_RADIUS_PX)).all(axis=1)
+    if not inside.any():
+        none = np.zeros((0, 2))
+        return Corners(ids[:0], none, np.zeros((0, 2, 2)), none[:, 0], none[:, 0])
+    return _Patches(picture, around.where(inside)).fitted(ids[inside])
+
+
+class _Patches:
+    """The picture around each of N corners, P pixels each: as many as the one has that has most."""
+
+    def __init__(self, picture: NDArray[np.uint8], around: Surroundings) -> None:
+        offsets = np.arange(-around.radius_px, around.radius_px + 1)
+        dx, dy = (each.ravel() for each in np.meshgrid(offsets, offsets))
+        middle = np.rint(around.pixels).astype(np.int64)
+        places = np.stack([middle[:, :1] + dx, middle[:, 1:] + dy], axis=-1)
+        self._around = around
+        seen = around.own_squares(places.astype(np.float64), np.array(picture.shape[::-1]))
+        kept = np.argsort(~seen, axis=1, kind="stable")[:, : int(seen.sum(axis=1).max())]
+        self._seen = np.take_along_axis(seen, kept, axis=1).astype(np.float64)  # (N, P) 1.0 where it counts
+        places = np.take_along_axis(places, kept[..., np.newaxis], axis=1)
+        columns, rows = np.moveaxis(places.clip(0, np.array(picture.shape[::-1]) - 1), -1, 0)
+        self._light = picture[rows, columns].astype(np.float64)  # (N, P)
+        self._places = places.astype(np.float64)  # (N, P, 2)
+        self._marker = around.marker_light(self._places)  # (N, P)
+
+    def fitted(self, ids: IntArray) -> Corners:
+        """The corners that look right."""
+        p = self._settled(self._start())
+        return self._judged(ids, p, self._looks_right(p))
+
+    def _settled(self, p: FloatArray) -> FloatArray:
+        """Levenberg-Marquardt on all patches at once, each with its own damping, until it has arrived."""
+        residual, jacobian = self._linearise(p)
+        cost, damping = (residual**2).sum(axis=1), np.full(len(p), 1e-3)
+        moving = np.arange(len(p))
+        for _ in range(_ROUNDS):
+            J, r = jacobian[moving], residual[moving]
+            normal = J.swapaxes(-1, -2) @ J
+            gradient = (r[:, None, :] @ J)[:, 0]
+            diagonal = np.einsum("nii->ni", normal)
+            damped = normal + (damping[moving, None] * diagonal + 1e-9)[:, :, None] * np.eye(_N)
+            step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+            tried = p[moving] - step
+            tried[:, _BLURS] = np.clip(tried[:, _BLURS], np.log(0.2), np.log(5.0))
+            new_residual, new_jacobian = self._linearise(tried, moving)
+            new_cost = (new_residual**2).sum(axis=1)
+            better = new_cost < cost[moving]
+            gained = moving[better]
+            p[gained], cost[gained] = tried[better], new_cost[better]
+            residual[gained], jacobian[gained] = new_residual[better], new_jacobian[better]
+            damping[moving] *= np.where(better, 0.1, 10.0)
+            moving = moving[np.abs(step[:, :2]).max(axis=1) > _ARRIVED_PX]
+            if not len(moving):
+                break
+        return p
+
+    def _start(self) -> FloatArray:
+        around = self._around
+        p = np.zeros((len(around.pixels), _N))
+        p[:, :2] = around.pixels
+        along_x, along_y = around.squares_px[:, :, 0], around.squares_px[:, :, 1]
+        p[:, 2] = np.arctan2(along_x[:, 0], -along_x[:, 1])  # normals: the directions turned by 90 degrees
+        p[:, 3] = np.arctan2(along_y[:, 0], -along_y[:, 1])
+        p[:, _BLURS] = np.log(FIRST_BLUR_PX)
+        p[:, 5] = 1.0
+        residual, _ = self._linearise(p)
+        shape = residual + self._seen * self._light  # the light of a = 0, b = 1
+        count = np.maximum(self._seen.sum(axis=1), 1.0)
+        mean_light, mean_shape = (self._seen * self._light).sum(axis=1) / count, shape.sum(axis=1) / count
+        off = self._seen * (shape - mean_shape[:, None])
+        p[:, 5] = (off * self._light).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-9)
+        p[:, 4] = mean_light - p[:, 5] * mean_shape
+        return p
+
+    def _linearise(self, p: FloatArray, of: IntArray | slice = slice(None)) -> tuple[FloatArray, FloatArray]:
+        """Residuals (N, P), model minus light, and their derivatives (N, P, 10), of some patches."""
+        off = self._places[of] - p[:, None, :2]
+        edges, slopes, by_centre, by_turn = [], [], [], []
+        for k in (0, 1):
+            cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
+            across, along = cos * off[..., 0] + sin * off[..., 1], -sin * off[..., 0] + cos * off[..., 1]
+            blur = np.exp(p[:, 6 + k])[:, None]
+            second, third, fourth = (each[..., None] for each in np.moveaxis(self._around.bend[of, k], -1, 0))
+            bend, change = second + along * (third + 0.5 * fourth * along), third + fourth * along
+            sag = along**2 * (0.5 * second + along * (third / 6.0 + fourth / 24.0 * along))
+            slope = along * (second + along * (0.5 * third + fourth / 6.0 * along)) + 0.5 * change * blur**2
+            q = (across - sag - 0.5 * bend * blur**2) / (np.sqrt(2.0) * blur)
+            edges.append(erf(q))
+            slopes.append((2.0 / np.sqrt(np.pi)) * np.exp(-(q**2)))
+            scale = 1.0 / (np.sqrt(2.0) * blur)
+            by_blur = -q - scale * bend * blur**2
+            by_centre.append((scale * (-cos - slope * sin), scale * (-sin + slope * cos), by_blur))
+            by_turn.append(scale * (along + slope * across))
+        a, b = p[:, 4, None], p[:, 5, None]
+        jacobian = np.empty((*off.shape[:2], _N))
+        first, second = b * slopes[0] * edges[1], b * slopes[1] * edges[0]
+        for axis in (0, 1):
+            jacobian[..., axis] = first * by_centre[0][axis] + second * by_centre[1][axis]
+        jacobian[..., 2], jacobian[..., 3] = first * by_turn[0], second * by_turn[1]
+        shape = edges[0] * edges[1] - self._marker[of]
+        jacobian[..., 4], jacobian[..., 5] = 1.0, shape
+        jacobian[..., 6], jacobian[..., 7] = first * by_centre[0][2], second * by_centre[1][2]
+        reflected = a + b * shape
+        away = (self._places[of] - self._around.pixels[of, None]) / self._around.radius_px
+        falling = self._seen[of] * (1.0 + np.einsum("npi,ni->np", away, p[:, _SLOPE]))
+        jacobian[..., : _SLOPE.start] *= falling[..., None]
+        jacobian[..., _SLOPE] = (self._seen[of] * reflected)[..., None] * away
+        return falling * reflected - self._seen[of] * self._light[of], jacobian
+
+    def _looks_right(self, p: FloatArray) -> BoolArray:
+        """(N,) whether two edges that cross near enough explain the light."""
+        residual, _ = self._linearise(p)
+        count = self._seen.sum(axis=1)
+        contrast = 2.0 * np.abs(p[:, 5])
+        squares = self._around.squares_px
+        side_px = np.linalg.norm(squares, axis=1).min(axis=1)
+        rms = np.sqrt((residual**2).sum(axis=1) / np.maximum(count, 1.0))
+        moved_px = np.linalg.norm(p[:, :2] - self._around.pixels, axis=1)
+        return np.asarray(
+            (count > _LEAST_PIXELS)
+            & (moved_px < np.minimum(_FARTHEST_SQUARES * side_px, FIRST_RADIUS_PX))
+            & (contrast > _LEAST_CONTRAST)
+            & (rms < _ROUGHEST * contrast)
+            & (np.exp(p[:, _BLURS]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
+        )
+
+    def _judged(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
+        """The good ones with their covariance: bright pixels are noisier, so it is made of each one's own residual."""
+        residual, jacobian = self._linearise(p)
+        residual, jacobian, count = residual[good], jacobian[good], self._seen[good].sum(axis=1)
+        gain = np.linalg.inv(np.einsum("npi,npj->nij", jacobian, jacobian) + 1e-12 * np.eye(_N))
+        square = residual**2 * (count / np.maximum(count - _N, 1.0))[:, None]
+        covariance = gain @ np.einsum("npi,np,npj->nij", jacobian, square, jacobian) @ gain
+        return Corners(
+            ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5])
+        )

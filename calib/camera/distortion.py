@@ -1,0 +1,184 @@
+"""Lens distortion in normalised image coordinates, as OpenCV and ROS define it.
+
+Every model here is a radial factor g(s), s = x^2 + y^2, plus plumb_bob's two tangential terms:
+distorted = g(s) (x, y) + (2 p1 x y + p2 (s + 2 x^2), p1 (s + 2 y^2) + 2 p2 x y).
+
+- plumb_bob (k1, k2, p1, p2, k3): g = 1 + k1 s + k2 s^2 + k3 s^3
+- rational_polynomial (k1, k2, p1, p2, k3, k4, k5, k6): g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
+- equidistant (k1, k2, k3, k4): g = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / tan(t), t = atan(sqrt(s))
+
+A polynomial turns back on itself far outside the picture; points beyond that radius would land in the picture
+again. `Distortion.limit` is that radius, and nothing beyond it is projected.
+Sources: OpenCV, calib3d and fisheye module documentation; ROS sensor_msgs/distortion_models.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.polynomial.polynomial import polyroots, polyval
+
+from groundsbot.calib.foundation import BoolArray, FloatArray
+
+COEFFICIENTS: Final = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+
+_WIDEST_RAD: Final = np.radians(89.0)  # off the optical axis; z > 0 in any case
+_NEWTON_STEPS: Final = 60  # bisection alone halves the bracket to the last bit in these
+_POLISH_STEPS: Final = 12
+_POLISHED: Final = 1e-9  # Newton's error is about its step squared
+_RESIDUAL: Final = 1e-12  # normalised: 1e-9 px at a focal length of 1000 px
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """One lens. Coordinates are `[..., 2]` (x/z, y/z) in the optical frame.
+
+    `limit` is the undistorted radius from which on there is no image, `distorted_limit` its image.
+    """
+
+    numerator: FloatArray  # coefficients, the constant first, of a polynomial of s, or of t^2 for equidistant
+    denominator: FloatArray
+    p1: float
+    p2: float
+    is_equidistant: bool
+    limit: float
+    distorted_limit: float
+
+    @classmethod
+    def of(cls, model: str, coefficients: tuple[float, ...]) -> "Distortion":
+        """The lens of one of `COEFFICIENTS`, its coefficients in OpenCV's order."""
+        if model == "equidistant":
+            numerator, denominator = np.array([1.0, *coefficients]), np.ones(1)
+            p1, p2 = 0.0, 0.0
+            # The angle t (1 + k1 t^2 + ...) must grow: d/dt = N + 2 u N' with u = t^2.
+            angle = np.sqrt(_first_positive_root(_growth(numerator, denominator), float(_WIDEST_RAD) ** 2))
+            limit = float(np.tan(angle))
+        else:
+            k1, k2, p1, p2, k3, *below = coefficients
+            numerator, denominator = np.array([1.0, k1, k2, k3]), np.array([1.0, *below])
+            widest = float(np.tan(_WIDEST_RAD)) ** 2
+            fold = _first_positive_root(_growth(numerator, denominator), widest)
+            limit = float(np.sqrt(_first_positive_root(denominator, fold)))
+        unlimited = cls(numerator, denominator, p1, p2, model == "equidistant", limit, np.inf)
+        with np.errstate(all="ignore"):  # where the denominator ends the lens, its image goes to infinity
+            factor, _ = unlimited._factor(np.array(limit * limit))
+        return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
+
+    @cached_property
+    def _numerator_slope(self) -> FloatArray:
+        return _slope(self.numerator)
+
+    @cached_property
+    def _denominator_slope(self) -> FloatArray:
+        return _slope(self.denominator)
+
+    def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
+        inside = np.hypot(undistorted[..., 0], undistorted[..., 1]) < self.limit
+        return self._apply(np.where(inside[..., np.newaxis], undistorted, np.nan))
+
+    def _apply(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x, y = points[..., 0], points[..., 1]
+        square, p1, p2 = x * x + y * y, self.p1, self.p2
+        factor, slope = self._factor(square)
+
+        distorted = np.empty(points.shape)
+        distorted[..., 0] = factor * x + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        distorted[..., 1] = factor * y + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+
+        jacobian = np.empty((*points.shape, 2))
+        jacobian[..., 0, 0] = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        jacobian[..., 0, 1] = jacobian[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        jacobian[..., 1, 1] = factor + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        return distorted, jacobian
+
+    def remove(self, distorted: FloatArray) -> FloatArray:
+        """Undistorted points `[..., 2]`, whose images are `distorted` to 1e-12; NaN where there is none."""
+        with np.errstate(all="ignore"):  # a point without a solution may run away; it is refused below
+            points = self._radially_undistorted(distorted)
+            if self.p1 or self.p2:
+                for _ in range(_POLISH_STEPS):
+                    image, jacobian = self._apply(points)
+                    step = _solved(jacobian, image - distorted)
+                    points = points - step
+                    if not np.any(np.abs(step) > _POLISHED):
+                        break
+            error = np.abs(self._apply(points)[0] - distorted).max(axis=-1, initial=0.0)
+            scale = 1.0 + np.abs(distorted).max(axis=-1, initial=0.0)
+            found = (error < _RESIDUAL * scale) & (np.hypot(points[..., 0], points[..., 1]) < self.limit)
+        return np.where(found[..., np.newaxis], points, np.nan)
+
+    def _radially_undistorted(self, distorted: FloatArray) -> FloatArray:
+        """The start for the tangential terms: exact without them. Newton on r g(r^2), kept in a bracket."""
+        target = np.minimum(np.hypot(distorted[..., 0], distorted[..., 1]), self.distorted_limit)
+        low, high = np.zeros_like(target), np.full_like(target, self.limit)
+        radius = np.minimum(target, 0.5 * self.limit)
+        for _ in range(_NEWTON_STEPS):
+            square = radius * radius
+            factor, slope = self._factor(square)
+            excess = radius * factor - target
+            low, high = np.where(excess < 0, radius, low), np.where(excess < 0, high, radius)
+            growth = factor + 2 * square * slope
+            step = np.divide(excess, growth, out=np.full_like(excess, np.inf), where=growth > 0)
+            inside = (radius - step >= low) & (radius - step <= high)
+            following = np.where(inside, radius - step, 0.5 * (low + high))
+            converged: BoolArray = np.abs(following - radius) <= 1e-15 * (1.0 + radius)
+            radius = following
+            if np.all(converged | np.isnan(target)):
+                break
+        length = np.hypot(distorted[..., 0], distorted[..., 1])
+        ratio = np.divide(radius, length, out=np.ones_like(length), where=length > 0)
+        return distorted * ratio[..., np.newaxis]
+
+    def _factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """g(s) and dg/ds."""
+        if self.is_equidistant:
+            return self._equidistant_factor(square)
+        below = polyval(square, self.denominator)
+        factor = polyval(square, self.numerator) / below
+        slope = polyval(square, self._numerator_slope) - factor * polyval(square, self._denominator_slope)
+        return factor, slope / below
+
+    def _equidistant_factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        radius = np.sqrt(square)
+        angle = np.arctan(radius)
+        polynomial = polyval(angle * angle, self.numerator)
+        near_axis = square < 1e-16
+        safe = np.where(near_axis, 1.0, square)
+        factor = np.where(near_axis, 1.0, angle * polynomial / np.sqrt(safe))
+        angle_slope = polynomial + 2 * angle * angle * polyval(angle * angle, self._numerator_slope)
+        slope = (angle_slope / (1.0 + safe) - factor) / (2.0 * safe)
+        # Near the axis t = r - r^3/3, so g = 1 + (k1 - 1/3) s.
+        return factor, np.where(near_axis, self.numerator[1] - 1.0 / 3.0, slope)
+
+
+def _slope(polynomial: FloatArray) -> FloatArray:
+    """Coefficients of the derivative."""
+    return np.asarray((np.arange(len(polynomial)) * polynomial)[1:] if len(polynomial) > 1 else np.zeros(1))
+
+
+def _growth(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Has the sign of d/dr of r N(r^2) / D(r^2), as a polynomial of s = r^2: (N + 2 s N') D - N 2 s D'."""
+    doubled = 2.0 * np.arange(max(len(numerator), len(denominator)))
+    grown = np.convolve((1.0 + doubled[: len(numerator)]) * numerator, denominator)
+    return np.asarray(grown - np.convolve(numerator, doubled[: len(denominator)] * denominator))
+
+
+def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
+    """The smallest root in (0, bound), else `bound`."""
+    trimmed = np.trim_zeros(polynomial, "b")
+    if len(trimmed) < 2:
+        return bound
+    roots = polyroots(trimmed)
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
+    return float(min(real.min(initial=bound), bound))
+
+
+def _solved(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions of `[..., 2, 2]` systems; not finite where singular, which LAPACK would refuse for all of them."""
+    a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
+    determinant = a * d - b * c
+    x = (d * right[..., 0] - b * right[..., 1]) / determinant
+    y = (a * right[..., 1] - c * right[..., 0]) / determinant
+    return np.stack([x, y], axis=-1)

@@ -1,0 +1,249 @@
+"""From pictures of a board to a camera: find corners, fit, look at the corners again with what was learnt, fit again.
+
+A lens bends the board's edges, and corners fitted with straight ones lie hundredths of a pixel off, all alike in one
+part of the picture. So a first camera tells the bends and which corners must be in the picture too; where the second
+one bends edges so much otherwise that it matters, they are looked at again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import log, sqrt
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.board import BoardFinder, View
+from groundsbot.calib.camera import COEFFICIENTS, CameraModel
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import BoolArray, FloatArray
+from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
+from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fitted_lens
+
+KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # the fewest coefficients first
+_FOLDS: Final = 5
+_LOOKS: Final = 3  # with bends; more than two have not been seen to matter
+_TOO_BLURRED: Final = 4.0  # robust sigmas of the views' blur
+_LEAST_BLUR_SCATTER: Final = 0.1  # of its logarithm
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera, and what led to it.
+
+    Attributes:
+        lens: the fit; its views are those of `views`.
+        views: every view with the board in it, as seen last.
+        poses: of every view.
+        blurred: (V,) views left out because they are more blurred than the others.
+        scores: of each kind of camera tried, the mean squared residual in views that it was not fitted to, in px^2.
+    """
+
+    lens: LensFit
+    views: Sequence[View]
+    poses: Poses
+    blurred: BoolArray
+    scores: dict[str, float]
+
+    @property
+    def model(self) -> CameraModel:
+        """The camera."""
+        return self.lens.fit.model
+
+    @property
+    def corner_sigma_px(self) -> float:
+        """Sigma of a typical corner's coordinate."""
+        return float(np.sqrt(np.median((self.lens.fit.residual_px**2).sum(axis=1)) / MEDIAN_CHI2))
+
+
+def calibrated(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS) -> Calibration:
+    """The camera that took the views, of the kind that predicts best what it was not fitted to.
+
+    Raises:
+        CalibError: the views do not tell a camera.
+    """
+    lens = first_fit(views, finder, name, kinds)
+    found = _looked(_Look(views, lens, every_pose(lens, observed(views, finder), len(views))), finder)
+    scores = {found.lens.fit.model.distortion_model: 0.0}
+    if len(kinds) > 1:
+        chosen, scores = _cross_validated(found.lens, kinds)
+        if chosen.distortion_model != found.lens.fit.model.distortion_model:
+            found = _looked(_refitted(found, chosen, finder), finder)
+    return Calibration(found.lens, found.views, found.poses, blurred(found.views), scores)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Views as seen last, camera and poses that follow, and the (V, K, 13, 2) places by which they were looked at."""
+
+    views: Sequence[View]
+    lens: LensFit
+    poses: Poses
+    expected: FloatArray | None = None
+
+
+def _looked(look: _Look, finder: BoardFinder) -> _Look:
+    """Looks for corners where the camera says that they are, as bent as it says, until it says the same afterwards."""
+    for _ in range(_LOOKS):
+        expected = _expected_places(look, finder)
+        if look.expected is not None and _settled(look, finder.moved_by_bends_px(look.expected, expected)):
+            break
+        views = [finder.find_again(view, each) for view, each in zip(look.views, expected, strict=True)]
+        look = _refitted(replace(look, views=views, expected=expected), look.lens.fit.model, finder)
+    return look
+
+
+def _expected_places(look: _Look, finder: BoardFinder) -> FloatArray:
+    """(V, K, 13, 2) where the camera has the places around each corner."""
+    places = np.einsum("vij,kmj->vkmi", look.poses.rotation, finder.places_around_m())
+    return look.lens.fit.model.project(places + look.poses.place_m[:, None, None])
+
+
+def _settled(look: _Look, moved_px: FloatArray) -> bool:
+    """Whether corners that move by (V, K) move no camera: all together, no more than noise moves its parameters."""
+    corners = [view.corners for view in look.views]
+    moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
+    variance = 0.5 * np.trace(look.lens.seen.covariance, axis1=1, axis2=2) + look.lens.extra_sigma_px**2
+    return bool((moved**2 / variance).sum() < len(look.lens.fit.information))
+
+
+def _refitted(look: _Look, start: CameraModel, finder: BoardFinder) -> _Look:
+    """With the camera and the poses that follow from its views, the camera from a start."""
+    seen = observed(look.views, finder)
+    lens = _fitted_without(blurred(look.views), seen, start)
+    return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
+
+
+def observed(views: Sequence[View], finder: BoardFinder) -> Observations:
+    """The corners of all views."""
+    corners = [view.corners for view in views]
+    return Observations(
+        np.concatenate([np.full(len(each.ids), index) for index, each in enumerate(corners)]).astype(np.int64),
+        finder.corners_m[np.concatenate([each.ids for each in corners])],
+        np.concatenate([each.pixels for each in corners]),
+        np.concatenate([each.covariance for each in corners]),
+    )
+
+
+def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
+    """The camera as the first look at the corners has it, of the simplest kind that fits as well as the best.
+
+    A kind with more freedom always fits a little better, and may bend beyond the corners as no lens does: where corners
+    are looked for next.
+
+    Raises:
+        CalibError: none fits.
+    """
+    size_px = views[0].picture.shape[1], views[0].picture.shape[0]
+    seen = observed(views, finder)
+    found: list[tuple[LensFit, float]] = []
+    why = ""
+    for kind in sorted(kinds, key=lambda kind: COEFFICIENTS[kind]):
+        try:
+            lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, kind, name))
+        except CalibError as error:
+            why = str(error)
+            continue
+        poses = every_pose(lens, seen, len(views))
+        residual = lens.fit.model.project(poses.points(seen.view, seen.points_m)[0]) - seen.pixels
+        found.append((lens, float(np.median(np.nan_to_num((residual**2).sum(axis=1), nan=np.inf)))))
+    if not found:
+        raise CalibError(why)
+    # The median of N squared distances, which noise makes exponential, has a standard error of 1 / (ln 2 sqrt(N)).
+    alike = 1.0 + 2.0 / (log(2.0) * sqrt(len(seen.view)))
+    least = min(typical for _, typical in found)
+    return next(lens for lens, typical in found if typical <= alike * least)
+
+
+def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
+    """Poses of all views, also of those that the fit leaves out."""
+    model = lens.fit.model
+    poses, _ = poses_of(model, seen, n_views)
+    poses.rotation[lens.views], poses.place_m[lens.views] = lens.fit.poses.rotation, lens.fit.poses.place_m
+    for view in np.nonzero(~lens.views)[0]:
+        alone = np.arange(n_views) == view
+        own = renumbered(seen, alone)
+        imaged = np.asarray(
+            np.isfinite(model.project(poses.where(alone).points(own.view, own.points_m)[0])).all(axis=1)
+        )
+        if imaged.any():
+            whitening = imaged[:, None, None] * np.eye(2)
+            fit = adjusted(model, poses.where(alone), own, whitening, hold_intrinsics=True)
+            poses.rotation[view], poses.place_m[view] = fit.poses.rotation[0], fit.poses.place_m[0]
+    return poses
+
+
+def blurred(views: Sequence[View]) -> BoolArray:
+    """(V,) views more blurred than the scatter among them allows, or without corners."""
+    blur_px = np.array([np.median(view.corners.blur_px) if len(view.corners.ids) else np.inf for view in views])
+    logarithm = np.log(blur_px)
+    middle = float(np.median(logarithm))
+    scatter = max(1.4826 * float(np.median(np.abs(logarithm - middle))), _LEAST_BLUR_SCATTER)
+    return np.asarray(logarithm - middle > _TOO_BLURRED * scatter)
+
+
+def _fitted_without(left_out: BoolArray, seen: Observations, start: CameraModel) -> LensFit:
+    """Fits the views that are not left out; the answer is about all of them."""
+    kept = ~left_out
+    of_kept = np.asarray(kept[seen.view])
+    lens = fitted_lens(renumbered(seen, kept), int(kept.sum()), start)
+    views, corners = np.zeros(len(kept), dtype=np.bool_), np.zeros(len(seen.view), dtype=np.bool_)
+    misfit = np.full(len(kept), np.nan)
+    views[kept], corners[of_kept], misfit[kept] = lens.views, lens.corners, lens.view_misfit
+    return replace(lens, views=views, corners=corners, view_misfit=misfit)
+
+
+def _cross_validated(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, dict[str, float]]:
+    """The simplest kind whose error in views left out of its fit is within one standard error of the best one's.
+
+    The rule of one standard error: Breiman et al., Classification and Regression Trees, 1984.
+    """
+    errors, cameras = {}, {}
+    for kind in kinds:
+        fit = _as_kind(lens, kind)
+        if fit is not None:
+            cameras[kind], errors[kind] = fit.model, _errors_left_out(lens, fit)
+    best = min(errors, key=lambda kind: float(errors[kind].mean()))
+    scores = {kind: float(each.mean()) for kind, each in errors.items()}
+    for kind in sorted(errors, key=lambda kind: COEFFICIENTS[kind]):
+        excess = errors[kind] - errors[best]
+        if excess.mean() <= excess.std(ddof=1) / np.sqrt(len(excess)):
+            return cameras[kind], scores
+    return cameras[best], scores
+
+
+def _as_kind(lens: LensFit, kind: str) -> Fit | None:
+    """A camera of some kind fitted to the same corners; None where it has no image of some of them."""
+    model, seen, n_views = lens.fit.model, lens.seen, int(lens.views.sum())
+    if kind == model.distortion_model:
+        return lens.fit
+    try:
+        if kind == "rational_polynomial" and model.distortion_model == "plumb_bob":
+            start = replace(model, distortion_model=kind, distortion=(*model.distortion, 0.0, 0.0, 0.0))
+        else:
+            start = first_guess(seen, n_views, (model.width_px, model.height_px), kind, model.name)
+        robust = fitted_lens(seen, n_views, start)
+    except CalibError:
+        return None
+    poses = every_pose(robust, seen, n_views)
+    if not np.isfinite(robust.fit.model.project(poses.points(seen.view, seen.points_m)[0])).all():
+        return None
+    return adjusted(robust.fit.model, poses, seen, seen.whitening(lens.extra_sigma_px))
+
+
+def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
+    """(views,) mean squared residual in px^2 of each view where camera and view were fitted apart."""
+    seen, n_views = lens.seen, int(lens.views.sum())
+    whitening = seen.whitening(lens.extra_sigma_px)
+    out = np.empty(n_views)
+    for fold in range(min(_FOLDS, n_views)):
+        tested = np.arange(n_views) % _FOLDS == fold
+        own = np.asarray(~tested[seen.view])
+        trained = adjusted(fit.model, fit.poses.where(~tested), renumbered(seen, ~tested), whitening[own]).model
+        test = renumbered(seen, tested)
+        poses = fit.poses.where(tested)
+        imaged = np.asarray(np.isfinite(trained.project(poses.points(test.view, test.points_m)[0])).all(axis=1))
+        weights = np.where(imaged[:, None, None], whitening[~own], 0.0)
+        again = adjusted(trained, poses, test, weights, hold_intrinsics=True)
+        square = np.where(imaged, (again.residual_px**2).sum(axis=1), float(trained.width_px) ** 2)
+        out[tested] = np.bincount(test.view, weights=square) / np.bincount(test.view)
+    return out

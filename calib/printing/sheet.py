@@ -1,0 +1,198 @@
+"""Sheets of paper in a PDF: lengths in mm, from the upper left corner, all in vectors and true to scale."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import BoolArray, written_whole
+
+try:
+    from reportlab.lib.units import mm
+    from reportlab.pdfbase.pdfmetrics import stringWidth
+    from reportlab.pdfgen.canvas import Canvas
+except ImportError as error:  # a robot's computer has no need of it
+    raise CalibError("printing needs reportlab, which is not installed; pip install 'groundsbot[laptop]'") from error
+
+PAPERS_MM: Final = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}
+HOW_TO_PRINT: Final = 'Print at 100 % (not "fit to page"). Hold a ruler against both rulers: 100 mm must be 100 mm.'
+
+_EDGE_MM: Final = 5.0  # along the paper's edges, where many a printer cannot print
+_RULER_MM: Final = 6.5  # what a ruler and its numbers take across
+_HEAD_MM: Final = 15.0  # a title and two lines of text
+_APART_MM: Final = 3.0  # what is printed from rulers and text
+_FONT: Final = "Helvetica"
+_TITLE_PT: Final = 11.0
+_TEXT_PT: Final = 8.0
+_TEXT_MM: Final = 4.0  # from one line to the next
+_LINE_MM: Final = 0.1
+_TICKS_MM: Final = ((10, 3.0), (5, 2.2), (1, 1.4))  # every so many mm, so long
+_NUMBERS_PT: Final = 5.0
+_CAPITAL_MM: Final = 0.72 * _NUMBERS_PT / mm  # how high Helvetica's digits stand
+
+Align = Literal["left", "middle", "right"]
+Line = tuple[float, float, float, float]  # x and y of one end and of the other, in mm
+
+
+class Rectangle(NamedTuple):
+    """Its upper left corner, width and height, in mm."""
+
+    x_mm: float
+    y_mm: float
+    width_mm: float
+    height_mm: float
+
+
+class Sheets:
+    """A PDF under way, one sheet after the other.
+
+    Attributes:
+        width_mm: of the paper.
+        height_mm: of the paper.
+    """
+
+    def __init__(self, path: Path, size_mm: tuple[float, float], title: str) -> None:
+        self.width_mm, self.height_mm = size_mm
+        self._canvas = Canvas(
+            str(path), pagesize=(self.width_mm * mm, self.height_mm * mm), pageCompression=1, invariant=1
+        )
+        self._canvas.setTitle(title)
+        self._canvas.setCreator("groundsbot")
+        # Viewers that ask the PDF leave its size alone when they print it.
+        self._canvas.setViewerPreference("PrintScaling", "None")
+
+    def blacken(self, rectangles: Iterable[Rectangle]) -> None:
+        """Fills them in one go, so that no gap shows where two of them touch."""
+        path = self._canvas.beginPath()
+        for x_mm, y_mm, width_mm, height_mm in rectangles:
+            path.rect(x_mm * mm, self._up(y_mm + height_mm), width_mm * mm, height_mm * mm)
+        self._canvas.drawPath(path, stroke=0, fill=1)
+
+    def triangle(self, x_mm: float, y_mm: float, side_mm: float) -> None:
+        """One that points up, black, its lower left corner at x and y."""
+        path = self._canvas.beginPath()
+        path.moveTo(x_mm * mm, self._up(y_mm))
+        path.lineTo((x_mm + side_mm) * mm, self._up(y_mm))
+        path.lineTo((x_mm + side_mm / 2) * mm, self._up(y_mm - side_mm))
+        path.close()
+        self._canvas.drawPath(path, stroke=0, fill=1)
+
+    def lines(self, lines: Iterable[Line]) -> None:
+        """Thin ones, upright or level; as filled shapes, which nobody moves to whole dots as strokes are."""
+        half_mm = _LINE_MM / 2
+        self.blacken(
+            Rectangle(
+                min(x1_mm, x2_mm) - half_mm,
+                min(y1_mm, y2_mm) - half_mm,
+                abs(x2_mm - x1_mm) + _LINE_MM,
+                abs(y2_mm - y1_mm) + _LINE_MM,
+            )
+            for x1_mm, y1_mm, x2_mm, y2_mm in lines
+        )
+
+    def text(self, x_mm: float, y_mm: float, text: str, size_pt: float, align: Align = "left") -> None:
+        """One line, its base line at y."""
+        self._canvas.setFont(_FONT, size_pt)
+        x_mm -= {"left": 0.0, "middle": 0.5, "right": 1.0}[align] * text_width_mm(text, size_pt)
+        self._canvas.drawString(x_mm * mm, self._up(y_mm), text)
+
+    def head(self, title: str, *lines: str) -> None:
+        """What the sheet is, above everything else."""
+        x_mm, y_mm = _EDGE_MM + _RULER_MM + _APART_MM, _EDGE_MM + 4.0
+        self.text(x_mm, y_mm, title, _TITLE_PT)
+        for index, line in enumerate(lines, start=1):
+            self.text(x_mm, y_mm + index * _TEXT_MM, line, _TEXT_PT)
+
+    def rulers(self) -> None:
+        """One along the left edge, one along the lower edge, as long as the paper allows, from 0."""
+        across_mm = _whole_cm(self.width_mm - 2 * _EDGE_MM - _RULER_MM)
+        down_mm = _whole_cm(self.height_mm - 2 * _EDGE_MM - _RULER_MM)
+        x_mm, y_mm = _EDGE_MM + _RULER_MM, self.height_mm - _EDGE_MM - _RULER_MM
+        self.lines(
+            [
+                (x_mm, y_mm, x_mm + across_mm, y_mm),
+                (x_mm, y_mm, x_mm, y_mm - down_mm),
+                *((x_mm + along, y_mm, x_mm + along, y_mm + long_mm) for along, long_mm in _ticks(across_mm)),
+                *((x_mm, y_mm - along, x_mm - long_mm, y_mm - along) for along, long_mm in _ticks(down_mm)),
+            ]
+        )
+        long_mm = _TICKS_MM[0][1] + 0.5
+        for along in range(0, across_mm + 1, 10):
+            self.text(x_mm + along, y_mm + long_mm + _CAPITAL_MM, str(along), _NUMBERS_PT, "middle")
+        for along in range(0, down_mm + 1, 10):
+            self.text(x_mm - long_mm, y_mm - along + _CAPITAL_MM / 2, str(along), _NUMBERS_PT, "right")
+
+    def end_sheet(self) -> None:
+        """What is drawn from now on goes to the next one."""
+        self._canvas.showPage()
+
+    def save(self) -> None:
+        """Writes the file."""
+        self._canvas.save()
+
+    def _up(self, y_mm: float) -> float:
+        return (self.height_mm - y_mm) * mm
+
+
+@contextmanager
+def sheets_written(path: Path, size_mm: tuple[float, float], title: str, overwrite: bool) -> Iterator[Sheets]:
+    """A PDF of sheets of one size, there as a whole when the block ends, or not at all.
+
+    Raises:
+        CalibError: `path` exists and is not to be overwritten, or cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise CalibError(f"{path}: exists already; name another file, or give --overwrite")
+    try:
+        with written_whole(path) as temporary:
+            sheets = Sheets(temporary, size_mm, title)
+            yield sheets
+            sheets.save()
+    except OSError as error:
+        raise CalibError(f"{path}: cannot be written ({error.strerror}); name a file that you may write") from error
+
+
+def paper_size_mm(paper: str) -> tuple[float, float]:
+    """Width and height of a paper standing upright.
+
+    Raises:
+        CalibError: no such paper.
+    """
+    if paper.lower() not in PAPERS_MM:
+        raise CalibError(f"--paper is {paper!r} but must be one of {', '.join(PAPERS_MM)}")
+    return PAPERS_MM[paper.lower()]
+
+
+def room_on(paper_mm: tuple[float, float]) -> Rectangle:
+    """What is left of a paper between text and rulers, and some space around."""
+    width_mm, height_mm = paper_mm
+    left_mm, top_mm = _EDGE_MM + _RULER_MM + _APART_MM, _EDGE_MM + _HEAD_MM
+    return Rectangle(
+        left_mm, top_mm, width_mm - left_mm - _EDGE_MM, height_mm - top_mm - _EDGE_MM - _RULER_MM - _APART_MM
+    )
+
+
+def black_cells(bits: BoolArray, x_mm: float, y_mm: float, cell_mm: float) -> Iterator[Rectangle]:
+    """The black cells of a pattern, neighbours in a row as one; its upper left corner at x and y."""
+    for row, cells in enumerate(bits):
+        edges = np.flatnonzero(np.diff(~cells, prepend=False, append=False))
+        for first, end in edges.reshape(-1, 2):
+            yield Rectangle(x_mm + first * cell_mm, y_mm + row * cell_mm, (end - first) * cell_mm, cell_mm)
+
+
+def text_width_mm(text: str, size_pt: float) -> float:
+    """How long a line of text is."""
+    return float(stringWidth(text, _FONT, size_pt)) / mm
+
+
+def _whole_cm(length_mm: float) -> int:
+    return int(length_mm // 10) * 10
+
+
+def _ticks(length_mm: int) -> Iterator[tuple[int, float]]:
+    """Where they are and how long."""
+    for along_mm in range(length_mm + 1):
+        yield along_mm, next(long_mm for every_mm, long_mm in _TICKS_MM if along_mm % every_mm == 0)

@@ -1,0 +1,33 @@
+from .noise import NoiseParameters, read_noise_yaml
+from .parameters import (
+    CAMERA_PARAMETERS,
+    EDGE_SHIFT,
+    FOCAL_SCALE,
+    IMPORTED_BATCH,
+    MOUNT_PARAMETERS,
+    TAG_SCALE,
+    TIME_OFFSET,
+    WHEEL_PARAMETERS,
+)
+from .robot import R_LEVEL_OPTICAL, Mount, Robot, TagBatch, Wheels, parse_robot_yaml, read_robot_yaml, write_robot_yaml
+
+__all__ = [
+    "CAMERA_PARAMETERS",
+    "EDGE_SHIFT",
+    "FOCAL_SCALE",
+    "IMPORTED_BATCH",
+    "MOUNT_PARAMETERS",
+    "R_LEVEL_OPTICAL",
+    "TAG_SCALE",
+    "TIME_OFFSET",
+    "WHEEL_PARAMETERS",
+    "Mount",
+    "NoiseParameters",
+    "Robot",
+    "TagBatch",
+    "Wheels",
+    "parse_robot_yaml",
+    "read_noise_yaml",
+    "read_robot_yaml",
+    "write_robot_yaml",
+]

@@ -1,0 +1,259 @@
+"""One robot's file, robot.yaml: validated, units in every name, a sigma beside every calibrated value.
+
+docs/robot_yaml.md describes it field by field.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import parse_mapping, read_text, validated, write_model
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+# Nothing on a robot is this long: a larger number was given in millimetres.
+Length = Annotated[float, Field(gt=0.0, le=10.0, allow_inf_nan=False)]
+Place = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
+TagFamily = Literal["tag36h11", "tag25h9", "tag16h5"]
+DetectorName = Literal["pupil-apriltags", "pyapriltags"]
+
+RELATIVE_RADIUS_SIGMA = 0.005
+RELATIVE_TRACK_SIGMA = 0.01
+RELATIVE_TAG_SIZE_SIGMA = 0.005
+# How far too far out sides of tags are seen. A camera that is linear in light and sharp stays within 0.05 px: pictures
+# rendered with a gamma of 1.02 and a blur of 0.9 px have them 0.02 to 0.04 px too far in. With a gamma of 2.2 and a
+# blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a step best which was blurred and then coded; that is
+# within reach of this sigma, and the tags of a drive tell it.
+EDGE_SHIFT_PX_SIGMA = 0.1
+# x right, y down, z forward of the camera, in forward, left, up.
+R_LEVEL_OPTICAL = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's Field
+    """The default of a sigma: a share of the field before it."""
+    return Field(default_factory=lambda data: data[field] * share)
+
+
+class Wheels(_Section):
+    """The differential drive.
+
+    Errors of the two radii are independent, so that their common scale has sigma / sqrt(2), unless it is said how well
+    that scale and the right radius over the left are known, as shares: drives tell the latter far better.
+    """
+
+    radius_left_m: Length
+    radius_left_m_sigma: Positive = _share_of("radius_left_m", RELATIVE_RADIUS_SIGMA)
+    radius_right_m: Length
+    radius_right_m_sigma: Positive = _share_of("radius_right_m", RELATIVE_RADIUS_SIGMA)
+    track_m: Length
+    track_m_sigma: Positive = _share_of("track_m", RELATIVE_TRACK_SIGMA)
+    ticks_per_turn: Positive
+    radii_scale_sigma: Positive | None = None
+    radii_ratio_sigma: Positive | None = None
+
+    @property
+    def metres_per_tick(self) -> tuple[float, float]:
+        """How far the left and the right wheel roll in one tick."""
+        turn = 2.0 * math.pi / self.ticks_per_turn
+        return self.radius_left_m * turn, self.radius_right_m * turn
+
+
+class Mount(_Section):
+    """Where the camera sits on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
+
+    All angles zero looks level and straight ahead; positive yaw turns to the left, positive pitch looks down,
+    positive roll tips the camera's top to the right.
+    """
+
+    x_m: Place = 0.0
+    x_m_sigma: Positive = 0.005
+    y_m: Place = 0.0
+    y_m_sigma: Positive = 0.005
+    z_m: Place = 0.0
+    z_m_sigma: Positive = 0.005
+    roll_rad: Finite = 0.0
+    roll_rad_sigma: Positive = math.radians(0.5)
+    pitch_rad: Finite = 0.0
+    pitch_rad_sigma: Positive = math.radians(0.5)
+    yaw_rad: Finite = 0.0
+    yaw_rad_sigma: Positive = math.radians(0.5)
+
+    @field_validator("roll_rad", "pitch_rad", "yaw_rad")
+    @classmethod
+    def _no_degrees(cls, angle_rad: float) -> float:
+        if abs(angle_rad) > 2.0 * math.pi:
+            raise ValueError(f"{angle_rad} is more than a full turn (2 pi rad); give radians, not degrees")
+        return angle_rad
+
+    @property
+    def T_base_camera(self) -> RigidTransform:
+        """Points in the camera's optical frame to points in base."""
+        turned = Rotation.from_euler("ZYX", [self.yaw_rad, self.pitch_rad, self.roll_rad])
+        return RigidTransform.from_components(
+            np.array([self.x_m, self.y_m, self.z_m]), rotation=turned * R_LEVEL_OPTICAL
+        )
+
+
+def _reference_size(batch: dict[str, Any]) -> float:
+    """The size in m that a batch's sigma is about."""
+    return float(batch["default_size_m"] or max(batch["sizes_m"].values(), default=1.0))
+
+
+class TagBatch(_Section):
+    """Tags printed together: one scale error for all, `sigma_size_m` on the default size (or on the largest)."""
+
+    family: TagFamily = "tag36h11"
+    default_size_m: Length | None = None
+    sizes_m: dict[Annotated[int, Field(ge=0)], Length] = {}
+    sigma_size_m: Positive = Field(default_factory=lambda data: _reference_size(data) * RELATIVE_TAG_SIZE_SIGMA)
+    batch: Annotated[str, Field(min_length=1)] = "default"
+
+    @model_validator(mode="after")
+    def _has_a_size(self) -> Self:
+        if self.default_size_m is None and not self.sizes_m:
+            raise ValueError(
+                "default_size_m is missing and sizes_m is empty; give the side of the black border's outer edge in m"
+            )
+        return self
+
+    @property
+    def relative_sigma(self) -> float:
+        """The batch's scale error as a share of the size."""
+        return self.sigma_size_m / _reference_size(vars(self))
+
+
+class Devices(_Section):
+    """What the recorder opens."""
+
+    encoder_port: Annotated[str, Field(min_length=1)] | None = None
+    encoder_baud: Annotated[int, Field(gt=0)] = 115200
+    camera: Annotated[str, Field(min_length=1)] | None = None
+    camera_fps: Positive = 15.0
+    camera_exposure_s: Positive | None = None
+    camera_gain: NotNegative | None = None
+
+
+class RecorderOptions(_Section):
+    """How the recorder works."""
+
+    picture_rate_hz: NotNegative = 0.0
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
+    detector: DetectorName = "pupil-apriltags"
+    quad_decimate: Annotated[float, Field(ge=1.0, le=8.0)] = 2.0
+    families: Annotated[list[TagFamily], Field(min_length=1)] = ["tag36h11"]
+    segment_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 600.0
+    segment_mb: Annotated[int, Field(ge=1)] = 500
+    keep_free_mb: Annotated[int, Field(ge=0)] = 500
+    remove_old_pictures: bool = False
+
+
+class Robot(_Section):
+    """One robot: wheels, camera and where it sits, the tags it may meet, its devices."""
+
+    robot_id: str
+    wheels: Wheels
+    mount: Mount = Mount()
+    camera: Annotated[str, Field(min_length=1)] | None = None
+    focal_scale_sigma: NotNegative = 0.0
+    readout_s: NotNegative = 0.0
+    time_offset_s: Finite = 0.0
+    time_offset_s_sigma: Positive = 0.002
+    edge_shift_px: Finite = 0.0
+    edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
+    tags: list[TagBatch] = []
+    imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
+    devices: Devices = Devices()
+    recorder: RecorderOptions = RecorderOptions()
+
+    @field_validator("robot_id")
+    @classmethod
+    def _fit_for_file_names(cls, robot_id: str) -> str:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", robot_id):
+            raise ValueError(
+                f"{robot_id!r} is not 1 to 64 letters, digits, '.', '_' or '-' beginning with a letter or digit; "
+                "rename the robot, file names are made of this"
+            )
+        return robot_id
+
+    @model_validator(mode="after")
+    def _detects_its_tags(self) -> Self:
+        for index, batch in enumerate(self.tags):
+            if batch.family not in self.recorder.families:
+                raise ValueError(
+                    f"tags[{index}].family is {batch.family!r} but recorder.families is {self.recorder.families}, "
+                    "so its tags would never be seen; add it there"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _each_tag_once(self) -> Self:
+        defaults: set[str] = set()
+        listed: set[tuple[str, int]] = set()
+        for index, batch in enumerate(self.tags):
+            if batch.default_size_m is not None and batch.family in defaults:
+                raise ValueError(
+                    f"tags[{index}].default_size_m: {batch.family} has a default size already; "
+                    "list the ids of all but one batch in sizes_m"
+                )
+            twice = sorted(tag_id for tag_id in batch.sizes_m if (batch.family, tag_id) in listed)
+            if twice:
+                raise ValueError(
+                    f"tags[{index}].sizes_m: {batch.family} tag {twice[0]} is in an earlier batch too; remove one"
+                )
+            listed.update((batch.family, tag_id) for tag_id in batch.sizes_m)
+            if batch.default_size_m is not None:
+                defaults.add(batch.family)
+        return self
+
+    def tag_size_m(self, family: str, tag_id: int) -> tuple[float, float, str]:
+        """A tag's side (the black border's outer edge), its sigma and its batch.
+
+        Raises:
+            CalibError: robot.yaml gives no size for it.
+        """
+        of_family = [batch for batch in self.tags if batch.family == family]
+        for batch in of_family:
+            if tag_id in batch.sizes_m:
+                size_m = batch.sizes_m[tag_id]
+                return size_m, size_m * batch.relative_sigma, batch.batch
+        for batch in of_family:
+            if batch.default_size_m is not None:
+                return batch.default_size_m, batch.sigma_size_m, batch.batch
+        raise CalibError(
+            f"robot {self.robot_id}: tags gives no size for {family} tag {tag_id}; "
+            f"add default_size_m or sizes_m: {{{tag_id}: metres}} to a batch of family {family} in robot.yaml"
+        )
+
+
+def parse_robot_yaml(text: str, source: str) -> Robot:
+    """A robot from the text of its file; `source` names it in errors.
+
+    Raises:
+        CalibError: one line that names file, field, value, limit and way out.
+    """
+    return validated(Robot, parse_mapping(text, source), source)
+
+
+def read_robot_yaml(path: Path) -> Robot:
+    """A robot from its file. `camera` stays as written: relative to the file's folder.
+
+    Raises:
+        CalibError: one line that names file, field, value, limit and way out.
+    """
+    return parse_robot_yaml(read_text(path), str(path))
+
+
+def write_robot_yaml(robot: Robot, path: Path) -> None:
+    """Writes every field, defaults included; whole or not at all."""
+    write_model(robot, path)

@@ -1,0 +1,5 @@
+from .advice import advise
+
+__all__ = [
+    "advise",
+]

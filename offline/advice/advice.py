@@ -1,0 +1,123 @@
+"""Where one more drive, or one more tag, would help a map most: candidates judged by what they do to its worst tag.
+
+The figure is the largest sigma of any tag, along its worst direction, as it would be with the candidate's measurements
+too: worked out from the solved map's joint covariance, without another solve (`advice_gain`). A candidate of each kind
+is told, the best first: a pass (`advice_passes`), and a tag that the same drives would have read (`advice_tags`).
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.linalg import LinAlgError
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.advice.information_gain import Gain, Known
+from groundsbot.offline.advice.new_tags import Drives, Place, View, drives_of, gain_of_place, places_of, view_of
+from groundsbot.offline.advice.passes import Pass, Sighting, gain_of_pass, passes_of, sightings_of, ways_m
+from groundsbot.offline.advice.visibility import expected_sigmas_m
+from groundsbot.offline.maps import AdviceResult
+from groundsbot.offline.measurements import TagKey
+from groundsbot.offline.sam import MAX_RELATIVE_ERROR, Graph, Solution, State
+
+# Corners of a way are enough to draw it.
+_MOST_POINTS: Final = 40
+
+
+class Candidates(NamedTuple):
+    """What could be done, and what that is judged by."""
+
+    sightings: list[Sighting]
+    drives: Drives
+    view: View
+    passes: list[Pass]
+    places: list[Place]
+
+
+class Judged(NamedTuple):
+    """A candidate and (T,) the tags' sigmas, now and then."""
+
+    kind: str
+    candidate: Pass | Place
+    now_m: FloatArray
+    then_m: FloatArray
+
+
+def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResult]:
+    """The best pass and the best tag for one component, the better one first; none where covariances mean nothing.
+
+    Args:
+        graph: of the component.
+        solution: of that graph.
+        component: its index.
+    """
+    is_sound = solution.converged and not solution.untied.n_directions
+    if not graph.tags or not is_sound or solution.relative_error() > MAX_RELATIVE_ERROR:
+        return []
+    return [_result(graph, solution, each, component) for each in judged(graph, solution)]
+
+
+def judged(graph: Graph, solution: Solution) -> list[Judged]:
+    """The best pass and the best tag, as far as there are any, the better one first."""
+    _, drives, view, passes, places = candidates_of(graph, solution.state)
+    gains: list[tuple[str, Pass | Place, Gain]] = []
+    for each in passes:
+        with suppress(LinAlgError):  # a pass that rounding leaves untied tells nothing
+            gains.append(("pass", each, gain_of_pass(graph, solution.state, each)))
+    gains += [("tag", each, gain_of_place(drives, view, each)) for each in places]
+    known = known_of(solution, [gain for _, _, gain in gains])
+    now_m = known.sigmas_m()
+    then = []
+    for kind, candidate, gain in gains:
+        if isinstance(candidate, Place):
+            then_m = expected_sigmas_m(drives, view, candidate, known)
+        else:
+            then_m = known.sigmas_with_m(gain)
+        then.append(Judged(kind, candidate, now_m, then_m))
+    then.sort(key=lambda each: float(each.then_m.max()))
+    return [next(each for each in then if each.kind == kind) for kind in dict.fromkeys(each.kind for each in then)]
+
+
+def candidates_of(graph: Graph, state: State) -> Candidates:
+    """For a component with readings."""
+    ways = ways_m(graph)
+    sightings = sightings_of(graph, ways)
+    drives = drives_of(graph, state, ways)
+    view = view_of(drives, len(sightings))
+    return Candidates(sightings, drives, view, passes_of(ways, sightings), places_of(drives, view))
+
+
+def known_of(solution: Solution, gains: Sequence[Gain]) -> Known:
+    """The joint covariance of all tags and of whatever else the gains are about."""
+    tags = solution.problem.columns.tags.reshape(-1)
+    others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
+    columns: IntArray = np.concatenate([tags, others])
+    return Known(columns, solution.covariance(columns), len(tags) // 2)
+
+
+def _result(graph: Graph, solution: Solution, best: Judged, component: int) -> AdviceResult:
+    wanted, tags = best.candidate, solution.state.tags
+    length_m: float | None = None
+    if isinstance(wanted, Pass):
+        ends = [wanted.from_tag, wanted.to_tag]
+        length_m = float(graph.chains[wanted.chain].odometry.distance_m[wanted.first : wanted.last].sum())
+        way = np.unique(np.linspace(wanted.first, wanted.last, _MOST_POINTS).round().astype(int))
+        way_m = graph.poses_of(solution.state, wanted.chain)[way, :2]
+    else:
+        ends, way_m = [int(np.argmin(np.hypot(*(tags - wanted.position_m).T)))], wanted.position_m[None]
+    return AdviceResult(
+        kind=best.kind,
+        component=component,
+        run=graph.chains[wanted.chain].name,
+        tags=tuple(_name(graph.tags[i]) for i in ends),
+        way_m=way_m,
+        length_m=length_m,
+        worst_tag=_name(graph.tags[int(np.argmax(best.now_m))]),
+        sigma_m=float(best.now_m.max()),
+        sigma_then_m=float(best.then_m.max()),
+    )
+
+
+def _name(tag: TagKey) -> tuple[str, int, str]:
+    return tag.family, tag.tag_id, tag.instance

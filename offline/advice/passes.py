@@ -1,0 +1,142 @@
+"""Drives that could be driven once more: parts of the ways that a map's runs drove, from one tag to another.
+
+A pass is taken to tell what the part of the run that it repeats told, with errors of its own: its poses are new, tags
+and calibration are those of the map.
+"""
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.advice.information_gain import Gain, condensed
+from groundsbot.offline.sam import Columns, Graph, State
+
+# A pass is a trip, not the whole drive again: at most this share of the longest run, and so far.
+_LENGTH_SHARE: Final = 0.25
+_MOST_LENGTH_M: Final = 50.0
+# The advice must not take longer than the map: so many candidates, and so many keyframes of all of them together.
+MOST_PASSES: Final = 40
+_MOST_KEYFRAMES: Final = 20_000
+# Some seconds of cubes of twice the tags that each of them passes.
+_MOST_WORK: Final = 2e9
+# What a pass tells costs the cube of the tags that it passes.
+_MOST_SIGHTINGS: Final = 60
+# A tag read again after so much way was passed again.
+SIGHTING_GAP_M: Final = 2.5
+
+
+class Sighting(NamedTuple):
+    """A run passes a tag."""
+
+    chain: int
+    tag: int
+    first: int  # keyframe of the chain
+    last: int
+
+
+class Pass(NamedTuple):
+    """Keyframes first to last of a chain, from the tag read first to the one read last."""
+
+    chain: int
+    first: int
+    last: int
+    from_tag: int
+    to_tag: int
+
+
+def ways_m(graph: Graph) -> list[FloatArray]:
+    """Of each chain, (K,) how far it had driven at its keyframes."""
+    return [chain.along_m for chain in graph.chains]
+
+
+def sightings_of(graph: Graph, ways: list[FloatArray]) -> list[Sighting]:
+    """All of them, chain by chain in the order in which they begin."""
+    found: list[Sighting] = []
+    number = {tag: i for i, tag in enumerate(graph.tags)}
+    for c, chain in enumerate(graph.chains):
+        order = np.lexsort((chain.readings.keyframe, chain.readings.tag))
+        keyframe, tag = chain.readings.keyframe[order], chain.readings.tag[order]
+        if not len(order):
+            continue
+        begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > SIGHTING_GAP_M)) + 1
+        own = [
+            Sighting(c, number[chain.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
+            for part in np.split(np.arange(len(order)), begins)
+        ]
+        found += sorted(own, key=lambda each: (each.first, each.last, each.tag))
+    return found
+
+
+def most_length_m(ways: list[FloatArray]) -> float:
+    """Of a pass."""
+    return min(_LENGTH_SHARE * max(float(way[-1]) for way in ways), _MOST_LENGTH_M)
+
+
+def passes_of(ways: list[FloatArray], sightings: list[Sighting], most: int = MOST_PASSES) -> list[Pass]:
+    """From a sighting as far as a pass goes, for each of them or so many evenly chosen.
+
+    Args:
+        ways: of `ways_m`.
+        sightings: of `sightings_of`.
+        most: how many.
+    """
+    length_m = most_length_m(ways)
+    found: list[Pass] = []
+    for c, way in enumerate(ways):
+        own = [each for each in sightings if each.chain == c]
+        ends_m = way[[each.last for each in own]]
+        for i, begin in enumerate(own):
+            reached = i + 1 + np.flatnonzero(ends_m[i + 1 : i + 1 + _MOST_SIGHTINGS] <= way[begin.first] + length_m)
+            ends = [own[k] for k in reached.tolist() if own[k].tag != begin.tag]
+            if ends:
+                end = max(ends, key=lambda each: each.last)
+                found.append(Pass(c, begin.first, end.last, begin.tag, end.tag))
+    n_keyframes = sum(each.last - each.first + 1 for each in found)
+    most = min(most, max(1, len(found) * _MOST_KEYFRAMES // max(n_keyframes, 1)))
+    found = _evenly(found, most)
+    work = sum((2.0 * len(_passed(each, sightings))) ** 3 for each in found)
+    return _evenly(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
+
+
+def _evenly(passes: list[Pass], most: int) -> list[Pass]:
+    """So many of them at most."""
+    if len(passes) <= most:
+        return passes
+    return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
+
+
+def _passed(wanted: Pass, sightings: list[Sighting]) -> set[int]:
+    """The tags seen on the way."""
+    return {
+        each.tag
+        for each in sightings
+        if each.chain == wanted.chain and each.first <= wanted.last and each.last >= wanted.first
+    }
+
+
+def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> Gain:
+    """What one more pass would tell of the map's tags and calibration."""
+    problem, offset = graph.problem, int(graph.first_pose[wanted.chain])
+    first, last = offset + wanted.first, offset + wanted.last
+    odometry, readings = problem.odometry, problem.readings
+    driven = slice(*np.searchsorted(odometry.first, [first, last]))
+    read = np.flatnonzero((readings.pose >= first) & (readings.pose <= last))
+    odometry = replace(odometry, **{name: value[driven] for name, value in vars(odometry).items()})
+    readings = replace(readings, **{name: value[read] for name, value in vars(readings).items()})
+    own, columns = _own_columns(problem.columns, np.arange(first, last + 1), np.unique(readings.tag))
+    return condensed((odometry.linearise(state, own), readings.linearise(state, own)), 3 * (last - first + 1), columns)
+
+
+def _own_columns(of_map: Columns, poses: IntArray, tags: IntArray) -> tuple[Columns, IntArray]:
+    """Columns of new copies of some poses, then of the map's own tags and calibration; and which those are there."""
+    n_own, n_tags = 3 * len(poses), 2 * len(tags)
+    by_pose = np.full(of_map.poses.shape, -1)
+    by_pose[poses] = np.arange(n_own).reshape(-1, 3)
+    by_tag = np.full(of_map.tags.shape, -1)
+    by_tag[tags] = n_own + np.arange(n_tags).reshape(-1, 2)
+    free = of_map.calibration >= 0
+    by_calibration = np.where(free, n_own + n_tags + np.cumsum(free) - 1, -1)
+    columns = np.concatenate([of_map.tags[tags].reshape(-1), of_map.calibration[free]])
+    return Columns(by_pose, by_tag, by_calibration, n_own + len(columns)), columns

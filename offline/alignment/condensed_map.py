@@ -1,0 +1,228 @@
+"""A local map reduced to its tags, with what its solve knows of them, in coordinates that stand a bend.
+
+The joint covariance of a solve is about small errors. A long drive errs by degrees in its heading, and what turns by
+phi moves on an arc: two tags 2 m apart, whose distance is known to a millimetre, come out 2 m phi^2 / 2 nearer when
+their errors are taken in map axes (11 mm at 6 degrees). So each tag is kept in the frame of a pose that read it, these
+anchor poses relative to each other along a tree of the stiffest relations, and errors enter there, T o exp(delta), as
+they do along a chain. To first order that is the same covariance; but a bend is no longer a contradiction.
+
+Andersson and Nygards, "C-SAM: Multi-robot SLAM using square root information smoothing" (2008), and Cunningham et al.,
+"DDF-SAM" (2010), condense local maps too, in map axes.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measurements import TagKey
+
+
+@dataclass(frozen=True)
+class CondensedMap:
+    """Some tags of a local map.
+
+    Attributes:
+        name: of the chain.
+        tags: sorted.
+        T_start_anchor: (T, 3) a pose from which each tag was read.
+        tag_m: (T, 2) each tag in its anchor's frame.
+        covariance: (5 T, 5 T) of right tangents of all anchors, (x, y, theta) each, then of all tags in their anchors.
+        root: the index of the anchor that stands still when errors are drawn: it carries the frame.
+    """
+
+    name: str
+    tags: tuple[TagKey, ...]
+    T_start_anchor: FloatArray
+    tag_m: FloatArray
+    covariance: FloatArray
+    root: int
+
+    @property
+    def tags_m(self) -> FloatArray:
+        """(T, 2) in the frame of the start."""
+        return se2.apply(self.T_start_anchor, self.tag_m)
+
+    @property
+    def extent_m(self) -> float:
+        """Length of the longer side of the box that holds the tags."""
+        return float(np.ptp(self.tags_m, axis=0).max())
+
+    @property
+    def frame_covariance(self) -> FloatArray:
+        """(3, 3) of where the start truly lies in the frame that the root carries, as a twist there."""
+        columns = 3 * self.root + np.arange(3)
+        carried = se2.adjoint(self.T_start_anchor[self.root])
+        covariance: FloatArray = carried @ self.covariance[np.ix_(columns, columns)] @ carried.T
+        return covariance
+
+    def tree(self, tags: Sequence[TagKey]) -> "AnchorTree":
+        """Some of the tags, for an alignment."""
+        index = {tag: i for i, tag in enumerate(self.tags)}
+        return _anchor_tree(self, np.array([index[tag] for tag in tags], dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class AnchorTree:
+    """Tags as a function of errors xi ~ N(0, covariance): how each anchor lies off its parent, each tag off its anchor.
+
+    Attributes:
+        root: (3,) T_start_root, exact.
+        order: (n,) nodes so that parents come first.
+        parent: (n,) of each node; -1: the root.
+        step: (n, 3) T_parent_anchor.
+        tag_m: (n, 2) in the anchor's frame.
+        above: (n, n) whether node k lies on the way from the root to node i, i itself included.
+        covariance: (5 n, 5 n) of xi: the n steps' right tangents, then the n tags in their anchors.
+    """
+
+    root: FloatArray
+    order: IntArray
+    parent: IntArray
+    step: FloatArray
+    tag_m: FloatArray
+    above: FloatArray
+    covariance: FloatArray
+
+    def places(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) tags in the frame of the start, and (n, 3) anchors."""
+        n = len(self.step)
+        moved = se2.compose(self.step, se2.exp(xi[: 3 * n].reshape(n, 3))).tolist()
+        parent = self.parent.tolist()
+        along = [*moved, self.root.tolist()]  # overwritten in order; plain numbers, as arrays of three cost more
+        for node in self.order.tolist():
+            x, y, theta = along[parent[node]]
+            cos, sin = math.cos(theta), math.sin(theta)
+            dx, dy, turn = moved[node]
+            along[node] = x + cos * dx - sin * dy, y + sin * dx + cos * dy, theta + turn
+        anchors = np.array(along[:n])
+        return se2.apply(anchors, self.tag_m + xi[3 * n :].reshape(n, 2)), anchors
+
+    def jacobian(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) tags in the frame of the start, and their derivatives (2 n, 5 n) by xi."""
+        n = len(self.step)
+        places, anchors = self.places(xi)
+        # A node's step moves all that hangs on it by the twist Ad(T) Jr dxi in the frame of the start.
+        by_step = se2.adjoint(anchors) @ se2.right_jacobian(xi[: 3 * n].reshape(n, 3))
+        moved = by_step[None, :, :2] + quarter_turned(places)[:, None, :, None] * by_step[None, :, None, 2]
+        out = np.zeros((n, 2, 5 * n))
+        out[..., : 3 * n] = (moved * self.above[:, :, None, None]).transpose(0, 2, 1, 3).reshape(n, 2, 3 * n)
+        cos, sin = np.cos(anchors[:, 2]), np.sin(anchors[:, 2])
+        each = np.arange(n)
+        out[each, 0, 3 * n + 2 * each], out[each, 0, 3 * n + 2 * each + 1] = cos, -sin
+        out[each, 1, 3 * n + 2 * each], out[each, 1, 3 * n + 2 * each + 1] = sin, cos
+        return places, out.reshape(2 * n, 5 * n)
+
+
+def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float = 1.0) -> CondensedMap:
+    """A local map reduced to some of its tags.
+
+    Args:
+        local_map: solved.
+        tags: sorted, one at least.
+        variance_factor: the covariance's, where the noise is known to be larger than the solve was told.
+    """
+    problem, state = local_map.graph.problem, local_map.solution.state
+    index = {tag: i for i, tag in enumerate(local_map.graph.tags)}
+    which = np.array([index[tag] for tag in tags], dtype=np.int64)
+    pose = problem.anchor[which]
+    columns = np.concatenate([problem.columns.poses[pose].reshape(-1), problem.columns.tags[which].reshape(-1)])
+    joint = variance_factor * local_map.solution.covariance(columns)
+    T_start_anchor = state.poses[pose]
+    tag_m = se2.apply(se2.inverse(T_start_anchor), state.tags[which])
+    return CondensedMap(
+        name=local_map.chain.name,
+        tags=tuple(tags),
+        T_start_anchor=T_start_anchor,
+        tag_m=tag_m,
+        covariance=_in_anchors(joint, T_start_anchor, tag_m),
+        root=_stillest(joint, len(which)),
+    )
+
+
+def quarter_turned(vectors: FloatArray) -> FloatArray:
+    """(..., 2) turned by a quarter to the left: how points move when all turns."""
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
+def _in_anchors(joint: FloatArray, T_start_anchor: FloatArray, tag_m: FloatArray) -> FloatArray:
+    """From tags in the frame of the start to tags in their anchors' frames: de = R^T dl - d_xy - d_theta J e."""
+    n = len(tag_m)
+    cos, sin = np.cos(T_start_anchor[:, 2]), np.sin(T_start_anchor[:, 2])
+    turn = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
+    quarter = quarter_turned(tag_m)
+
+    def rows(matrix: FloatArray) -> FloatArray:
+        out = matrix.copy()
+        anchors, tags = matrix[: 3 * n].reshape(n, 3, -1), matrix[3 * n :].reshape(n, 2, -1)
+        moved = turn @ tags - anchors[:, :2] - quarter[:, :, None] * anchors[:, 2:]
+        out[3 * n :] = moved.reshape(2 * n, -1)
+        return out
+
+    return rows(np.ascontiguousarray(rows(joint).T))
+
+
+def _stillest(joint: FloatArray, n: int) -> int:
+    """The anchor whose heading is best known against all others'."""
+    return int(np.argmin(_heading_variance(joint, n).sum(axis=1)))
+
+
+def _heading_variance(joint: FloatArray, n: int) -> FloatArray:
+    """(n, n) of the differences of the anchors' headings."""
+    headings = joint[2 : 3 * n : 3, 2 : 3 * n : 3]
+    own = np.diag(headings)
+    return np.maximum(own[:, None] + own - 2.0 * headings, 0.0)
+
+
+def _anchor_tree(condensed: CondensedMap, which: IntArray) -> AnchorTree:
+    n_all, n = len(condensed.tags), len(which)
+    nodes = np.append(which, condensed.root)
+    parent, order = _stiffest_tree(condensed, nodes)
+    T_start_node = condensed.T_start_anchor[nodes]
+    step = se2.between(T_start_node[parent], T_start_node[:n])
+    columns = np.concatenate(
+        [(3 * nodes[:, None] + np.arange(3)).reshape(-1), (3 * n_all + 2 * which[:, None] + np.arange(2)).reshape(-1)]
+    )
+    joint = condensed.covariance[np.ix_(columns, columns)]
+    carried = se2.adjoint(se2.inverse(step))
+
+    def rows(matrix: FloatArray) -> FloatArray:
+        """T_p o exp(d_p) o D o exp(r) = T_c o exp(d_c): r = d_c - Ad(D^-1) d_p."""
+        anchors = matrix[: 3 * (n + 1)].reshape(n + 1, 3, -1)
+        steps = anchors[:n] - carried @ anchors[parent]
+        return np.concatenate([steps.reshape(3 * n, -1), matrix[3 * (n + 1) :]])
+
+    above = np.zeros((n + 1, n))
+    for node in order:
+        above[node] = above[parent[node]]
+        above[node, node] = 1.0
+    return AnchorTree(
+        root=T_start_node[-1],
+        order=order,
+        parent=np.where(parent == n, -1, parent),
+        step=step,
+        tag_m=condensed.tag_m[which],
+        above=above[:n],
+        covariance=rows(np.ascontiguousarray(rows(joint).T)),
+    )
+
+
+def _stiffest_tree(condensed: CondensedMap, nodes: IntArray) -> tuple[IntArray, IntArray]:
+    """(n,) parent of each node but the last, which is the root, and (n,) these nodes with parents first.
+
+    Neighbours in the tree are those whose headings are best known against each other: there an error in the turn is
+    smallest, and with it what bending adds in second order.
+    """
+    n = len(nodes)
+    variance = _heading_variance(condensed.covariance, len(condensed.tags))[np.ix_(nodes, nodes)]
+    # Only their order counts; and what is near zero (tags read from one pose) would be no edge.
+    weight = 1.0 + variance / max(float(variance.max()), 1e-30)
+    np.fill_diagonal(weight, 0.0)
+    tree = minimum_spanning_tree(weight)
+    found, before = breadth_first_order(tree + tree.T, n - 1, directed=False)
+    return np.asarray(before[: n - 1], dtype=np.int64), np.asarray(found[1:], dtype=np.int64)

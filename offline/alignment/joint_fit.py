@@ -1,0 +1,299 @@
+"""Two local maps held together by some of the tags they share: the least that both must bend, and what it tells.
+
+With xi_a, xi_b the errors of the maps and T the pose of frame b in frame a, the shared tags M ask for
+f_a(xi_a) = T f_b(xi_b). The least of xi_a' C_a^-1 xi_a + xi_b' C_b^-1 xi_b under that condition is what the cost of
+solving both runs together rises by over the local maps (in squared sigmas), and chi-square with 2 M - 3 degrees of
+freedom where all is well. Found by Gauss-Newton on the condition (generalised least squares with the joint covariance
+S of the differences), linearised anew at each step: the Gauss-Helmert model, as in Foerstner and Wrobel,
+"Photogrammetric Computer Vision" (2016), section 4.8.
+
+Calibration is a nuisance of each local solve, so the covariances carry what it leaves open, the scale included; the two
+maps' calibrations are taken as independent. Where they are one robot's, or one batch of tags, their errors are common
+and the true differences smaller than S says: the test is then blunter, never false.
+
+Two tags that are read together a hundred times come out a tenth of a millimetre apart from where they came out in
+another run, says the covariance: it knows of noise, not of a mount that pitches, a lens's remains or a board that
+leans, which shift a tag by millimetres, by more the more the sides differ that it is seen from. So S also holds a
+sigma of 1 cm for each tag, which is little against any tag that was moved.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Final
+
+import numpy as np
+from scipy import linalg
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
+from groundsbot.offline.alignment.condensed_map import AnchorTree, quarter_turned
+from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, ill_fitting, worth_nats
+from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
+
+_STEPS: Final = 8
+_CONVERGED_SIGMAS: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Bend:
+    """T_a_b and how both maps bend to meet."""
+
+    T_a_b: FloatArray  # (3,)
+    xi_a: FloatArray  # (5 n,)
+    xi_b: FloatArray
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The differences of all shared tags around a bend: f_a - T f_b = apart + by_transform dT + noise.
+
+    Attributes:
+        apart: (2 n,) for maps that do not bend.
+        covariance: (2 n, 2 n) of the noise.
+        by_transform: (2 n, 3) by a motion (x, y, turn) of map b about `centre`.
+        by_a: (2 n, 5 n) by xi_a; by_b by xi_b.
+        effort: that least squares over its tags are taken off.
+    """
+
+    at: Bend
+    centre: FloatArray
+    apart: FloatArray
+    covariance: FloatArray
+    by_transform: FloatArray
+    by_a: FloatArray
+    by_b: FloatArray
+    effort: AlignmentEffort = field(default_factory=AlignmentEffort)
+
+
+class JointFit:
+    """Two maps' trees of the same n tags in the same order."""
+
+    def __init__(
+        self,
+        a: AnchorTree,
+        b: AnchorTree,
+        unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
+        effort: AlignmentEffort = UNLIMITED,
+    ) -> None:
+        """Two trees and what may be done with them.
+
+        Args:
+            a: the tree of one map.
+            b: that of the other.
+            unmodelled_sigma_m: of each coordinate, beyond what the covariances say.
+            effort: what it may take.
+        """
+        self.a, self.b = a, b
+        self.n = len(a.step)
+        self.unmodelled_m2 = unmodelled_sigma_m**2
+        self._effort = effort
+
+    @cached_property
+    def _unbent(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+        self._effort.linearise(self.n)
+        none = np.zeros(5 * self.n)
+        return _spread(self.a, none), _spread(self.b, none)
+
+    @property
+    def places_a(self) -> FloatArray:
+        """(n, 2) as map a has them; `places_b` in frame b."""
+        return self._unbent[0][0]
+
+    @property
+    def places_b(self) -> FloatArray:
+        """(n, 2) as map b has them."""
+        return self._unbent[1][0]
+
+    @property
+    def covariance_a(self) -> FloatArray:
+        """(2 n, 2 n) of map a's tags against its root, to first order; `covariance_b` likewise."""
+        return self._unbent[0][2]
+
+    @property
+    def covariance_b(self) -> FloatArray:
+        """(2 n, 2 n) of map b's."""
+        return self._unbent[1][2]
+
+    def unbent(self, T_a_b: FloatArray) -> Bend:
+        """Both maps as they are."""
+        return Bend(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
+
+    def linearised(self, bend: Bend) -> Linear:
+        """The differences around a bend."""
+        bent = bool(bend.xi_a.any() or bend.xi_b.any())
+        if bent:
+            self._effort.linearise(self.n)
+        (f_a, J_a, S_a), (f_b, J_b, S_b) = (
+            (_spread(self.a, bend.xi_a), _spread(self.b, bend.xi_b)) if bent else self._unbent
+        )
+        cos, sin = np.cos(bend.T_a_b[2]), np.sin(bend.T_a_b[2])
+        R = np.array([[cos, -sin], [sin, cos]])
+        by_b = -(R @ J_b.reshape(self.n, 2, -1)).reshape(J_b.shape)
+        turned = (R @ S_b.reshape(self.n, 2, -1)).reshape(S_b.shape)
+        turned = np.einsum("iaj,ba->ibj", turned.T.reshape(self.n, 2, -1), R).reshape(S_b.shape)
+        in_a = se2.apply(bend.T_a_b, f_b)
+        centre = in_a.mean(axis=0)
+        by_transform = np.zeros((self.n, 2, 3))
+        by_transform[:, :, :2] = -np.eye(2)
+        by_transform[:, :, 2] = -quarter_turned(in_a - centre)
+        apart = (f_a - in_a).reshape(-1) - J_a @ bend.xi_a - by_b @ bend.xi_b
+        covariance = S_a + turned
+        covariance[np.diag_indices(2 * self.n)] += self.unmodelled_m2
+        return Linear(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
+
+    def moved(self, linear: Linear, held: "Held") -> Bend:
+        """The bend that the tags held ask for."""
+        pull = np.zeros(2 * self.n)
+        pull[held.rows] = held.pull
+        return Bend(
+            held.T_a_b,
+            -self.a.covariance @ (linear.by_a.T @ pull),
+            -self.b.covariance @ (linear.by_b.T @ pull),
+        )
+
+    def settled(self, bend: Bend, members: BoolArray) -> tuple[Linear, "Held"]:
+        """Where the steps end that these tags (n,) ask for, from a bend nearby."""
+        linear = self.linearised(bend)
+        held = hold(linear, members)
+        for _ in range(_STEPS):
+            linear = self.linearised(self.moved(linear, held))
+            before, held = held, hold(linear, members)
+            left = float(held.motion @ held.information @ held.motion)
+            if left < _CONVERGED_SIGMAS**2 and abs(before.rise - held.rise) < _CONVERGED_SIGMAS * (1.0 + held.rise):
+                break
+        return linear, held
+
+
+@dataclass(frozen=True)
+class Held:
+    """The least squares over some tags of a `Linear`.
+
+    Attributes:
+        rows: (2 m,) of theirs.
+        root: (2 m, 2 m) lower triangular, of the covariance.
+        motion: (3,) that map b still makes.
+        information: (3, 3) of it.
+        pull: (2 m,) how strongly each tag pulls.
+        rise: m tags' sum of squared sigmas, chi-square with 2 m - 3 degrees of freedom.
+        log_determinant: of their covariance.
+    """
+
+    linear: Linear
+    rows: IntArray
+    whitened: FloatArray  # (2 m, 3) by_transform
+    motion: FloatArray
+    information: FloatArray
+    pull: FloatArray
+    left: FloatArray  # (2 m,) whitened
+
+    @property
+    def T_a_b(self) -> FloatArray:
+        """(3,) pose of frame b in frame a once the motion is made."""
+        dx, dy, turn = self.motion
+        centre = self.linear.centre
+        about = centre - se2.apply([0.0, 0.0, turn], centre)
+        return se2.compose([about[0] + dx, about[1] + dy, turn], self.linear.at.T_a_b)
+
+    @property
+    def rise(self) -> float:
+        """In squared sigmas."""
+        return float(self.left @ self.left)
+
+    @property
+    def closes(self) -> bool:
+        """Whether chance explains the rise."""
+        return self.rise <= _most_rise(len(self.rows) - 3)
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """Worked out again by who asks after `without_root`."""
+        return _root(self.linear, self.rows)
+
+    def without_root(self) -> None:
+        """Lets go of the root, which may be most of an explanation; what it is asked for most stays known."""
+        _ = self.log_determinant
+        vars(self).pop("root", None)
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Of the covariance of the differences."""
+        return 2.0 * float(np.log(np.diag(self.root)).sum())
+
+    def others(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) difference of each tag that those held foretell, and (n, 2, 2) its covariance; theirs mean nothing."""
+        linear = self.linear
+        n = len(linear.apart) // 2
+        coupled = linalg.solve_triangular(self.root, linear.covariance[self.rows], lower=True, check_finite=False)
+        off = linear.apart + linear.by_transform @ self.motion - coupled.T @ self.left
+        lever = (linear.by_transform - coupled.T @ self.whitened).reshape(n, 2, 3)
+        each = coupled.reshape(-1, n, 2)
+        own = linear.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n), :]
+        spread = own - np.einsum("ria,rib->iab", each, each)
+        spread += lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
+        return off.reshape(n, 2), spread
+
+    def without_each(self) -> tuple[FloatArray, FloatArray]:
+        """What the others make of each tag held: three tags at least.
+
+        With P the inverse covariance freed of the motion, P_ii^-1 (P w)_i is the difference that the others leave, and
+        P_ii^-1 the covariance that they foretell for it (Baarda's test).
+
+        Returns:
+            (m, 2) differences, and (m, 2, 2) their covariances.
+        """
+        m = len(self.rows) // 2
+        inverse_root = linalg.solve_triangular(self.root, np.eye(2 * m), lower=True, check_finite=False)
+        lever = (inverse_root.T @ self.whitened).reshape(m, 2, 3)
+        each = inverse_root.reshape(2 * m, m, 2)
+        P = np.einsum("rma,rmb->mab", each, each)
+        P -= lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
+        covariance = np.linalg.inv(P)
+        return (covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance
+
+    def misfits(self) -> FloatArray:
+        """(m,) how ill each tag held fits where the others want it, see `ill_fitting`; three tags at least."""
+        return ill_fitting(*self.without_each())
+
+    def worth_nats(self) -> FloatArray:
+        """(m,) log of how much better each tag held fits than as a wrong one; three tags at least."""
+        return worth_nats(*self.without_each())
+
+    def motion_covariance(self) -> FloatArray:
+        """(3, 3) of the motion."""
+        return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
+
+
+@lru_cache
+def _most_rise(freedom: int) -> float:
+    return float(chi2.isf(FALSE_ALARM, freedom))
+
+
+def hold(linear: Linear, members: BoolArray) -> Held:
+    """Least squares over some tags (n,), two at least."""
+    rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
+    linear.effort.hold(len(rows) // 2)
+    root = _root(linear, rows)
+    right = np.column_stack([linear.by_transform[rows], linear.apart[rows]])
+    right = linalg.solve_triangular(root, right, lower=True, check_finite=False)
+    whitened, apart = right[:, :3], right[:, 3]
+    information = whitened.T @ whitened
+    motion = -np.linalg.solve(information, whitened.T @ apart)
+    left = apart + whitened @ motion
+    pull = linalg.solve_triangular(root, left, lower=True, trans=1, check_finite=False)
+    held = Held(linear, rows, whitened, motion, information, pull, left)
+    vars(held)["root"] = root  # where the property has it
+    return held
+
+
+def _root(linear: Linear, rows: IntArray) -> FloatArray:
+    S = linear.covariance[np.ix_(rows, rows)]
+    # Readings without noise leave rounding only; far below any true sigma.
+    S[np.diag_indices(len(rows))] += 1e-12 * float(np.trace(S)) / len(rows) + 1e-18
+    return np.asarray(linalg.cholesky(S, lower=True, check_finite=False), dtype=np.float64)
+
+
+def _spread(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    places, jacobian = tree.jacobian(xi)
+    return places, jacobian, jacobian @ tree.covariance @ jacobian.T

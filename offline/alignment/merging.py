@@ -1,0 +1,190 @@
+"""Many local maps -> components, each with one frame: which chains the shared tags join, and where each starts.
+
+Nothing here depends on the order of the maps but the frame: pairs are aligned in the order of names, and what is equal
+is settled by them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import log, pi
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.alignment.budget import AlignmentEffort, AlignmentTooLongError
+from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
+from groundsbot.offline.alignment.cycle_consistency import Contradiction, Link, consistent_links, spanning_tree
+from groundsbot.offline.alignment.pairwise import Alignment, align
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measurements import Placement, TagKey
+
+
+@dataclass(frozen=True)
+class PairAlignment:
+    """Two local maps, by index, and how the second lies in the first.
+
+    Attributes:
+        a: whose name comes first.
+        b: the other.
+        shared: the tags in both.
+        alignment: by these; None where no two of them fit together.
+        placement: as somebody measured it, of the starts.
+        is_searched: whether what the logs are worth sufficed to look for an alignment.
+    """
+
+    a: int
+    b: int
+    shared: tuple[TagKey, ...]
+    alignment: Alignment | None
+    placement: Placement | None = None
+    is_searched: bool = True
+
+
+@dataclass(frozen=True)
+class Group:
+    """Chains that alignments join.
+
+    Attributes:
+        members: indices of local maps in the order given; the first one's start is the frame.
+        T_frame_start: (n, 3) starting values of the members' starts.
+    """
+
+    members: tuple[int, ...]
+    T_frame_start: FloatArray
+
+
+@dataclass(frozen=True)
+class Merge:
+    """What hangs together, and why.
+
+    Attributes:
+        pairs: all that share a tag or a measured placement, in order of the maps' names.
+        links: by which maps were joined, surest first.
+        contradictions: links that others overruled.
+        groups: largest first.
+    """
+
+    pairs: tuple[PairAlignment, ...]
+    links: tuple[Link, ...]
+    contradictions: tuple[Contradiction, ...]
+    groups: tuple[Group, ...]
+
+
+def merge(
+    maps: Sequence[LocalMap],
+    placements: Mapping[tuple[int, int], Placement] | None = None,
+    variance_factors: Sequence[float] | None = None,
+) -> Merge:
+    """Aligns all pairs, keeps the alignments that go together, and places what they join.
+
+    Args:
+        maps: solved, of distinct names.
+        placements: measured poses of the second map's start in the first one's, by indices.
+        variance_factors: by which each map's noise is larger than its solve was told; from what the solve left over
+            where None, 1 at least.
+    """
+    condensed = _condensed(maps, variance_factors or [variance_factor(each) for each in maps])
+    pairs = tuple(_aligned_pairs(maps, condensed, placements or {}))
+    links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
+    return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
+
+
+def variance_factor(local_map: LocalMap) -> float:
+    """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that.
+
+    Where a map's parts do not join within their noise, something that is in no covariance bends it, and by as much as
+    they do not join its covariance says too little.
+    """
+    problem = local_map.graph.problem
+    n_priors = int((problem.prior.sigma > 0.0).sum())
+    freedom = problem.n_residuals + n_priors - problem.columns.n
+    factor = max(1.0, 2.0 * local_map.solution.cost / freedom) if freedom > 0 else 1.0
+    goodness = local_map.goodness
+    return factor if goodness.fits else max(factor, goodness.chi_square / max(goodness.expected, 1))
+
+
+def _condensed(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
+    """Each map reduced to the tags that others have too; None where there are none."""
+    count: dict[TagKey, int] = {}
+    for local_map in maps:
+        for tag in local_map.graph.tags:
+            count[tag] = count.get(tag, 0) + 1
+    shared = [[tag for tag in local_map.graph.tags if count[tag] > 1] for local_map in maps]
+    return [condense(m, tags, factor) if tags else None for m, tags, factor in zip(maps, shared, factors, strict=True)]
+
+
+def _aligned_pairs(
+    maps: Sequence[LocalMap],
+    condensed: Sequence[CondensedMap | None],
+    placements: Mapping[tuple[int, int], Placement],
+) -> list[PairAlignment]:
+    pairs = []
+    effort = AlignmentEffort.of_logs(sum({m.chain.run.name: m.chain.run.log_bytes for m in maps}.values()))
+    by_name = sorted(range(len(maps)), key=lambda i: maps[i].chain.name)
+    for a, b in combinations(by_name, 2):
+        placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
+        map_a, map_b = condensed[a], condensed[b]
+        shared: tuple[TagKey, ...] = ()
+        alignment, is_searched = None, True
+        if map_a is not None and map_b is not None:
+            shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
+            try:
+                alignment = align(map_a, map_b, placement, effort)
+            except AlignmentTooLongError:
+                is_searched = False
+        if shared or placement is not None:
+            pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))
+    return pairs
+
+
+def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[CondensedMap | None]) -> list[Link]:
+    """One where the pair is joined: by its tags, or else by what was measured."""
+    names = maps[pair.a].chain.name, maps[pair.b].chain.name
+    alignment, placement = pair.alignment, pair.placement
+    if alignment is not None and alignment.is_sure:
+        return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.evidence_nats, names)]
+    if placement is None:
+        return []
+    # A link is of the frames that the maps' roots carry, what was measured of the starts themselves.
+    frame_a, frame_b = condensed[pair.a], condensed[pair.b]
+    covariance = placement.covariance.copy()
+    if frame_a is not None:
+        back = se2.adjoint(se2.inverse(placement.T_a_b))
+        covariance += back @ frame_a.frame_covariance @ back.T
+    if frame_b is not None:
+        covariance += frame_b.frame_covariance
+    # Against a start anywhere within a kilometre.
+    evidence_nats = log(2.0 * pi * 1e6) - 0.5 * float(np.linalg.slogdet(2.0 * pi * covariance)[1])
+    return [Link(pair.a, pair.b, placement.T_a_b, covariance, evidence_nats, names)]
+
+
+def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
+    """Components of the maps under a tree of links, largest first."""
+    neighbours: dict[int, list[Link]] = {i: [] for i in range(len(maps))}
+    for link in tree:
+        neighbours[link.a].append(link)
+        neighbours[link.b].append(link)
+    groups = []
+    placed: dict[int, FloatArray] = {}
+    for first in sorted(range(len(maps)), key=lambda i: maps[i].chain.name):
+        if first in placed:
+            continue
+        placed[first] = np.zeros(3)
+        members = [first]
+        for here in members:
+            for link in neighbours[here]:
+                there, T_here_there, _ = link.seen_from(here)
+                if there not in placed:
+                    placed[there] = se2.compose(placed[here], T_here_there)
+                    members.append(there)
+        members.sort()
+        groups.append(Group(tuple(members), se2.between(placed[members[0]], np.array([placed[m] for m in members]))))
+    return sorted(groups, key=lambda group: size_rank(maps, group))
+
+
+def size_rank(maps: Sequence[LocalMap], group: Group) -> tuple[int, int, int]:
+    """Sorts groups, largest first: most tags, then most keyframes."""
+    tags = {tag for m in group.members for tag in maps[m].graph.tags}
+    return -len(tags), -sum(len(maps[m].T_start_base) for m in group.members), group.members[0]

@@ -1,0 +1,54 @@
+"""Why runs were not joined, in words."""
+
+from collections.abc import Sequence
+from math import degrees
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.alignment.pairwise import Alignment
+from groundsbot.offline.measurements import TagKey
+
+_MOST_NAMED = 8
+
+
+def why_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
+    """Why run b is not joined to a, by name; they share a tag at least."""
+    if alignment is not None and alignment.rivals:
+        return _ambiguous(a, b, alignment)
+    if len(shared) == 1:
+        return f"{b} shares only tag {shared[0].tag_id} with {a}; one more shared tag would do"
+    if alignment is not None and alignment.is_sure:
+        return f"the alignment of {b} with {a} contradicts those of other runs"
+    if alignment is not None:
+        return (
+            f"of the {len(shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} lie the same "
+            "way in both maps, which chance may bring about; were tags moved between the runs? One more shared tag "
+            "that stayed would do"
+        )
+    return (
+        f"{b} shares {len(shared)} tags with {a}, but no two of them lie the same way in both maps: "
+        "were tags moved between the runs? Two shared tags that stayed would do"
+    )
+
+
+def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
+    ways = [alignment, *alignment.rivals]
+    first = set(alignment.inliers)
+    told = [f"tags {_names(ways[0].inliers)} put {b}'s start at {_place(ways[0].T_a_b)}"]
+    told += [
+        f"tags {_names(tuple(tag for tag in way.inliers if tag not in first) or way.inliers)} at {_place(way.T_a_b)}"
+        for way in ways[1:3]
+    ]
+    more = f", and there are {len(ways) - 3} more ways" if len(ways) > 3 else ""
+    return (
+        f"how {b} lies in {a} is ambiguous, because {', '.join(told)}{more}: nothing tells which tags stayed and which "
+        "were moved or relabelled; a few more shared tags that stayed would do"
+    )
+
+
+def _names(tags: Sequence[TagKey]) -> str:
+    named = ", ".join(f"{tag.tag_id}{tag.instance}" for tag in tags[:_MOST_NAMED])
+    return named if len(tags) <= _MOST_NAMED else f"{named} and {len(tags) - _MOST_NAMED} more"
+
+
+def _place(T: FloatArray) -> str:
+    return f"({T[0]:.2f}, {T[1]:.2f}) m turned by {degrees(T[2]):.1f} deg"

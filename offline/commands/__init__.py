@@ -1,0 +1,9 @@
+"""The commands of `groundsbot-offline`: their options, and what each does with files.
+
+In: the command line. Out: files and lines for a person. `drives`, `finished_maps`, `imports` and `logs` hold options and
+import nothing heavy; the other modules do the work.
+"""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,0 +1,20 @@
+from .drives import calibrate, localize, map_command
+from .finished_maps import compare, export
+from .imports import import_recording
+from .logs import detect, info, salvage
+from .map_drives import MapOptions, make_map, summary
+
+__all__ = [
+    "MapOptions",
+    "calibrate",
+    "compare",
+    "detect",
+    "export",
+    "import_recording",
+    "info",
+    "localize",
+    "make_map",
+    "map_command",
+    "salvage",
+    "summary",
+]

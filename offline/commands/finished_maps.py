@@ -1,0 +1,89 @@
+"""`groundsbot-offline compare` and `export`: their options, for commands that take a finished map."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groundsbot.offline.commands.arguments import JsonFlag
+from groundsbot.offline.export import ExportFormat, ExportOptions
+
+MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")]
+
+
+def compare(
+    folder: MapFolder,
+    truth: Annotated[Path | None, typer.Option(help="truth.json of the simulation.")] = None,
+    survey: Annotated[
+        Path | None, typer.Option(help="Measured places of tags: tag_id,x_m,y_m, maybe sigma_m, family, instance.")
+    ] = None,
+    json_output: JsonFlag = False,
+) -> None:
+    """Tells how far a map is from ground truth or from a survey, and whether its covariances are honest.
+
+    A survey is aligned first, and its entries that look wrong are named. With several components the figures of the
+    largest come first, then those of the others, each in its own frame.
+    """
+    import json
+
+    from groundsbot.offline.evaluation import MapErrors, SurveyErrors, evaluate, judge_survey, read_survey, read_truth
+    from groundsbot.offline.maps import read_map
+
+    errors: MapErrors | SurveyErrors
+    if truth is not None and survey is None:
+        errors = evaluate(read_map(folder), read_truth(truth))
+    elif survey is not None and truth is None:
+        errors = judge_survey(read_map(folder), read_survey(survey))
+    else:
+        raise typer.BadParameter("give either --truth or --survey")
+    if json_output:
+        typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
+        return
+    for line in errors.lines():
+        typer.echo(line)
+
+
+def export(
+    folder: MapFolder,
+    form: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
+    ],
+    component: Annotated[
+        int | None, typer.Option(min=0, help="Which one, where the map has several: each has a frame of its own.")
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            help="geojson: where the map's frame lies, LAT_DEG,LON_DEG,HEADING_DEG (WGS 84; of its x axis, clockwise "
+            "from north)."
+        ),
+    ] = None,
+    tag_poses: Annotated[
+        Path | None,
+        typer.Option(help="frc, limelight: copy of tags.csv in which z_m and yaw_rad are filled in, as measured."),
+    ] = None,
+    tag_height_m: Annotated[
+        float | None,
+        typer.Option(
+            help="frc, limelight: taken for the height of tags of which neither --tag-poses nor the map tells."
+        ),
+    ] = None,
+    face_viewers: Annotated[
+        bool,
+        typer.Option(
+            "--face-viewers", help="frc, limelight: take tags to face where they were seen from, by tens of degrees."
+        ),
+    ] = False,
+    field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
+    family: Annotated[str | None, typer.Option(help="frc: the family to write, which a layout cannot tell.")] = None,
+) -> None:
+    """Writes a finished map in the form of other tools: a graph for g2o, trajectories, places, layouts of tags.
+
+    Nothing is written over, and nothing made up: what a form needs and a map does not hold is an option.
+    """
+    from groundsbot.offline.export import export_map
+
+    options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
+    for line in export_map(folder, options):
+        typer.echo(line)

@@ -1,0 +1,240 @@
+"""The `map` command: logs in, a folder with the map out; everything is written or nothing."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from math import degrees
+from pathlib import Path
+from typing import Final
+
+from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, counted, folder_written_whole
+from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.progress_bar import progress_bar
+from groundsbot.offline.commands.shared import check_output, metre_line, read_robot_files, say
+from groundsbot.offline.corners import check_upright
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import StageCost, Stages, compilation_announced
+from groundsbot.offline.mapping import Workings, build_map, read_runs
+from groundsbot.offline.maps import (
+    JSON_FILE,
+    MAP_FILE,
+    NOT_NEEDED,
+    AlignmentResult,
+    Component,
+    FittedNoise,
+    MapResult,
+    MeasurementResult,
+    advice_as_json,
+    map_as_json,
+    read_map,
+    write_map,
+    write_mcap,
+)
+from groundsbot.offline.measurements import TapeOptions
+from groundsbot.offline.report import advice_sentence, write_picture
+from groundsbot.offline.self_calibration import OFF, freed_lines, parse_calibrate
+from groundsbot.onboard.log import find_logs
+
+REPORT_FILE: Final = "report.html"
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """What the command line says."""
+
+    logs: Sequence[Path]
+    output: Path
+    robots: Sequence[Path] = ()
+    noise: Path | None = None
+    overwrite: bool = False
+    starts: Sequence[str] = ()
+    distances: Sequence[str] = ()
+    keep_suspects: bool = False
+    corners: bool = False
+    upright_deg: float | None = None
+    extend: Path | None = None
+    calibrate: str = OFF
+
+
+def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
+    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories, map.mcap, map.png and report.html.
+
+    Returns:
+        The map, and what each stage of making it took.
+
+    Raises:
+        GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
+    """
+    upright_sigma_rad = check_upright(options.upright_deg, corners=options.corners)
+    logs = find_logs(list(options.logs))
+    check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
+    extending = None if options.extend is None else _read_extended(options.extend, options)
+    robot_files = read_robot_files(options.robots)
+    noise = read_noise_yaml(options.noise) if options.noise else None
+    calibrate = parse_calibrate(options.calibrate)
+    with compilation_announced(say), progress_bar() as show:
+        stages, workings = Stages(show), Workings()
+        result = build_map(
+            read_runs(logs, robot_files, stages),
+            noise,
+            stages,
+            TapeOptions(options.starts, options.distances),
+            keep_suspects=options.keep_suspects,
+            corners=options.corners,
+            upright_sigma_rad=upright_sigma_rad,
+            calibrate=calibrate,
+            workings=workings,
+            extending=extending,
+        )
+        with folder_written_whole(options.output, replace=options.overwrite) as folder:
+            _write_files(result, workings, folder, options.output, stages)
+    return result, stages.costs
+
+
+def _write_files(result: MapResult, workings: Workings, folder: Path, output: Path, stages: Stages) -> None:
+    try:
+        with stages.stage("writing files"):
+            write_map(result, folder)
+            write_mcap(result, folder / MAP_FILE)
+        with stages.stage("drawing the picture"):
+            write_picture(result, folder / "map.png")
+        if find_spec("plotly") is not None:  # a map is worth having where only the report's script is missing
+            from groundsbot.offline.report import write_report
+
+            with stages.stage("writing the report"):
+                write_report(result, workings, folder / REPORT_FILE)
+    except OSError as error:
+        raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
+
+
+def _read_extended(path: Path, options: MapOptions) -> MapResult:
+    """The map that is kept: its folder, or map.json in it."""
+    folder = path.parent if path.name == JSON_FILE else path
+    check_output(options.output, [folder], JSON_FILE, overwrite=options.overwrite)
+    if options.noise is not None:
+        raise OfflineError("--noise: a map is extended under its own noise; leave it out, or map all logs anew")
+    return read_map(folder)
+
+
+def exit_code(result: MapResult) -> int:
+    """Done, or done in several components or with logs of which something is lost."""
+    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses else EXIT_DONE
+
+
+def summary(result: MapResult, output: Path) -> list[str]:
+    """What a person wants to know first."""
+    lines = []
+    for component in result.components:
+        lines += _component_lines(component, several=len(result.components) > 1)
+    lines += [_alignment_line(alignment) for alignment in result.alignments]
+    lines += [
+        f"start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m (sigma {pair.sigma_m:.3f} m)"
+        for component in result.components
+        for pair in component.start_to_start
+    ]
+    lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
+    lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+    lines += freed_lines(result)
+    lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
+    if result.noise_fit is not None:
+        lines += _noise_lines(result.noise_fit)
+    lines += _floor_lines(result)
+    lines += _advice_lines(result)
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    lines += [f"lost: {loss}" for loss in result.losses]
+    return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
+
+
+def _report_line(output: Path) -> str:
+    path = output / REPORT_FILE
+    return f"report: {path}" if path.is_file() else "report: none without plotly; pip install 'groundsbot[laptop]'"
+
+
+def stage_lines(costs: Sequence[StageCost]) -> list[str]:
+    """What each stage took, as a table."""
+    lines = [f"{'stage':<28}{'seconds':>8}{'of CPU':>8}{'peak MiB':>10}"]
+    for name, seconds, cpu_seconds, peak_mib in costs:
+        peak = "" if peak_mib is None else f"{peak_mib:10.0f}"
+        lines.append(f"{name:<28}{seconds:8.2f}{cpu_seconds:8.2f}{peak}")
+    return lines
+
+
+def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
+    """The content of map.json, and what the stages took where that is given."""
+    data = map_as_json(result)
+    if costs is not None:
+        data["stages"] = [cost._asdict() for cost in costs]
+    return json.dumps(data, indent=2, allow_nan=False)
+
+
+def _component_lines(component: Component, *, several: bool) -> list[str]:
+    lines = []
+    if several:
+        lines.append(f"component in the frame of {component.frame_run}: {counted(len(component.tags), 'tag')}")
+    for run in component.runs:
+        n_tags = sum(run.name in tag.runs for tag in component.tags)
+        lines.append(
+            f"{run.name}: {counted(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {counted(n_tags, 'tag')}"
+        )
+    if not several:
+        lines.append(f"{counted(len(component.tags), 'tag')} in one map, in the frame of {component.frame_run}'s start")
+    return lines
+
+
+def _alignment_line(alignment: AlignmentResult) -> str:
+    x_m, y_m, theta_rad = alignment.T_from_to
+    weak = "; weak: one tag alone says so" if alignment.is_weak else ""
+    return (
+        f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
+        f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
+        f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
+        + (weak if alignment.is_sure else "; not sure, so not used")
+    )
+
+
+def _measurement_line(measurement: MeasurementResult) -> str:
+    """What the map makes of it."""
+    what = f"{measurement.a} to {measurement.b}" if measurement.kind == "distance" else f"start of {measurement.b}"
+    values = [] if measurement.in_map is None else measurement.in_map.tolist()
+    figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
+    off = "nothing else says" if measurement.off_sigmas is None else f"all else is off by {measurement.off_sigmas:.1f}"
+    unit = "" if measurement.off_sigmas is None else " sigma"
+    return f"measured {what}: {figures} in the map ({off}{unit})"
+
+
+def _noise_lines(fit: FittedNoise) -> list[str]:
+    """What was fitted, with its 99 % interval, and what was not."""
+    fitted = [
+        f"{each.name} {each.value:.3g} ({each.low:.3g} to {each.high:.3g})" for each in fit.parameters if not each.kept
+    ]
+    lines = []
+    if fitted:
+        lines.append(f"noise as {counted(len(fit.runs), 'run')} show it (with 99 %): " + ", ".join(fitted))
+    kept: dict[str, list[str]] = {}
+    for each in fit.parameters:
+        if each.kept not in ("", NOT_NEEDED):
+            kept.setdefault(each.kept, []).append(f"{each.name} {each.value:.3g}")
+    lines += [f"noise left as it was, since {why}: " + ", ".join(names) for why, names in kept.items()]
+    return lines
+
+
+def _floor_lines(result: MapResult) -> list[str]:
+    """How uneven the floor is, where corners tell."""
+    several = len(result.components) > 1
+    lines = []
+    for i, floor in enumerate(component.floor for component in result.components):
+        if floor is not None and (floor.sigma_tilt_rad or floor.sigma_height_m):
+            lines.append(
+                f"floor{f' of component {i}' if several else ''}: pictures roll and pitch by "
+                f"{degrees(floor.sigma_tilt_rad):.2f} deg and stand off by {1000.0 * floor.sigma_height_m:.1f} mm "
+                "(standard deviations)"
+            )
+    return lines
+
+
+def _advice_lines(result: MapResult) -> list[str]:
+    """The best that could be done for the worst tag; runs that do not hang together need other things first."""
+    several = len({tag.family for component in result.components for tag in component.tags}) > 1
+    told = result.advice[:1] if len(result.components) == 1 else ()
+    return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]

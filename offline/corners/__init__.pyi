@@ -1,0 +1,20 @@
+from .factors import SpatialState
+from .graph import corner_graph, has_corners
+from .initial_tag_poses import hung_otherwise
+from .multifrontal.fronts import NotPositiveError
+from .refinement import Refined, refine
+from .solver import CornerSolution, solve_corners
+from .upright_prior import check_upright
+
+__all__ = [
+    "CornerSolution",
+    "NotPositiveError",
+    "Refined",
+    "SpatialState",
+    "check_upright",
+    "corner_graph",
+    "has_corners",
+    "hung_otherwise",
+    "refine",
+    "solve_corners",
+]

@@ -1,0 +1,109 @@
+"""In which order an estimate on corners is eliminated: each chain by nested dissection, then what chains share."""
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.corners.multifrontal.fronts import Fronts, build_fronts, common_ancestor
+
+if TYPE_CHECKING:
+    from groundsbot.offline.corners.problem import CornerProblem
+
+# Poses that one leaf eliminates, between two separators, and leaves or branches that meet in a branch.
+_LEAF: Final = 12
+_FAN: Final = 6
+# Poses in a row that saw nothing couple with their two neighbours and the wheels alone: they go first, so many at once.
+_BLIND: Final = 8
+
+
+def corner_order(problem: "CornerProblem") -> Fronts:
+    """Poses in leaves and separators, tags where all who saw them meet, calibration and starts at the root."""
+    columns, kinds = problem.columns, problem.kinds()
+    pose = np.concatenate([problem.corners.looks.pose, problem.readings.pose])
+    tag = np.concatenate([problem.corners.looks.tag, problem.readings.tag])
+    starts, distances = problem.measured.starts, problem.measured.distances
+    ends = np.concatenate([starts.pose, distances.pose_a, distances.pose_b])
+    ends = ends[ends >= 0]
+    pose_node, parent = _chains(problem, np.concatenate([pose, ends]), ends)
+    root = len(parent) - 1
+    seen = np.unique(tag * (root + 1) + pose_node[pose])
+    nodes_of: list[list[int]] = [[] for _ in columns.tags]
+    for key in seen.tolist():
+        nodes_of[key // (root + 1)].append(key % (root + 1))
+    tag_node = np.array([common_ancestor(nodes, parent) if nodes else root for nodes in nodes_of], dtype=np.int64)
+    tag_node[problem.measured.tags] = root
+    node_of = np.full(columns.n, root, dtype=np.int64)
+    for variable, node in (
+        (columns.poses, pose_node[:, None]),
+        (columns.tags, tag_node[:, None]),
+        (columns.heights, tag_node),
+        (columns.turns, tag_node[:, None]),
+    ):
+        node = np.broadcast_to(node, variable.shape)
+        node_of[variable[variable >= 0]] = node[variable >= 0]
+    return build_fronts(columns.n, node_of, parent, kinds)
+
+
+def _chains(problem: "CornerProblem", seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
+    """(P,) node of each pose and (N,) parent of each node; starts of chains are at the root, and the `ends`.
+
+    First come nodes of poses in a row that saw nothing, then each chain's others by nested dissection.
+    """
+    n_poses = len(problem.columns.poses)
+    begins = np.ones(n_poses, dtype=np.bool_)
+    begins[problem.odometry.first + 1] = False
+    is_blind = ~begins
+    is_blind[seeing] = False
+    at = np.arange(n_poses)
+    since = at - np.maximum.accumulate(np.where(is_blind, 0, at))  # 1 for the first blind pose in a row
+    is_blind &= since % (_BLIND + 1) != 0
+    first_blind = np.flatnonzero(is_blind & (since % (_BLIND + 1) == 1))
+    n_blind = len(first_blind)
+    pose_node = np.cumsum(is_blind & (since % (_BLIND + 1) == 1)) - 1
+    parent = [-1] * n_blind
+    chain, tops = np.cumsum(begins) - 1, []
+    others = np.flatnonzero(~is_blind & ~begins)
+    for own in np.split(others, np.flatnonzero(np.diff(chain[others])) + 1):
+        if len(own):
+            tops.append(_chain(own, pose_node, parent))
+    root = len(parent)
+    for top in tops:
+        parent[top] = root
+    pose_node[begins] = root
+    pose_node[ends] = root
+    # A blind node's neighbours lie on one path to the root: its parent is the lower one.
+    last_blind = np.flatnonzero(is_blind & ~np.append(is_blind[1:] & (since[1:] % (_BLIND + 1) != 1), [False]))
+    before = pose_node[first_blind - 1]
+    has_next = last_blind + 1 < n_poses
+    after = np.where(has_next, last_blind + 1, 0)
+    after = np.where(has_next & ~begins[after], pose_node[after], root)
+    nodes = np.array([*parent, -1], dtype=np.int64)
+    nodes[:n_blind] = np.minimum(before, after)
+    return pose_node, nodes
+
+
+def _chain(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
+    """Adds the nodes of poses (n,) along a chain, of which each is joined to the next; their topmost node."""
+    nodes, separators = [], []
+    for begin in range(0, len(own), _LEAF + 1):
+        pose_node[own[begin : begin + _LEAF]] = len(parent)
+        nodes.append(len(parent))
+        parent.append(-1)
+        if begin + _LEAF < len(own):
+            separators.append(int(own[begin + _LEAF]))
+    while len(nodes) > 1:
+        above, left = [], []
+        for i in range(0, len(nodes), _FAN):
+            branch = len(parent)
+            parent.append(-1)
+            for node in nodes[i : i + _FAN]:
+                parent[node] = branch
+            inside = separators[i : min(i + _FAN, len(nodes)) - 1]
+            pose_node[inside] = branch
+            left += separators[i + len(inside) : i + len(inside) + 1]
+            above.append(branch)
+        nodes, separators = above, left
+    for separator in separators:  # a chain may end in one
+        pose_node[separator] = nodes[0]
+    return nodes[0]

@@ -1,0 +1,219 @@
+"""From a solved map of the floor to the problem of refining it on tag corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.camera import CameraModel
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import wheels
+from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, FOCAL_SCALE, MOUNT_PARAMETERS, TIME_OFFSET
+from groundsbot.calib.tags import outward
+from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, Looks, SpatialState
+from groundsbot.offline.corners.initial_calibration import calibrated
+from groundsbot.offline.corners.initial_tag_poses import tags_hung
+from groundsbot.offline.corners.problem import CornerProblem, columns_of
+from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
+from groundsbot.offline.measurements import Chain
+from groundsbot.offline.sam import CalibrationPrior, Graph, Parameter, ReadingFactors, State
+
+_CORNER_NOISE: Final = "sigma_corner_px"
+_HEIGHT: Final = "mount_z_m"
+
+
+@dataclass(frozen=True)
+class CornerGraph:
+    """A problem on corners and what its variables mean.
+
+    Attributes:
+        graph: of the floor: its chains, poses, tags, and the first of the parameters, are the same.
+        parameters: in order; those of the graph, then what only corners depend on.
+    """
+
+    problem: CornerProblem
+    graph: Graph
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def is_hung(self) -> BoolArray:
+        """(T,) which tags have a height and an orientation."""
+        return np.asarray(self.problem.columns.heights >= 0)
+
+    def height_of(self, chain: int) -> int | None:
+        """Index of the height of one chain's camera among the parameters; None where no corners were kept."""
+        height = _height_parameter(self.graph.chains[chain])
+        return self.parameters.index(height) if height in self.parameters else None
+
+
+def has_corners(graph: Graph) -> bool:
+    """Whether any reading of the graph came from corners that the log still has."""
+    return any(_from_corners(chain).any() for chain in graph.chains)
+
+
+def corner_graph(
+    graph: Graph, state: State, wobble_sigma: FloatArray | None = None, upright_sigma_rad: float | None = None
+) -> tuple[CornerGraph, SpatialState]:
+    """The problem, and its start: the floor's solution with every tag hung, and cameras mounted, as looks have it.
+
+    Args:
+        graph: of the floor; a reading of it stands for each look.
+        state: its solution.
+        wobble_sigma: (3,) how far off level pictures are; None: not at all.
+        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
+    """
+    chains, masks = graph.chains, [_from_corners(chain) for chain in graph.chains]
+    seeing = [chain for chain, mask in zip(chains, masks, strict=True) if mask.any()]
+    of_corners = sorted({each for chain in seeing for each in (_height_parameter(chain), _focal_parameter(chain))})
+    parameters = (*graph.parameters, *of_corners)
+    looks, cameras = _looks(graph, parameters, masks)
+    floor = graph.problem
+    n_tags = len(graph.tags)
+    seen = np.bincount(looks.tag, minlength=n_tags) > 0
+    kept = ~np.concatenate(masks)
+    sigmas = np.array([parameter.sigma for parameter in parameters])
+    problem = CornerProblem(
+        odometry=floor.odometry,
+        corners=CornerFactors(looks, cameras),
+        readings=_readings_where(floor.readings, kept),
+        prior=CalibrationPrior(sigmas),
+        measured=floor.measured,
+        columns=columns_of(len(state.poses), seen, sigmas),
+        anchor=floor.anchor,
+        wobble_sigma=np.zeros(3) if wobble_sigma is None else wobble_sigma,
+        upright=NOTHING_UPRIGHT
+        if upright_sigma_rad is None
+        else UprightFactors(np.flatnonzero(seen), upright_sigma_rad),
+    )
+    start = SpatialState(
+        poses=state.poses,
+        tags=state.tags,
+        calibration=np.concatenate([state.calibration, np.zeros(len(of_corners))]),
+        heights_m=np.where(seen, np.nan, 0.0),
+        turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
+    )
+    start = calibrated(problem, tags_hung(problem, start))
+    problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
+    vars(problem)["motions"] = floor.arrowhead.odometry  # where the property has it: they rise by pose in a graph
+    return CornerGraph(problem, graph, parameters), start
+
+
+def _from_corners(chain: Chain) -> BoolArray:
+    """(M,) which of a chain's readings have corners."""
+    return np.asarray(np.isfinite(chain.readings.corners_px).all((-1, -2)))
+
+
+def _looks(
+    graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
+) -> tuple[Looks, tuple[CameraModel, ...]]:
+    """Those readings of each chain that have corners, and the cameras."""
+    floor = _readings_where(graph.problem.readings, np.concatenate(masks))
+    cameras: list[CameraModel] = []
+    shown: list[_Shown] = []
+    of_chain: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
+    for chain, mask in zip(graph.chains, masks, strict=True):
+        camera = chain.run.camera
+        if camera is None or not mask.any():
+            continue
+        if camera not in cameras:
+            cameras.append(camera)
+        own = [parameters.index(each) for each in (_height_parameter(chain), _focal_parameter(chain))]
+        of_chain.append((own[0], own[1], cameras.index(camera)))
+        shown.append(_shown(chain, mask, camera.height_px))
+    found = _Shown(*(np.concatenate(each) for each in zip(*shown, strict=True)))
+    heights, focal, camera_of = np.repeat(of_chain, [len(each.sigma_px) for each in shown], axis=0).T
+    index: dict[str, IntArray] = {
+        **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
+        **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
+        _HEIGHT: heights,
+    }
+    looks = Looks(
+        pose=floor.pose,
+        tag=floor.tag,
+        corners_px=found.corners_px,
+        sigma_px=found.sigma_px,
+        side_m=found.side_m,
+        camera=camera_of,
+        moved=found.moved,
+        twist=found.twist,
+        mount=found.mount,
+        mount_parameters=np.column_stack([index[name] for name in CORNER_MOUNT]),
+        time_parameter=index[TIME_OFFSET],
+        scale_parameter=floor.scale_parameter,
+        focal_parameter=focal,
+        edge_parameter=index[EDGE_SHIFT],
+        outward=outward(found.corners_px),
+    )
+    return looks, tuple(cameras)
+
+
+class _Shown(NamedTuple):
+    """What the floor knows nothing of: arrays of `Looks` with the same names."""
+
+    corners_px: FloatArray
+    sigma_px: FloatArray
+    side_m: FloatArray
+    moved: FloatArray
+    twist: FloatArray
+    mount: FloatArray
+
+
+def _shown(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
+    """Of those readings of one chain that have corners."""
+    robot, readings = chain.run.robot, chain.readings
+    corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
+    unit = parts.of((_CORNER_NOISE,))[0]
+    variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
+    sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
+    moved, twist = _moved(chain, readings.keyframe[mask], corners_px, height_px)
+    return _Shown(
+        corners_px,
+        np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
+        sides_m[readings.tag[mask]],
+        moved,
+        twist,
+        np.tile([getattr(robot.mount, name.removeprefix("mount_")) for name in CORNER_MOUNT], (len(corners_px), 1)),
+    )
+
+
+def _trace(matrices: FloatArray) -> FloatArray:
+    """(M,) of (M, 2, 2); numpy's own takes five times as long."""
+    return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
+
+
+def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: int) -> tuple[FloatArray, FloatArray]:
+    """How base moved by the wheels (M, 4, 3) from a keyframe to when each corner's row was read, and its twist (M, 3).
+
+    A stamp is that of the middle row.
+    """
+    robot = chain.run.robot
+    stamps_ns = chain.stamps_ns[keyframe]
+    track = next(each for each in chain.run.stretches if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1])
+    speed, turning = track.twist_at(stamps_ns, robot.wheels.track_m).T
+    twist = np.stack([speed, np.zeros_like(speed), turning], axis=-1)
+    if robot.readout_s == 0.0:  # all rows at once
+        return np.zeros((*corners_px.shape[:-1], 3)), twist
+    share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
+    rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
+    left_m, right_m = (
+        at_row - at_stamp[:, None] for at_row, at_stamp in zip(track.at(rows_ns), track.at(stamps_ns), strict=True)
+    )
+    return wheels.advance(left_m, right_m, robot.wheels.track_m), twist
+
+
+def _height_parameter(chain: Chain) -> Parameter:
+    mount = chain.run.robot.mount
+    return Parameter(chain.run.robot_id, _HEIGHT, (mount.z_m,), mount.z_m_sigma)
+
+
+def _focal_parameter(chain: Chain) -> Parameter:
+    """Held where robot.yaml gives it no sigma."""
+    run = chain.run
+    nominal = () if run.camera is None else (run.camera.fx_px, run.camera.fy_px)
+    return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)
+
+
+def _readings_where(readings: ReadingFactors, kept: BoolArray) -> ReadingFactors:
+    return ReadingFactors(*(getattr(readings, field.name)[kept] for field in fields(ReadingFactors)))

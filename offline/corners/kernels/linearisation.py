@@ -1,0 +1,216 @@
+"""Compiled linearisation of `corner_factors` and of odometry: residuals and Jacobians, straight into the fronts."""
+
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, face, look_factor
+from groundsbot.offline.corners.multifrontal.kernels import Kind, System, add_matrix, add_vector
+from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.sam import (
+    Loss,
+    Odometry,
+    Values,
+    error_by_wheels,
+    error_of,
+    loss_and_weight,
+    motion_at,
+    scaled_information,
+    wheel_correction,
+)
+
+N_LOOK: Final = 19
+N_POSE: Final = 3  # which come first
+N_MOTION: Final = 9
+_WIDTH: Final = 20  # of a look's rows, with a zero at the end: columns go in pairs
+
+
+@jitted
+def add_looks(
+    looks: LookArrays,
+    lenses: FloatArray,
+    loss: Loss,
+    values: SpatialValues,
+    kind: Kind,
+    order: IntArray,
+    system: System,
+) -> float:
+    """Adds J^T W J and J^T W r of all looks; returns the sum of their losses.
+
+    Where the system has no room for matrices only gradients are added. Looks (M,) go in the order that is given: what
+    has nothing to do with the pose is summed up first for those in a row that have all else in common.
+    """
+    looks, values, kind, system = borrowed(looks), borrowed(values), borrowed(kind), borrowed(system)
+    r, J, B, normal, vector = _look_room()
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    total, is_whole, last = 0.0, len(system.entries) > 0, -1
+    free, place = np.empty(N_LOOK, dtype=np.uint64), np.empty(N_LOOK, dtype=np.uint64)
+    for m in order:
+        face(looks, m, values.calibration, eye)
+        look_factor(looks, lenses, m, values, eye, r, J, B)
+        square = 0.0
+        for i in range(8):
+            square += r[i] * r[i]
+        rho, w = loss_and_weight(loss, square)
+        total += rho
+        f0, f1, f2, f3 = w * r[0], w * r[1], w * r[2], w * r[3]
+        f4, f5, f6, f7 = w * r[4], w * r[5], w * r[6], w * r[7]
+        _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, vector)
+        add_vector(kind, m, vector[:N_LOOK], system.gradient)
+        if is_whole:
+            if last >= 0 and not _is_alike(kind, last, m):
+                add_matrix(kind, last, normal, N_POSE, N_LOOK, system, free, place)
+                normal[N_POSE:] = 0.0
+            last = m
+            normal[:N_POSE] = 0.0
+            _add_square(J, w, normal)
+            add_matrix(kind, m, normal, 0, N_POSE, system, free, place)
+    if last >= 0:
+        add_matrix(kind, last, normal, N_POSE, N_LOOK, system, free, place)
+    return total
+
+
+@inner
+def _look_room() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """For a look's residual, derivatives by all columns and by how the picture stands, normal matrix and gradient."""
+    return np.empty(8), np.zeros((8, _WIDTH)), np.empty((8, 3)), np.zeros((_WIDTH, _WIDTH)), np.zeros(_WIDTH)
+
+
+@inner
+def _is_alike(kind: Kind, m: int, other: int) -> bool:
+    """Whether two looks differ in the pose alone."""
+    apart = abs(kind.node[m] - kind.node[other])
+    for a in range(N_POSE, N_LOOK):
+        apart += abs(kind.place[m, a] - kind.place[other, a])
+    return bool(apart == 0)
+
+
+@inner
+def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
+    """Adds w J^T J, whole: two rows at once fill vectors, where the half that counts would not."""
+    for a in range(0, _WIDTH, 2):
+        f0, f1, f2, f3 = w * J[0, a], w * J[1, a], w * J[2, a], w * J[3, a]
+        f4, f5, f6, f7 = w * J[4, a], w * J[5, a], w * J[6, a], w * J[7, a]
+        g0, g1, g2, g3 = w * J[0, a + 1], w * J[1, a + 1], w * J[2, a + 1], w * J[3, a + 1]
+        g4, g5, g6, g7 = w * J[4, a + 1], w * J[5, a + 1], w * J[6, a + 1], w * J[7, a + 1]
+        one, other = normal[a], normal[a + 1]
+        for b in range(len(one)):
+            j0, j1, j2, j3, j4, j5, j6, j7 = J[0, b], J[1, b], J[2, b], J[3, b], J[4, b], J[5, b], J[6, b], J[7, b]
+            one[b] += (f0 * j0 + f1 * j1 + f2 * j2 + f3 * j3) + (f4 * j4 + f5 * j5 + f6 * j6 + f7 * j7)
+            other[b] += (g0 * j0 + g1 * j1 + g2 * j2 + g3 * j3) + (g4 * j4 + g5 * j5 + g6 * j6 + g7 * j7)
+
+
+@jitted
+def add_wobble(
+    looks: LookArrays,
+    lenses: FloatArray,
+    loss: Loss,
+    values: SpatialValues,
+    given: FloatArray,
+    picture: IntArray,
+    weight: FloatArray,
+    own: FloatArray,
+    force: FloatArray,
+    coupled: FloatArray,
+) -> None:
+    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 19); B as in `look_factor`.
+
+    Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
+    """
+    looks, values = borrowed(looks), borrowed(values)
+    r, J, B, _, vector = _look_room()
+    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    for m in range(len(looks.pose)):
+        face(looks, m, values.calibration, eye)
+        look_factor(looks, lenses, m, values, eye, r, J, B)
+        square = 0.0
+        for i in range(8):
+            square += r[i] * r[i]
+        w = given[m] if len(given) else loss_and_weight(loss, square)[1]
+        weight[m] = w
+        for k in range(3):
+            f0, f1, f2, f3 = w * B[0, k], w * B[1, k], w * B[2, k], w * B[3, k]
+            f4, f5, f6, f7 = w * B[4, k], w * B[5, k], w * B[6, k], w * B[7, k]
+            _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, vector)
+            coupled[m, k] = vector[:N_LOOK]
+            for i in range(8):
+                force[picture[m], k] += w * B[i, k] * r[i]
+                for j in range(3):
+                    own[picture[m], k, j] += w * B[i, k] * B[i, j]
+
+
+@jitted
+def add_motions(odometry: Odometry, loss: Loss, values: Values, kind: Kind, system: System) -> float:
+    """Adds J^T W J and J^T W r of all motions, by both poses and the wheels; returns the sum of their losses.
+
+    Where the system has no room for matrices only gradients are added.
+    """
+    odometry, values, kind, system = borrowed(odometry), borrowed(values), borrowed(kind), borrowed(system)
+    C, product, J, heavy = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, N_MOTION)), np.empty((3, N_MOTION))
+    normal, vector = np.empty((N_MOTION, N_MOTION)), np.empty(N_MOTION)
+    free, place = np.empty(N_MOTION, dtype=np.uint64), np.empty(N_MOTION, dtype=np.uint64)
+    total, is_whole, last, cos_j, sin_j = 0.0, len(system.entries) > 0, -1, 1.0, 0.0
+    for m in range(len(odometry.first)):
+        i = odometry.first[m]
+        before, after = values.poses[i], values.poses[i + 1]
+        cos_i, sin_i = cos_j, sin_j
+        if i != last:
+            cos_i, sin_i = np.cos(before[2]), np.sin(before[2])
+        last, cos_j, sin_j = i + 1, np.cos(after[2]), np.sin(after[2])
+        apart_x, apart_y = after[0] - before[0], after[1] - before[1]
+        x, y = cos_i * apart_x + sin_i * apart_y, cos_i * apart_y - sin_i * apart_x
+        t = wheel_correction(odometry, m, values.calibration)
+        e, (a, b, p, q) = error_of(motion_at(odometry, m, t), x, y, after[2] - before[2])
+        s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
+        error_by_wheels(odometry.jacobian[m], t, e, s, C, product)
+        # By the second pose Jr^-1(e), by the first one that times minus the adjoint of the motion back.
+        J[0, 3], J[0, 4], J[0, 5], J[1, 3], J[1, 4], J[1, 5] = a, -b, p, b, a, q
+        J[2, 3], J[2, 4], J[2, 5] = 0.0, 0.0, 1.0
+        cos, sin = cos_i * cos_j + sin_i * sin_j, cos_i * sin_j - sin_i * cos_j
+        u, v = sin * x - cos * y, cos * x + sin * y
+        for k in range(3):
+            J[k, 0] = -(J[k, 3] * cos - J[k, 4] * sin)
+            J[k, 1] = -(J[k, 3] * sin + J[k, 4] * cos)
+            J[k, 2] = -(J[k, 3] * u + J[k, 4] * v + J[k, 5])
+            J[k, 6], J[k, 7], J[k, 8] = C[k, 0], C[k, 1], C[k, 2]
+        l0, l1, l2, l3, l4, l5 = scaled_information(odometry.information[m], s)
+        f0 = l0 * e[0] + l1 * e[1] + l2 * e[2]
+        f1 = l1 * e[0] + l3 * e[1] + l4 * e[2]
+        f2 = l2 * e[0] + l4 * e[1] + l5 * e[2]
+        rho, w = loss_and_weight(loss, e[0] * f0 + e[1] * f1 + e[2] * f2)
+        total += rho
+        for k in range(N_MOTION):
+            vector[k] = w * (f0 * J[0, k] + f1 * J[1, k] + f2 * J[2, k])
+        add_vector(kind, m, vector, system.gradient)
+        if is_whole:
+            for k in range(N_MOTION):
+                heavy[0, k] = w * (l0 * J[0, k] + l1 * J[1, k] + l2 * J[2, k])
+                heavy[1, k] = w * (l1 * J[0, k] + l3 * J[1, k] + l4 * J[2, k])
+                heavy[2, k] = w * (l2 * J[0, k] + l4 * J[1, k] + l5 * J[2, k])
+            for k in range(N_MOTION):
+                c0, c1, c2 = J[0, k], J[1, k], J[2, k]
+                for j in range(k, N_MOTION):
+                    normal[k, j] = c0 * heavy[0, j] + c1 * heavy[1, j] + c2 * heavy[2, j]
+            add_matrix(kind, m, normal, 0, N_MOTION, system, free, place)
+    return total
+
+
+@inner
+def _combine(
+    J: FloatArray,
+    f0: float,
+    f1: float,
+    f2: float,
+    f3: float,
+    f4: float,
+    f5: float,
+    f6: float,
+    f7: float,
+    out: FloatArray,
+) -> None:
+    """The rows of J (8, 20), so many times each."""
+    for b in range(len(out)):
+        out[b] = (f0 * J[0, b] + f1 * J[1, b] + f2 * J[2, b] + f3 * J[3, b]) + (
+            f4 * J[4, b] + f5 * J[5, b] + f6 * J[6, b] + f7 * J[7, b]
+        )

@@ -1,0 +1,194 @@
+"""Compiled: how one look at a tag fits, and by what that changes; see `corner_factors`.
+
+What `CornerFactors` writes as arrays over all looks is here for one of them with the same names; the tests hold both to
+each other. Derivatives stand in the order of `CornerFactors.columns`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.corners.kernels.lens import CENTRE, distorted_at
+from groundsbot.offline.foundation import inlined, inner
+from groundsbot.offline.sam import series
+
+
+class LookArrays(NamedTuple):
+    """`corner_factors.Looks`, for compiled functions."""
+
+    pose: IntArray
+    tag: IntArray
+    corners_px: FloatArray
+    sigma_px: FloatArray
+    side_m: FloatArray
+    camera: IntArray
+    moved: FloatArray
+    twist: FloatArray
+    mount: FloatArray
+    mount_parameters: IntArray
+    time_parameter: IntArray
+    scale_parameter: IntArray
+    focal_parameter: IntArray
+    edge_parameter: IntArray
+    outward: FloatArray
+
+
+class SpatialValues(NamedTuple):
+    """`corner_factors.SpatialState`, for compiled functions."""
+
+    poses: FloatArray
+    tags: FloatArray
+    calibration: FloatArray
+    heights_m: FloatArray
+    turns: FloatArray
+
+
+class Eye(NamedTuple):
+    """A camera on its base: its place, the rotation from its axes, and the axes about which its mount turns."""
+
+    mount: FloatArray  # (6,)
+    rotation: FloatArray  # (3, 3) R_base_camera
+    axes: FloatArray  # (3, 3) of roll, pitch and yaw, row by row
+
+
+@inner
+def face(looks: LookArrays, m: int, calibration: FloatArray, eye: Eye) -> None:
+    """Sets the eye as the calibration has it, unless it is so already: most looks are by the same one."""
+    is_same = True
+    for k in range(6):
+        value = looks.mount[m, k] + calibration[looks.mount_parameters[m, k]]
+        is_same &= value == eye.mount[k]
+        eye.mount[k] = value
+    if is_same:
+        return
+    sin_r, cos_r = np.sin(eye.mount[3]), np.cos(eye.mount[3])
+    sin_p, cos_p = np.sin(eye.mount[4]), np.cos(eye.mount[4])
+    sin_y, cos_y = np.sin(eye.mount[5]), np.cos(eye.mount[5])
+    R, axes = eye.rotation, eye.axes
+    # Columns: a level eye's z, -x and -y look along base's x, y and z.
+    R[0, 2], R[1, 2], R[2, 2] = cos_y * cos_p, sin_y * cos_p, -sin_p
+    R[0, 0] = -(cos_y * sin_p * sin_r - sin_y * cos_r)
+    R[1, 0] = -(sin_y * sin_p * sin_r + cos_y * cos_r)
+    R[2, 0] = -cos_p * sin_r
+    R[0, 1] = -(cos_y * sin_p * cos_r + sin_y * sin_r)
+    R[1, 1] = -(sin_y * sin_p * cos_r - cos_y * sin_r)
+    R[2, 1] = -cos_p * cos_r
+    axes[0, 0], axes[0, 1], axes[0, 2] = cos_y * cos_p, sin_y * cos_p, -sin_p
+    axes[1, 0], axes[1, 1], axes[1, 2] = -sin_y, cos_y, 0.0
+    axes[2, 0], axes[2, 1], axes[2, 2] = 0.0, 0.0, 1.0
+
+
+@inner
+def look_factor(
+    looks: LookArrays,
+    lenses: FloatArray,
+    m: int,
+    values: SpatialValues,
+    eye: Eye,
+    r: FloatArray,
+    J: FloatArray,
+    B: FloatArray,
+) -> None:
+    """Sets the whitened residual (8,), its derivatives (8, 19), and those by how the picture stands (8, 3).
+
+    NaN where the lens has no image of a corner.
+    """
+    pose, tag, lens = looks.pose[m], looks.tag[m], lenses[looks.camera[m]]
+    late = values.calibration[looks.time_parameter[m]]
+    scale = 1.0 + values.calibration[looks.scale_parameter[m]]
+    focal = 1.0 + values.calibration[looks.focal_parameter[m]]
+    shift = values.calibration[looks.edge_parameter[m]]
+    half = 0.5 * looks.side_m[m] * scale
+    place_x, place_y, heading = values.poses[pose, 0], values.poses[pose, 1], values.poses[pose, 2]
+    cos_h, sin_h = np.cos(heading), np.sin(heading)
+    T, R, mount = values.turns[tag], eye.rotation, eye.mount
+    v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
+    back_x, back_y, cos_l, sin_l = gone_back(v0, v1, omega, late)
+    cos_m, sin_m, cos_t, sin_t, last = 1.0, 0.0, cos_l, sin_l, 0.0
+    by_pixel, by_scale = 1.0 / looks.sigma_px[m], 1.0 / scale
+    for k in range(4):
+        u = -half if k == 0 or k == 3 else half
+        v = half if k < 2 else -half
+        dx = values.tags[tag, 0] + T[0, 0] * u + T[0, 1] * v - place_x
+        dy = values.tags[tag, 1] + T[1, 0] * u + T[1, 1] * v - place_y
+        up = values.heights_m[tag] + T[2, 0] * u + T[2, 1] * v
+        key_x, key_y = cos_h * dx + sin_h * dy, cos_h * dy - sin_h * dx
+        moved = looks.moved[m, k]
+        if moved[2] != last:  # all corners were seen at once, but by a rolling shutter
+            last = moved[2]
+            cos_m, sin_m = np.cos(last), np.sin(last)
+            cos_t, sin_t = cos_m * cos_l - sin_m * sin_l, sin_m * cos_l + cos_m * sin_l
+        rest_x = key_x - (moved[0] + cos_m * back_x - sin_m * back_y)
+        rest_y = key_y - (moved[1] + sin_m * back_x + cos_m * back_y)
+        base_x, base_y = cos_t * rest_x + sin_t * rest_y, cos_t * rest_y - sin_t * rest_x
+        x, y, z = base_x - mount[0], base_y - mount[1], up - mount[2]
+        depth = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        px, py, d00, d01, d11, nx, ny = distorted_at(
+            lens,
+            R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+            R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+            depth,
+        )
+        for axis in range(2):
+            i = 2 * k + axis
+            off = lens[axis] * (px if axis == 0 else py)
+            outward = looks.outward[m, k, axis]
+            r[i] = by_pixel * (focal * off + lens[CENTRE + axis] + shift * outward - looks.corners_px[m, k, axis])
+            gain = by_pixel * lens[axis] * focal / depth
+            b0, b1, b2 = _by_place(R, nx, ny, gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11))
+            k0, k1 = b0 * cos_t - b1 * sin_t, b0 * sin_t + b1 * cos_t
+            row = J[i]
+            row[0], row[1], row[2] = -k0, -k1, k0 * key_y - k1 * key_x
+            _by_tag(row, k0 * cos_h - k1 * sin_h, k0 * sin_h + k1 * cos_h, b2, T, u, v, by_scale)
+            _by_mount(row, b0, b1, b2, x, y, z, eye.axes)
+            row[15] = b0 * v0 + b1 * v1 - (b0 * base_y - b1 * base_x) * omega
+            row[17], row[18] = by_pixel * off, by_pixel * outward
+            B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2
+
+
+@inlined
+def gone_back(v0: float, v1: float, omega: float, late: float) -> tuple[float, float, float, float]:
+    """Where a base that drives so was a moment before, in its axes now: x, y, cosine and sine of its heading."""
+    along, even, _ = series(-late * omega)
+    across = -late * omega * even
+    return (
+        -late * (along * v0 - across * v1),
+        -late * (across * v0 + along * v1),
+        1.0 + late * omega * across,
+        -late * omega * along,
+    )
+
+
+@inlined
+def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tuple[float, float, float]:
+    """By where a corner is in base, from the derivative by where it is across the picture, times its depth."""
+    j2 = -(j0 * nx + j1 * ny)
+    return (
+        j0 * R[0, 0] + j1 * R[0, 1] + j2 * R[0, 2],
+        j0 * R[1, 0] + j1 * R[1, 1] + j2 * R[1, 2],
+        j0 * R[2, 0] + j1 * R[2, 1] + j2 * R[2, 2],
+    )
+
+
+@inlined
+def _by_tag(
+    row: FloatArray, m0: float, m1: float, m2: float, T: FloatArray, u: float, v: float, by_scale: float
+) -> None:
+    """By the tag's place, turn and scale, from the derivative by where a corner (u, v) of it is in map."""
+    t0 = m0 * T[0, 0] + m1 * T[1, 0] + m2 * T[2, 0]
+    t1 = m0 * T[0, 1] + m1 * T[1, 1] + m2 * T[2, 1]
+    t2 = m0 * T[0, 2] + m1 * T[1, 2] + m2 * T[2, 2]
+    row[3], row[4], row[5] = m0, m1, m2
+    row[6], row[7], row[8] = t2 * v, -t2 * u, t1 * u - t0 * v
+    row[16] = (t0 * u + t1 * v) * by_scale
+
+
+@inlined
+def _by_mount(row: FloatArray, b0: float, b1: float, b2: float, x: float, y: float, z: float, axes: FloatArray) -> None:
+    """By the mount's place and turn, from the derivative by where a corner is in base, off the mount by (x, y, z)."""
+    row[9], row[10], row[11] = -b0, -b1, -b2
+    w0, w1, w2 = b1 * z - b2 * y, b2 * x - b0 * z, b0 * y - b1 * x
+    row[12] = w0 * axes[0, 0] + w1 * axes[0, 1] + w2 * axes[0, 2]
+    row[13] = w0 * axes[1, 0] + w1 * axes[1, 1]
+    row[14] = w2

@@ -1,0 +1,1 @@
+"""A multifrontal Cholesky solver on dense blocks, for the corner problem."""

@@ -1,0 +1,202 @@
+"""A map against ground truth: how far off it is, and whether it knows.
+
+Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" are of the map as it
+stands. Whether it knows is told by `nees`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation.errors import ComponentErrors, MapErrors, StartError, TagError
+from groundsbot.offline.evaluation.nees import nees_per_dim, tangent_errors
+from groundsbot.offline.evaluation.truth import TrueRun, Truth
+from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
+
+
+def evaluate(result: MapResult, truth: Truth) -> MapErrors:
+    """Compares a map with the truth.
+
+    Raises:
+        OfflineError: the truth does not know the run that the largest component's frame is made of.
+    """
+    components = []
+    for index, component in enumerate(result.components):
+        frame = _true_frame(component, truth)
+        if frame is None and index == 0:
+            raise OfflineError(
+                f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
+                f"it has {', '.join(sorted(truth.runs)) or 'no runs'}. Give the truth.json of these drives"
+            )
+        components.append(_unknown(component) if frame is None else _evaluate(component, truth, frame))
+    return MapErrors(tuple(components))
+
+
+def _true_frame(component: Component, truth: Truth) -> FloatArray | None:
+    """T_world_map: the true start pose of the component's first run."""
+    first = next(run for run in component.runs if run.name == component.frame_run)
+    return _true_start(first, truth)
+
+
+def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
+    true_run = truth.runs.get(run.run)
+    if true_run is None:
+        return None
+    poses, covered = true_run.at(run.stamps_ns[:1])
+    return poses[0] if covered[0] else None
+
+
+def _unknown(component: Component) -> ComponentErrors:
+    note = f"the truth does not know the start of {component.frame_run}; this component is not judged"
+    runs = tuple(run.name for run in component.runs)
+    return ComponentErrors(
+        component.frame_run, runs, len(component.tags), (), (), None, None, None, None, None, (note,)
+    )
+
+
+def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> ComponentErrors:
+    notes = _notes(component, truth)
+    places = _start_places(component, truth, T_world_map)
+    starts = tuple(_start_error(a, b, places) for a, b in combinations(places, 2))
+    known = [i for i, tag in enumerate(component.tags) if _knows(truth, tag)]
+    tags = [component.tags[i] for i in known]
+    found = np.array([tag.position_m for tag in tags]).reshape(-1, 2)
+    world = np.array([truth.tags_m[_name(tag)] for tag in tags]).reshape(-1, 2)
+    true = se2.apply(se2.inverse(T_world_map), world)
+    errors = found - true
+    nees_start, nees_tags = _nees(component, places, known, true)
+    for name, value, wanted in (("tags", nees_tags, len(tags)), ("start", nees_start, len(starts))):
+        if wanted and value is None:
+            notes.append(f"nees_{name}_per_dim: the covariance is not positive definite, so there is no figure")
+    return ComponentErrors(
+        frame_run=component.frame_run,
+        runs=tuple(run.name for run in component.runs),
+        n_tags=len(component.tags),
+        starts=starts,
+        tags=tuple(_tag_error(tag, error) for tag, error in zip(tags, errors, strict=True)),
+        tags_rmse_m=_rms(errors),
+        tags_rmse_aligned_m=_rms(aligned(found, true) - true) if len(tags) > 1 else None,
+        trajectory_rmse_m=_rms(_trajectory_errors(component.runs, truth, T_world_map)),
+        nees_tags_per_dim=nees_tags,
+        nees_start_per_dim=nees_start,
+        notes=tuple(notes),
+    )
+
+
+def aligned(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
+    """Points (N, 2) turned and moved, not scaled, so that they lie on others (N, 2) with least squares.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991).
+    """
+    middle, onto_middle = points_m.mean(axis=0), onto_m.mean(axis=0)
+    left, _, right = np.linalg.svd((onto_m - onto_middle).T @ (points_m - middle))
+    no_mirror = np.diag([1.0, np.sign(np.linalg.det(left @ right)) or 1.0])
+    rotation = left @ no_mirror @ right
+    moved: FloatArray = (points_m - middle) @ rotation.T + onto_middle
+    return moved
+
+
+def _start_places(
+    component: Component, truth: Truth, T_world_map: FloatArray
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Where each run starts, found and true (2,); later stretches apart, whose start is no start of a drive."""
+    places = {}
+    for run in component.runs:
+        T_world_start = _true_start(run, truth) if run.run == run.name else None
+        if T_world_start is not None:
+            places[run.name] = run.T_map_start[:2], se2.between(T_world_map, T_world_start)[:2]
+    return places
+
+
+def _nees(
+    component: Component,
+    places: Mapping[str, tuple[FloatArray, FloatArray]],
+    known: Sequence[int],
+    true_tags_m: FloatArray,
+) -> tuple[float | None, float | None]:
+    """Of all starts jointly as seen from the frame's, and of all tags (indices `known`) jointly."""
+    names = [run.name for run in component.runs]
+    starts = [name for name in places if name != component.frame_run]
+    rows = [3 * names.index(name) + axis for name in starts for axis in (0, 1)]
+    rows += [3 * len(names) + 2 * i + axis for i in known for axis in (0, 1)]
+    covariance = component.joint_covariance[np.ix_(rows, rows)]
+    found_m = np.array([places[name][0] for name in starts] + [component.tags[i].position_m for i in known])
+    true_m = np.concatenate([np.array([places[name][1] for name in starts]).reshape(-1, 2), true_tags_m])
+    if not len(rows) or not np.isfinite(covariance).all():
+        return None, None
+    errors = tangent_errors(found_m, true_m, covariance)
+    n = len(starts)
+    return (
+        nees_per_dim(errors[:n].reshape(-1), covariance[: 2 * n, : 2 * n]),
+        nees_per_dim(errors[n:].reshape(-1), covariance[2 * n :, 2 * n :]),
+    )
+
+
+def _start_error(a: str, b: str, places: dict[str, tuple[FloatArray, FloatArray]]) -> StartError:
+    found = places[b][0] - places[a][0]
+    true = places[b][1] - places[a][1]
+    return StartError(
+        a,
+        b,
+        distance_m=float(np.linalg.norm(found)),
+        true_distance_m=float(np.linalg.norm(true)),
+        vector_error_m=float(np.linalg.norm(found - true)),
+    )
+
+
+def _trajectory_errors(runs: Iterable[RunResult], truth: Truth, T_world_map: FloatArray) -> FloatArray:
+    """Position errors (K, 2) of all keyframes that the truth covers."""
+    errors = [np.empty((0, 2))]
+    for run in runs:
+        true_run = truth.runs.get(run.run)
+        if true_run is not None:
+            T_world_base, covered = true_run.at(run.stamps_ns)
+            T_map_base = se2.between(T_world_map, T_world_base)
+            errors.append((run.T_map_base - T_map_base)[covered, :2])
+    return np.concatenate(errors)
+
+
+def _notes(component: Component, truth: Truth) -> list[str]:
+    """One line each on what the truth does not know."""
+    notes = []
+    unknown_runs = [run.name for run in component.runs if run.run not in truth.runs]
+    if unknown_runs:
+        notes.append(f"not in the truth, left out: runs {', '.join(unknown_runs)}")
+    late = sum(_n_not_covered(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
+    if late:
+        notes.append(f"{late} keyframes lie outside the truth's time, left out of trajectory_rmse_m")
+    unknown_tags = [tag.full_label for tag in component.tags if not _knows(truth, tag)]
+    if unknown_tags:
+        notes.append(f"not in the truth, or there more than once, left out: tags {', '.join(unknown_tags)}")
+    return notes
+
+
+def _n_not_covered(run: RunResult, true_run: TrueRun) -> int:
+    return int((~true_run.at(run.stamps_ns)[1]).sum())
+
+
+def _name(tag: TagResult) -> tuple[str, int, str]:
+    return tag.family, tag.tag_id, tag.instance
+
+
+def _knows(truth: Truth, tag: TagResult) -> bool:
+    return _name(tag) in truth.tags_m and _name(tag) not in truth.ambiguous
+
+
+def _tag_error(tag: TagResult, error_m: FloatArray) -> TagError:
+    return TagError(
+        tag.family,
+        tag.tag_id,
+        tag.instance,
+        float(np.linalg.norm(error_m)),
+        float(np.sqrt(np.trace(tag.covariance))),
+    )
+
+
+def _rms(errors_m: FloatArray) -> float | None:
+    """Root mean square of the lengths of (N, 2) errors; None of none."""
+    return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else None

@@ -1,0 +1,266 @@
+"""A map against positions that somebody measured, neither of which is beyond doubt.
+
+The survey is turned and moved onto the map, weighed by the joint covariance of both. Each entry is then tested for a
+shift of its own (Baarda, "A testing procedure for use in geodetic networks", 1968): what the map and all other entries
+say of it against what it says itself. The worst goes first, and the rest is judged anew.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import fit_transform, se2
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation.survey_errors import ComponentSurvey, JudgedEntry, SurveyErrors
+from groundsbot.offline.foundation import CsvTable, read_table
+from groundsbot.offline.maps import Component, MapResult
+
+# What a tape measure and a plumb line leave, where the file does not say.
+DEFAULT_SIGMA_M: Final = 0.02
+# An entry of a good survey is named once in a thousand surveys.
+_FALSE_ALARM: Final = 1e-3
+_MAX_STEPS: Final = 20
+_MAX_PLACE_M: Final = 1e8  # no place on the earth is farther from the origin of any grid
+_MAX_SIGMA_M: Final = 1000.0  # as far as a tag is ever read from
+
+
+@dataclass(frozen=True)
+class SurveyEntry:
+    """One measured place, in the survey's own frame."""
+
+    family: str  # empty: not said
+    tag_id: int
+    instance: str
+    position_m: FloatArray  # (2,)
+    sigma_m: float  # of each coordinate
+
+
+def read_survey(path: Path) -> list[SurveyEntry]:
+    """Reads `tag_id,x_m,y_m` and, where they are there, `sigma_m,family,instance`; other columns are not looked at.
+
+    Raises:
+        OfflineError: not such a file, or a tag twice in it.
+    """
+    table = read_table(path)
+    missing = [column for column in ("tag_id", "x_m", "y_m") if column not in table]
+    if missing:
+        raise OfflineError(f"{path}: has no column {', '.join(missing)}; a survey has tag_id,x_m,y_m and maybe sigma_m")
+    n = len(table)
+    ids = table.integers("tag_id", minimum=0)
+    x_m, y_m = (table.numbers_below(column, _MAX_PLACE_M) for column in ("x_m", "y_m"))
+    sigmas = table.positive_numbers("sigma_m", _MAX_SIGMA_M) if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
+    families = table.text("family") if "family" in table else [""] * n
+    instances = table.text("instance") if "instance" in table else [""] * n
+    entries = [
+        SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma)
+        for family, tag_id, instance, x, y, sigma in zip(families, ids, instances, x_m, y_m, sigmas, strict=True)
+    ]
+    _check_once(table, entries)
+    return entries
+
+
+def _check_once(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
+    seen = set()
+    for row, entry in enumerate(entries):
+        name = (entry.family, entry.tag_id, entry.instance)
+        if name in seen:
+            table.fail(row, "tag_id", "is there twice; leave one row out, or tell them apart by instance")
+        seen.add(name)
+
+
+def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:
+    """Compares every component that shares three entries or more.
+
+    Raises:
+        OfflineError: no component does, two entries mean one tag, or their places tell no direction.
+    """
+    components, found = [], set()
+    for component in result.components:
+        named: dict[tuple[int, str], list[int]] = {}
+        for i, tag in enumerate(component.tags):
+            named.setdefault((tag.tag_id, tag.instance), []).append(i)
+        matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry, named)]
+        found |= {k for _, k in matched}
+        _check_different(component, [i for i, _ in matched])
+        if len(matched) >= 3:
+            _check_extent(component, [entries[k] for _, k in matched])
+            components.append(_judge(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
+    if not components:
+        raise OfflineError(
+            f"the survey shares {len(found)} tags with the map, and three in one component are the least that can be "
+            "judged; measure more tags, or give the survey of this map"
+        )
+    lost = [str(entry.tag_id) for k, entry in enumerate(entries) if k not in found]
+    notes = [f"not in the map: tags {', '.join(lost)}"] if lost else []
+    return SurveyErrors(tuple(components), tuple(notes))
+
+
+def _tags_of(component: Component, entry: SurveyEntry, named: Mapping[tuple[int, str], Sequence[int]]) -> list[int]:
+    """The component's tag that an entry means, `named` by number and instance; none where that is not clear."""
+    same = named.get((entry.tag_id, entry.instance), ())
+    fits = [i for i in same if entry.family in ("", component.tags[i].family)]
+    return fits if len(fits) == 1 else []
+
+
+def _check_different(component: Component, tags: Sequence[int]) -> None:
+    """Refuses a tag that two entries mean: once with its family, say, and once without."""
+    for i in tags:
+        if tags.count(i) > 1:
+            tag = component.tags[i]
+            raise OfflineError(
+                f"the survey has tag {tag.tag_id}{tag.instance} of {tag.family} twice, once without its family; leave "
+                "one row out, or say the family of both"
+            )
+
+
+def _check_extent(component: Component, entries: Sequence[SurveyEntry]) -> None:
+    """Refuses entries so close together that their turn about their middle is known no better than to a radian."""
+    places_m = np.array([entry.position_m for entry in entries])
+    weight = np.array([entry.sigma_m for entry in entries]) ** -2.0
+    from_middle_m = places_m - weight @ places_m / weight.sum()
+    if weight @ (from_middle_m**2).sum(axis=1) <= 1.0:
+        raise OfflineError(
+            f"the survey has the tags of {component.frame_run}'s component all in one place (within sigma_m), which "
+            "tells no direction; measure tags farther apart"
+        )
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """What a least-squares fit of the survey onto the map leaves over.
+
+    Attributes:
+        T_map_survey: (3,).
+        residual: (2n,) map minus survey, in map axes.
+        reliability: (2n, 2n) A with A residual = Q^-1 (what the fit leaves over), A Q A = A.
+    """
+
+    T_map_survey: FloatArray
+    residual: FloatArray
+    reliability: FloatArray
+
+    def shift(self, rows: Sequence[int]) -> tuple[FloatArray, float]:
+        """Of the rows of some entries: the shift that would explain them, and its squared length in sigmas."""
+        at = np.array(rows)
+        pulled = (self.reliability @ self.residual)[at]
+        shift: FloatArray = np.asarray(np.linalg.pinv(self.reliability[np.ix_(at, at)], rcond=1e-12) @ pulled)
+        return shift, float(pulled @ shift)
+
+
+def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> _Adjusted:
+    """Generalised least squares for the transform alone."""
+    information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    T_map_survey = fit_transform(map_m, survey_m)
+    for _ in range(_MAX_STEPS):
+        placed = se2.apply(T_map_survey, survey_m)
+        jacobian = _by_transform(placed)
+        normal = jacobian.T @ information @ jacobian
+        step = _solved(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
+        T_map_survey = se2.compose(np.array([0.0, 0.0, step[2]]), T_map_survey) + np.array([step[0], step[1], 0.0])
+        if np.abs(step).max() < 1e-12:
+            break
+    placed = se2.apply(T_map_survey, survey_m)
+    jacobian = _by_transform(placed)
+    weighted = information @ jacobian
+    reliability: FloatArray = information - weighted @ _solved(jacobian.T @ weighted, weighted.T)
+    return _Adjusted(T_map_survey, (map_m - placed).reshape(-1), reliability)
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Of all solutions the shortest: where the entries that are left lie in one place, any turn will do."""
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
+
+
+def _by_transform(placed_m: FloatArray) -> FloatArray:
+    """(2n, 3) derivative of places by a shift and a turn of the survey about the map's origin."""
+    jacobian = np.zeros((len(placed_m), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -placed_m[:, 1], placed_m[:, 0]
+    return jacobian.reshape(-1, 3)
+
+
+def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
+    map_m = np.array([component.tags[i].position_m for i in tags])
+    survey_m = np.array([entry.position_m for entry in entries])
+    rows = np.array([(2 * i, 2 * i + 1) for i in tags]).reshape(-1)
+    covariance = component.tag_covariance[np.ix_(rows, rows)]
+    covariance = covariance + np.diag(np.repeat([entry.sigma_m**2 for entry in entries], 2))
+    good = _fitting(map_m, survey_m, covariance)
+    swapped = _swapped(map_m, survey_m, covariance, good)
+    judged = []
+    for k, i in enumerate(tags):
+        part, adjusted = _with(map_m, survey_m, covariance, [*sorted({*good, k})])
+        at = 2 * part.index(k)
+        shift, square = adjusted.shift([at, at + 1])
+        verdict = "fits" if k in good else "swapped" if k in swapped else "wrong"
+        other = entries[swapped[k]].tag_id if k in swapped else None
+        judged.append(JudgedEntry(component.tags[i], shift, float(np.sqrt(max(square, 0.0))), verdict, other))
+    _, adjusted = _with(map_m, survey_m, covariance, good)
+    residual = map_m[good] - se2.apply(fit_transform(map_m[good], survey_m[good]), survey_m[good])
+    scale, scale_sigma = _scale(adjusted, map_m[good])
+    n_over = residual.size - 3
+    square = float(adjusted.residual @ adjusted.reliability @ adjusted.residual)
+    return ComponentSurvey(
+        frame_run=component.frame_run,
+        entries=tuple(judged),
+        T_map_survey=adjusted.T_map_survey,
+        rmse_m=float(np.sqrt((residual**2).sum(axis=1).mean())),
+        worst_m=float(np.linalg.norm(residual, axis=1).max()),
+        scale_error=scale,
+        scale_sigma=scale_sigma,
+        nees_per_dim=square / n_over if n_over > 0 else None,
+    )
+
+
+def _with(
+    map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, part: list[int]
+) -> tuple[list[int], _Adjusted]:
+    """The fit of some entries."""
+    rows = np.array([(2 * k, 2 * k + 1) for k in part]).reshape(-1)
+    return part, _adjust(map_m[part], survey_m[part], covariance[np.ix_(rows, rows)])
+
+
+def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
+    """Entries left after the worst have gone, one at a time; three at least."""
+    limit = chdtri(2, _FALSE_ALARM / len(map_m))
+    good = list(range(len(map_m)))
+    while len(good) > 3:
+        _, adjusted = _with(map_m, survey_m, covariance, good)
+        squares = [adjusted.shift([2 * k, 2 * k + 1])[1] for k in range(len(good))]
+        worst = int(np.argmax(squares))
+        if squares[worst] <= limit:
+            break
+        del good[worst]
+    return good
+
+
+def _swapped(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, good: Sequence[int]) -> dict[int, int]:
+    """Among the entries that do not fit, pairs that do once exchanged."""
+    found: dict[int, int] = {}
+    odd = [k for k in range(len(map_m)) if k not in good]
+    for a, b in combinations(odd, 2):
+        if a in found or b in found:
+            continue
+        exchanged = survey_m.copy()
+        exchanged[[a, b]] = survey_m[[b, a]]
+        part, adjusted = _with(map_m, exchanged, covariance, [*sorted({*good, a, b})])
+        rows = [2 * part.index(k) + axis for k in (a, b) for axis in (0, 1)]
+        if chdtrc(4, adjusted.shift(rows)[1]) > _FALSE_ALARM:
+            found[a], found[b] = b, a
+    return found
+
+
+def _scale(adjusted: _Adjusted, map_m: FloatArray) -> tuple[float, float]:
+    """How much longer the map is than the survey, as a share, and its sigma."""
+    direction = (map_m - map_m.mean(axis=0)).reshape(-1)
+    pulled = adjusted.reliability @ direction
+    information = float(direction @ pulled)
+    if information <= 0.0:
+        return 0.0, float("inf")
+    return float(pulled @ adjusted.residual) / information, information**-0.5

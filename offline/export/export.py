@@ -1,0 +1,142 @@
+"""A finished map in the form of other tools; docs/formats.md says units and frames of each."""
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from groundsbot.calib.foundation import counted, folder_written_whole, written_whole
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export.frc_layout import fmap_of, frc_layout_of
+from groundsbot.offline.export.g2o import g2o_text
+from groundsbot.offline.export.geojson import geojson_of
+from groundsbot.offline.export.options import ExportFormat, ExportOptions
+from groundsbot.offline.maps import Component, MapResult, RunResult, read_map, tags_csv, write_tum
+
+RUN_COLUMNS: Final = ("t_ns", "x_m", "y_m", "theta_rad")
+
+Lines = list[str]
+
+
+def export_map(folder: Path, options: ExportOptions) -> Lines:
+    """Writes one component of a map.
+
+    Args:
+        folder: what `map -o` wrote.
+        options: format, output and what the format needs besides.
+
+    Returns:
+        What a person should know.
+
+    Raises:
+        GroundsbotError: the output exists, or the map does not hold what the format needs; nothing is written then.
+    """
+    options.check()
+    if os.path.lexists(options.output):
+        raise OfflineError(f"-o {options.output}: exists already; nothing is written over, give another output")
+    result = read_map(folder)
+    component = _component(result, options.component)
+    try:
+        if options.form in _FOLDERS:
+            with folder_written_whole(options.output) as partial:
+                _FOLDERS[options.form](component, partial)
+            lines = [_measure(component)]
+        else:
+            text, lines = _TEXTS[options.form](component, result, options)
+            with written_whole(options.output) as partial:
+                partial.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OfflineError(
+            f"-o {options.output}: cannot be written ({error.strerror}); choose another place"
+        ) from error
+    return [*lines, *_suspects(result, component), f"{options.form}: {options.output}"]
+
+
+def _component(result: MapResult, index: int | None) -> Component:
+    """The one asked for, or the only one."""
+    n = len(result.components)
+    if index is None and n == 1:
+        return result.components[0]
+    which = ", ".join(
+        f"{i} (frame of {each.frame_run}, {counted(len(each.runs), 'run')}, {counted(len(each.tags), 'tag')})"
+        for i, each in enumerate(result.components)
+    )
+    if index is None:
+        raise OfflineError(
+            f"the map has {n} components, each with a frame of its own; choose one by --component: {which}"
+        )
+    if index >= n:
+        raise OfflineError(f"--component {index}: the map has none of that number; choose among {which}")
+    return result.components[index]
+
+
+def _suspects(result: MapResult, component: Component) -> Lines:
+    """Tags that the map itself mistrusts, which other tools have no word for."""
+    there = {(tag.family, tag.tag_id) for tag in component.tags}
+    return [f"warning: suspect: {each.line()}" for each in result.suspects if (each.family, each.tag_id) in there]
+
+
+def _measure(component: Component) -> str:
+    runs, tags = counted(len(component.runs), "run"), counted(len(component.tags), "tag")
+    return f"{runs}, {tags}, in the frame of {component.frame_run}'s start"
+
+
+def _write_tum(component: Component, folder: Path) -> None:
+    for run in component.runs:
+        write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
+
+
+def _write_csv(component: Component, folder: Path) -> None:
+    (folder / "tags.csv").write_text(tags_csv([component]), encoding="utf-8")
+    for run in component.runs:
+        (folder / f"{run.name}.csv").write_text(_run_csv(run), encoding="utf-8")
+
+
+def _run_csv(run: RunResult) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(RUN_COLUMNS)
+    for stamp_ns, (x, y, theta) in zip(run.stamps_ns.tolist(), run.T_map_base.tolist(), strict=True):
+        writer.writerow((stamp_ns, f"{x:.9f}", f"{y:.9f}", f"{theta:.12f}"))
+    return stream.getvalue()
+
+
+def _g2o(component: Component, result: MapResult, _options: ExportOptions) -> tuple[str, Lines]:
+    lines = [_measure(component)]
+    used = {each.component for each in result.measurements}
+    if any(each is component and i in used for i, each in enumerate(result.components)):
+        lines.append("warning: what --start and --distance measured is not in it; without them its optimum is another")
+    return g2o_text(component), lines
+
+
+def _geojson(component: Component, _result: MapResult, options: ExportOptions) -> tuple[str, Lines]:
+    return _as_json(geojson_of(component, options)), [_measure(component)]
+
+
+def _frc(component: Component, _result: MapResult, options: ExportOptions) -> tuple[str, Lines]:
+    layout, said = frc_layout_of(component, options)
+    return _as_json(layout), said
+
+
+def _limelight(component: Component, _result: MapResult, options: ExportOptions) -> tuple[str, Lines]:
+    fmap, said = fmap_of(component, options)
+    return _as_json(fmap), said
+
+
+def _as_json(data: dict[str, Any]) -> str:
+    return json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+_FOLDERS: Final[dict[ExportFormat, Callable[[Component, Path], None]]] = {
+    ExportFormat.TUM: _write_tum,
+    ExportFormat.CSV: _write_csv,
+}
+_TEXTS: Final[dict[ExportFormat, Callable[[Component, MapResult, ExportOptions], tuple[str, Lines]]]] = {
+    ExportFormat.G2O: _g2o,
+    ExportFormat.GEOJSON: _geojson,
+    ExportFormat.FRC: _frc,
+    ExportFormat.LIMELIGHT: _limelight,
+}

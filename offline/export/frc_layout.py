@@ -1,0 +1,98 @@
+"""Tags as FRC tools have them: WPILib's AprilTagFieldLayout and Limelight's .fmap.
+
+Both want a tag's pose in space. Their tag frame has x out of the printed face and z up.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export.options import ExportOptions, numbers
+from groundsbot.offline.export.tag_poses import PlacedTag, tags_in_space
+from groundsbot.offline.maps import Component
+
+# docs.limelightvision.io, "AprilTag Map Specification", names these two.
+_LIMELIGHT_FAMILIES: Final = {"tag36h11": "apriltag3_36h11_classic", "tag16h5": "apriltag3_16h5_classic"}
+
+
+def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any], list[str]]:
+    """The layout, and what a person should know.
+
+    Raises:
+        OfflineError: something is missing that a layout needs.
+    """
+    if options.field_m is None:
+        raise OfflineError(
+            "--format frc: a layout says how large the field is, about whose middle WPILib turns it for the other "
+            "alliance; give --field-m LENGTH,WIDTH"
+        )
+    length_m, width_m = numbers("--field-m", options.field_m, "LENGTH,WIDTH")
+    if min(length_m, width_m) <= 0.0:
+        raise OfflineError(f"--field-m {options.field_m}: must be above 0")
+    family = _one_family(component, options.family)
+    twice = sorted({tag.tag_id for tag in component.tags if tag.family == family and tag.instance})
+    chosen = [tag for tag in component.tags if tag.family == family and not tag.instance]
+    placed, said = tags_in_space(component, chosen, options)
+    if twice:
+        said.append(f"left out, since a layout has one place for an id: {', '.join(map(str, twice))}")
+    tags = [{"ID": each.tag.tag_id, "pose": _wpilib_pose(each)} for each in placed]
+    return {"tags": tags, "field": {"length": length_m, "width": width_m}}, said
+
+
+def fmap_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any], list[str]]:
+    """The .fmap, and what a person should know.
+
+    Raises:
+        OfflineError: something is missing that it needs.
+    """
+    for tag in component.tags:
+        if tag.family not in _LIMELIGHT_FAMILIES:
+            known = ", ".join(_LIMELIGHT_FAMILIES)
+            raise OfflineError(f"--format limelight: knows tags of {known}, not of {tag.family}; choose another format")
+        if tag.size_m is None:
+            raise OfflineError(
+                f"--format limelight: wants the size of each tag, and that of {tag.tag_id} is not known to the map "
+                "(its positions were imported); import the log with --robot, or choose another format"
+            )
+    placed, said = tags_in_space(component, component.tags, options)
+    fiducials = [
+        {
+            "family": _LIMELIGHT_FAMILIES[each.tag.family],
+            "id": each.tag.tag_id,
+            "size": 1000.0 * (each.tag.size_m or 0.0),
+            "transform": _row_major(each),
+            "unique": 0 if each.tag.instance else 1,
+        }
+        for each in placed
+    ]
+    return {"type": "frc", "fiducials": fiducials}, said
+
+
+def _one_family(component: Component, wanted: str | None) -> str:
+    families = sorted({tag.family for tag in component.tags})
+    if not families:
+        raise OfflineError("--format frc: the map has no tags; choose another format")
+    if wanted is None and len(families) == 1:
+        return families[0]
+    if wanted not in families:
+        asked = "--format frc: a layout tells no families apart" if wanted is None else f"--family {wanted}: not there"
+        raise OfflineError(f"{asked}, and the map has {', '.join(families)}; choose one by --family")
+    return wanted
+
+
+def _wpilib_pose(each: PlacedTag) -> dict[str, Any]:
+    x_m, y_m = each.tag.position_m.tolist()
+    x, y, z, w = each.R_map_tag.as_quat(canonical=True).tolist()
+    return {
+        "translation": {"x": x_m, "y": y_m, "z": each.z_m},
+        "rotation": {"quaternion": {"W": w, "X": x, "Y": y, "Z": z}},
+    }
+
+
+def _row_major(each: PlacedTag) -> list[float]:
+    x_m, y_m = each.tag.position_m.tolist()
+    T_map_tag = np.eye(4)
+    T_map_tag[:3, :3], T_map_tag[:3, 3] = each.R_map_tag.as_matrix(), (x_m, y_m, each.z_m)
+    row_major: list[float] = T_map_tag.ravel().tolist()
+    return row_major

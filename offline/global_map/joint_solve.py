@@ -1,0 +1,198 @@
+"""All runs of a component in one solve, and the typed result."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.alignment import Group
+from groundsbot.offline.corners import CornerSolution, Refined
+from groundsbot.offline.foundation import Stages
+from groundsbot.offline.global_map.edges import edges_of
+from groundsbot.offline.global_map.tape import with_measurements
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.maps import (
+    CalibrationResult,
+    Component,
+    KeptCalibration,
+    MapModel,
+    RunResult,
+    StartToStart,
+    TagPose,
+    TagResult,
+    nominal_row,
+)
+from groundsbot.offline.measurements import Measurements, TagKey
+from groundsbot.offline.sam import Graph, Parameter, Solution, State, build_graph, solve
+
+
+def solve_global_map(
+    maps: Sequence[LocalMap], group: Group, stages: Stages, measurements: Measurements | None = None
+) -> tuple[Graph, Solution]:
+    """Solves the members of a group together, from their local maps placed by the alignments."""
+    members = [maps[m] for m in group.members]
+    with stages.stage("building the graph"):
+        graph = build_graph([member.chain for member in members])
+        graph = with_measurements(graph, measurements) if measurements else graph
+        if len(members) == 1 and not len(graph.problem.measured):
+            return graph, members[0].solution
+        poses = np.concatenate(
+            [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
+        )
+        start = graph.start(poses, _mean_tags(members, group), _mean_calibration(members))
+        _ = graph.problem.arrowhead  # the order of elimination is part of it, and made when first asked for
+    with stages.stage("solving all runs together"):
+        return graph, solve(graph.problem, start)
+
+
+def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
+    """Typed results with covariances, in the frame of the first chain's start; refined on corners where they are."""
+    last = refined.solution if refined else solution
+    state, columns = last.state, last.problem.columns
+    starts = graph.first_pose
+    free = np.flatnonzero(columns.calibration >= 0)
+    places = np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)])
+    whole = last.covariance(np.concatenate([places, columns.calibration[free]]))
+    joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
+    n_starts = 3 * len(starts)
+    runs = tuple(
+        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mount_of(state, i))
+        for i in range(len(graph.chains))
+    )
+    tag_covariances = [
+        joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2]
+        for i in range(len(graph.tags))
+    ]
+    return Component(
+        frame_run=graph.chains[0].name,
+        runs=runs,
+        tags=_tag_results(graph, state, tag_covariances, refined.tag_poses if refined else [None] * len(graph.tags)),
+        joint_covariance=joint,
+        cost=last.cost,
+        n_residuals=last.problem.n_residuals,
+        start_to_start=_start_to_start(runs, joint),
+        edges=edges_of(graph, solution, refined.solution.state if refined else None),
+        model=MapModel.CORNERS if refined else MapModel.FLOOR,
+        floor=refined.floor if refined else None,
+        calibration=_kept_calibration(
+            [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
+        ),
+    )
+
+
+def calibration_of(
+    parameters: Sequence[Parameter], solution: Solution | CornerSolution, component: int
+) -> list[CalibrationResult]:
+    """What the solve found for the calibration numbers it carried."""
+    columns = solution.problem.columns.calibration
+    sigmas = np.sqrt(np.diag(solution.covariance(columns)))
+    return [
+        CalibrationResult(parameter.owner, parameter.name, component, float(value), float(sigma), parameter.sigma)
+        for parameter, value, sigma, column in zip(parameters, solution.state.calibration, sigmas, columns, strict=True)
+        if column >= 0
+    ]
+
+
+def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:
+    """Tags in the group's frame, the mean over the maps that have them."""
+    places: dict[TagKey, list[FloatArray]] = {}
+    for T_frame_start, member in zip(group.T_frame_start, members, strict=True):
+        for tag, place in member.tags_m.items():
+            places.setdefault(tag, []).append(se2.apply(T_frame_start, place))
+    return {tag: np.mean(found, axis=0) for tag, found in places.items()}
+
+
+def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
+    values: dict[Parameter, list[float]] = {}
+    for member in members:
+        for parameter, value in member.calibration.items():
+            values.setdefault(parameter, []).append(value)
+    return {parameter: float(np.mean(found)) for parameter, found in values.items()}
+
+
+def _kept_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> KeptCalibration:
+    """Of the C numbers that the solve carried: their rows (C, 2 T + C) of the covariance of tags and calibration."""
+    n = rows.shape[1] - len(parameters)
+    return KeptCalibration(
+        owners=tuple(parameter.owner for parameter in parameters),
+        names=tuple(parameter.name for parameter in parameters),
+        nominal=np.array([nominal_row(parameter.nominal) for parameter in parameters]).reshape(
+            -1, len(nominal_row(()))
+        ),
+        values=values,
+        covariance=rows[:, n:],
+        with_tags=rows[:, :n],
+    )
+
+
+def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
+    """From right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
+    turned = joint.copy()
+    for i, theta in enumerate(start_headings_rad):
+        cos, sin = np.cos(theta), np.sin(theta)
+        turn, place = np.array([[cos, -sin], [sin, cos]]), slice(3 * i, 3 * i + 2)
+        turned[place] = turn @ turned[place]
+        turned[:, place] = turned[:, place] @ turn.T
+    return turned
+
+
+def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mount: Mount | None) -> RunResult:
+    chain = graph.chains[index]
+    poses = graph.poses_of(state, index)
+    return RunResult(
+        name=chain.name,
+        run=chain.run.name,
+        log=chain.run.log,
+        robot_id=chain.run.robot_id,
+        run_id=chain.run.run_id,
+        T_map_start=poses[0],
+        covariance=covariance,
+        stamps_ns=chain.stamps_ns,
+        T_map_base=poses,
+        distance_m=float(chain.along_m[-1]),
+        T_base_camera=None if mount is None else _components(mount),
+    )
+
+
+def _components(mount: Mount) -> FloatArray:
+    """(7,) place and quaternion x, y, z, w."""
+    place_m, turn = mount.T_base_camera.as_components()
+    return np.concatenate([place_m, turn.as_quat(canonical=True)])
+
+
+def _tag_results(
+    graph: Graph, state: State, covariances: Sequence[FloatArray], poses: Sequence[TagPose | None]
+) -> tuple[TagResult, ...]:
+    results = []
+    for i, (tag, n) in enumerate(zip(graph.tags, graph.n_readings().tolist(), strict=True)):
+        seen_by = [chain for chain in graph.chains if tag in chain.tags]
+        robot = seen_by[0].run.robot
+        has_size = any(batch.family == tag.family for batch in robot.tags)
+        results.append(
+            TagResult(
+                family=tag.family,
+                tag_id=tag.tag_id,
+                instance=tag.instance,
+                size_m=robot.tag_size_m(tag.family, tag.tag_id)[0] if has_size else None,
+                position_m=state.tags[i],
+                covariance=covariances[i],
+                n_observations=n,
+                runs=tuple(chain.name for chain in seen_by),
+                pose=poses[i],
+            )
+        )
+    return tuple(results)
+
+
+def _start_to_start(runs: Sequence[RunResult], joint: FloatArray) -> tuple[StartToStart, ...]:
+    found = []
+    for i in range(len(runs)):
+        for j in range(i + 1, len(runs)):
+            first, second = slice(3 * i, 3 * i + 2), slice(3 * j, 3 * j + 2)
+            between = joint[first, second]
+            covariance = joint[first, first] + joint[second, second] - between - between.T
+            vector_m = runs[j].T_map_start[:2] - runs[i].T_map_start[:2]
+            found.append(StartToStart(runs[i].name, runs[j].name, vector_m, covariance))
+    return tuple(found)

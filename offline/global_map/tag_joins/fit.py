@@ -1,0 +1,213 @@
+"""How one solved component lies in another by tags that hang in both: place, height and orientation of each.
+
+A tag in space has six numbers, a floor's transform three. So one shared tag gives the whole transform, and three
+numbers are left to hold against chance: the tag must hang at one height and lean one way in both. The least squares of
+the six differences under their joint covariance (generalised least squares, Gauss-Newton) gives all of that.
+
+Each component is taken about a pose that saw the tags, which has no error there: how its start lies to that pose is no
+business of the tags, and a long way's bend would not be a small error.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.alignment import FALSE_ALARM, quarter_turned
+from groundsbot.offline.corners import CornerSolution, SpatialState
+from groundsbot.offline.measurements import REACH_M, UNMODELLED_SIGMA_M
+
+_STEPS: Final = 6
+_STRAIGHT_SIGMAS: Final = 2.0
+# Squared sigmas between two ways that are equally likely: together they vary by an eighth more than either.
+_COVERED: Final = 0.5
+
+
+@dataclass(frozen=True)
+class HungTags:
+    """K tags of a component about one of its poses.
+
+    Attributes:
+        T_map_anchor: (3,) the pose.
+        place_m: (K, 3) in its frame, height above the floor.
+        turn: (K, 3, 3) R_anchor_tag.
+        covariance: (6 K, 6 K) of place and of a small turn about the anchor's axes, tag by tag.
+        nats: by how much less likely the looks are if the tags hang so, than as they fit best.
+        straightness: how much less likely they truly become where the first tag turns by two sigmas to the worse side,
+            over what first order foretells.
+    """
+
+    T_map_anchor: FloatArray
+    place_m: FloatArray
+    turn: FloatArray
+    covariance: FloatArray
+    nats: float = 0.0
+    straightness: float = 1.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the tags are within reach at all, rather than far off where no look says anything."""
+        return float(np.trace(self.covariance)) < REACH_M**2
+
+
+@dataclass(frozen=True)
+class TagFit:
+    """One component in another.
+
+    Attributes:
+        a: the tags in one, b: in the other.
+        T_a_b: (3,) pose of b's map in a's.
+        T_anchors: (3,) of b's anchor in a's.
+        covariance: (3, 3) of T_anchors as x, y, theta; with what is unmodelled.
+        rise: squared sigmas, chi-square with `freedom` where the tags hang alike in both.
+        nats: minus the log likelihood, up to a constant that all ways of the same tags share.
+    """
+
+    a: HungTags
+    b: HungTags
+    T_anchors: FloatArray
+    covariance: FloatArray
+    rise: float
+    freedom: int
+    nats: float
+
+    @property
+    def T_a_b(self) -> FloatArray:
+        """(3,) pose of map b in map a."""
+        return se2.compose(se2.compose(self.a.T_map_anchor, self.T_anchors), se2.inverse(self.b.T_map_anchor))
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """How well it is known how one is turned against the other."""
+        return float(self.covariance[2, 2] ** 0.5)
+
+    @property
+    def closes(self) -> bool:
+        """Whether chance explains how the tags differ."""
+        return self.rise < float(chi2.isf(FALSE_ALARM, self.freedom))
+
+    def covers(self, other: "TagFit") -> bool:
+        """Whether this covariance will do for both ways, whichever is true."""
+        off = self.T_anchors - other.T_anchors
+        off[2] = se2.wrap_angle(off[2])
+        return float(off @ np.linalg.solve(self.covariance, off)) < _COVERED
+
+
+def hung_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float) -> HungTags:
+    """Some tags of a converged solution about a pose.
+
+    Args:
+        solution: on corners.
+        tags: (K,) indices.
+        anchor: index of the pose.
+        variance_factor: the covariance's.
+        nats: see `HungTags`.
+    """
+    state, columns = solution.state, solution.problem.columns
+    pose = state.poses[anchor]
+    back = Rotation.from_euler("z", -pose[2]).as_matrix()
+    place = (np.column_stack([state.tags, state.heights_m])[tags] - [pose[0], pose[1], 0.0]) @ back.T
+    turn = back @ state.turns[tags]
+    six = np.column_stack([columns.tags, columns.heights, columns.turns])[tags]
+    joint = solution.covariance(np.concatenate([columns.poses[anchor], six.ravel()]))
+    by = np.zeros((len(tags), 6, 3 + six.size))
+    for k, own in enumerate(by):
+        own[:3, 6 * k + 3 : 6 * k + 6] = back
+        own[3:, 6 * k + 6 : 6 * k + 9] = turn[k]
+        by[k, :2, :2] = -np.eye(2)
+        by[k, :2, 2] = -quarter_turned(place[k, :2])
+        by[k, 5, 2] = -1.0
+    rows = by.reshape(-1, 3 + six.size)
+    straight = _straightness(solution, int(tags[0]), anchor)
+    return HungTags(pose, place, turn, variance_factor * rows @ joint @ rows.T, nats, straight)
+
+
+def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
+    """Near a frontal view a tag's turn shows in second order only, and its sigma there is not what it is beside it."""
+    if solution.factor is None:
+        return 0.0
+    state, columns = solution.state, solution.problem.columns
+    heading = np.zeros(columns.n + 1)
+    heading[columns.turns[tag]] = state.turns[tag, 2]
+    heading[columns.poses[anchor, 2]] -= 1.0
+    way = solution.factor.solve(heading[:-1])
+    way *= _STRAIGHT_SIGMAS / np.sqrt(heading[:-1] @ way)
+
+    def cost_at(state: SpatialState) -> float:
+        return solution.problem.system(state, is_whole=False)[1]
+
+    rises = [cost_at(solution.problem.moved(state, step)) - cost_at(state) for step in (way, -way)]
+    return min(rises) / (0.5 * _STRAIGHT_SIGMAS**2)
+
+
+def fitted(a: HungTags, b: HungTags) -> TagFit:
+    """The transform that brings the tags of b onto those of a."""
+    k = len(a.place_m)
+    relative = a.turn @ b.turn.swapaxes(-1, -2)
+    theta = float(
+        np.arctan2((relative[:, 1, 0] - relative[:, 0, 1]).sum(), (relative[:, 0, 0] + relative[:, 1, 1]).sum())
+    )
+    T = np.array([0.0, 0.0, theta])
+    T[:2] = (a.place_m[:, :2] - se2.apply(T, b.place_m[:, :2])).mean(axis=0)
+    for _ in range(_STEPS):
+        residual, by_transform, S = _linearised(a, b, T)
+        pulled = np.linalg.solve(S, by_transform).T
+        T = T - np.linalg.solve(pulled @ by_transform, pulled @ residual)
+        T[2] = se2.wrap_angle(T[2])
+    residual, by_transform, S = _linearised(a, b, T)
+    information = by_transform.T @ np.linalg.solve(S, by_transform)
+    rise = float(residual @ np.linalg.solve(S, residual))
+    # The likelihood of all poses of the tags and of all transforms, each as likely as any other (Laplace).
+    logarithms = [float(np.linalg.slogdet(each)[1]) for each in (S, information, a.covariance, b.covariance)]
+    nats = 0.5 * (rise + logarithms[0] + logarithms[1] - logarithms[2] - logarithms[3]) + a.nats + b.nats
+    return TagFit(a, b, T, np.linalg.inv(information), rise, 6 * k - 3, nats)
+
+
+def _linearised(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
+    k = len(a.place_m)
+    turned = Rotation.from_euler("z", T[2]).as_matrix()
+    in_a = b.place_m @ turned.T
+    apart = a.place_m - in_a - [T[0], T[1], 0.0]
+    tilted = Rotation.from_matrix(a.turn @ (turned @ b.turn).swapaxes(-1, -2)).as_rotvec()
+    by_transform = np.zeros((k, 6, 3))
+    by_transform[:, :2, :2] = -np.eye(2)
+    by_transform[:, :2, 2] = -quarter_turned(in_a[:, :2])
+    by_transform[:, 5, 2] = -1.0
+    both = np.kron(np.eye(2 * k), turned)
+    S = a.covariance + both @ b.covariance @ both.T + np.diag(_unmodelled(a, b) ** 2)
+    return np.concatenate([apart, tilted], axis=1).ravel(), by_transform.reshape(-1, 3), S
+
+
+def _unmodelled(a: HungTags, b: HungTags) -> FloatArray:
+    """(6 K,) sigmas beyond what covariances say, of each difference: a centimetre, and what moves a tag by that.
+
+    What a mount's pitch or a lens's remains shift by a centimetre at its range, they turn by that over the range.
+    """
+    range_m = np.minimum(*(np.linalg.norm(each.place_m[:, :2], axis=1) for each in (a, b)))
+    turned = UNMODELLED_SIGMA_M / np.maximum(range_m, UNMODELLED_SIGMA_M)
+    return np.concatenate([np.full((len(range_m), 3), UNMODELLED_SIGMA_M), np.tile(turned[:, None], (1, 3))], 1).ravel()
+
+
+def radial_sigmas(solution: CornerSolution, anchor: int, starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """How far tags and some poses lie from a pose (N,), and how well that distance is known (N,)."""
+    state, columns = solution.state, solution.problem.columns
+    pose = state.poses[anchor]
+    points = np.concatenate([state.tags, state.poses[list(starts), :2]]) - pose[:2]
+    far_m = np.linalg.norm(points, axis=1)
+    way = points / np.maximum(far_m, 1e-9)[:, None]
+    which = np.concatenate([columns.poses[anchor, :2], columns.tags.ravel(), columns.poses[list(starts), :2].ravel()])
+    joint = solution.covariance(which)
+    # A pose's columns are along its own axes, a tag's along map's.
+    axes = [pose[2], *np.zeros(len(state.tags)), *state.poses[list(starts), 2]]
+    turn = Rotation.from_euler("z", np.array(axes)[:, None]).as_matrix()[:, :2, :2]
+    by = np.zeros((len(points), len(which)))
+    for n in range(len(points)):
+        by[n, 2 * n + 2 : 2 * n + 4] = way[n] @ turn[n + 1]
+        by[n, :2] = -way[n] @ turn[0]
+    return far_m, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", by, joint, by), 0.0))

@@ -1,0 +1,167 @@
+"""What a person measured, in the solve of a component: as factors, and held against the map without it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.corners import CornerSolution
+from groundsbot.offline.maps import MeasurementResult
+from groundsbot.offline.measurements import MeasuredDistance, MeasuredStart, Measurements, TagKey
+from groundsbot.offline.sam import (
+    DistanceFactors,
+    Graph,
+    Linearised,
+    Measured,
+    Solution,
+    StartFactors,
+    State,
+    ends_of,
+    whitening,
+)
+
+# A measurement that belongs is said to contradict the map so rarely.
+_FALSE_ALARM: Final = 1e-4
+# What all else knows a thousand times worse than the tape is as good as not known.
+_CHECKED: Final = 1e-6
+
+
+def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
+    """The graph with those measurements whose ends it has; starts where it has the frame."""
+    starts, distances = _usable(graph, measurements)
+    if not starts and not distances:
+        return graph
+    places = [start.placement for start in starts]
+    firsts: dict[str | TagKey, int] = dict(zip(_names(graph), graph.first_pose.tolist(), strict=True))
+    tags: dict[str | TagKey, int] = _first_instances(graph)
+    ends = [[distance.a for distance in distances], [distance.b for distance in distances]]
+    (pose_a, pose_b), (tag_a, tag_b) = (
+        [np.array([index.get(end, -1) for end in side], dtype=np.int64) for side in ends] for index in (firsts, tags)
+    )
+    measured = Measured(
+        StartFactors(
+            pose=np.array([firsts[start.run] for start in starts], dtype=np.int64),
+            T_map_start=np.array([place.T_a_b for place in places]).reshape(-1, 3),
+            whitening=whitening(np.array([place.covariance for place in places]).reshape(-1, 3, 3)),
+        ),
+        DistanceFactors(
+            pose_a=pose_a,
+            tag_a=tag_a,
+            pose_b=pose_b,
+            tag_b=tag_b,
+            distance_m=np.array([distance.distance_m for distance in distances]),
+            sigma_m=np.array([distance.sigma_m for distance in distances]),
+        ),
+    )
+    return replace(graph, problem=replace(graph.problem, measured=measured))
+
+
+def judged(
+    graph: Graph, solution: Solution | CornerSolution, measurements: Measurements, component: int
+) -> list[MeasurementResult]:
+    """What the component makes of the measurements that it uses."""
+    starts, distances = _usable(graph, measurements)
+    measured, state = graph.problem.measured, solution.state
+    by_start, by_distance = measured.linearise(state, solution.problem.columns)
+    in_map = state.poses[measured.starts.pose], _lengths(measured.distances, state)
+    told = _told(measurements.frame, starts, distances)
+    rows = [(by_start, m) for m in range(len(starts))] + [(by_distance, m) for m in range(len(distances))]
+    results = []
+    for result, (kind, m), value in zip(told, rows, [*in_map[0], *in_map[1]], strict=True):
+        off_sigmas, bound = _off(kind, m, solution)
+        results.append(
+            replace(
+                result,
+                component=component,
+                in_map=value,
+                residual_sigmas=float(np.linalg.norm(kind.residual[m])),
+                off_sigmas=off_sigmas,
+                contradicts=off_sigmas is not None and off_sigmas > bound,
+            )
+        )
+    return results
+
+
+def unused(measurements: Measurements, used: Sequence[MeasurementResult]) -> list[MeasurementResult]:
+    """Those whose ends lie in different components."""
+    known = {(result.kind, result.a, result.b) for result in used}
+    told = _told(measurements.frame, measurements.starts, measurements.distances)
+    return [result for result in told if (result.kind, result.a, result.b) not in known]
+
+
+def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
+    """Of those that contradict the map, and those that are not used."""
+    warnings = []
+    for result in results:
+        option = f"--{result.kind} {result.b if result.kind == 'start' else f'{result.a},{result.b}'}"
+        if result.component is None or result.in_map is None:
+            warnings.append(f"{option}: not used, since its ends are in different components of the map")
+        elif result.contradicts:
+            warnings.append(
+                f"{option}: measured {_figures(result.measured)}, and everything else says otherwise by "
+                f"{result.off_sigmas:.1f} sigma (the map, which gives in to both, has {_figures(result.in_map)}): "
+                "a slip of the tape or of the pen, sigmas too small, or a map whose scale is wrong"
+            )
+    return warnings
+
+
+def _usable(graph: Graph, measurements: Measurements) -> tuple[tuple[MeasuredStart, ...], tuple[MeasuredDistance, ...]]:
+    names, known = _names(graph), {*_names(graph), *_first_instances(graph)}
+    has_frame = names[0] == measurements.frame
+    starts = tuple(start for start in measurements.starts if has_frame and start.run in names)
+    return starts, tuple(each for each in measurements.distances if each.a in known and each.b in known)
+
+
+def _first_instances(graph: Graph) -> dict[str | TagKey, int]:
+    """The tag of each id; of one that hangs in several places the first."""
+    return {tag.whole: i for i, tag in reversed(list(enumerate(graph.tags)))}
+
+
+def _names(graph: Graph) -> list[str]:
+    """Of the chains: where a run has several, the first has the run's own."""
+    return [chain.name for chain in graph.chains]
+
+
+def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:
+    """How far a measurement lies from what all others say, in sigmas, and how far chance may put it.
+
+    With S = J H^-1 J^T the share of the residual that the estimate took, r^T (I - S)^-1 r is that of a prediction
+    without the measurement (Cook and Weisberg, "Residuals and influence in regression", 1982): chi-square.
+    """
+    columns = np.concatenate([columns[m] for columns, _ in kind.blocks])
+    jacobian = np.concatenate([derivative[m] for _, derivative in kind.blocks], axis=1)
+    residual = kind.residual[m]
+    left = np.eye(len(residual)) - jacobian @ solution.covariance(columns) @ jacobian.T
+    share, ways = np.linalg.eigh(left)
+    checked = share > _CHECKED
+    if not checked.any():
+        return None, np.inf
+    square = float(((ways.T @ residual)[checked] ** 2 / share[checked]).sum())
+    return square**0.5, float(chi2.isf(_FALSE_ALARM, int(checked.sum()))) ** 0.5
+
+
+def _lengths(distances: DistanceFactors, state: State) -> FloatArray:
+    """(D, 1) as the map has them."""
+    place_a, place_b = ends_of(distances, state)
+    lengths: FloatArray = np.linalg.norm(place_b - place_a, axis=1)[:, None]
+    return lengths
+
+
+def _told(
+    frame: str, starts: Sequence[MeasuredStart], distances: Sequence[MeasuredDistance]
+) -> list[MeasurementResult]:
+    """As they were measured."""
+    told = [MeasurementResult("start", frame, each.run, each.T_map_start, each.sigma, None) for each in starts]
+    for each in distances:
+        a, b = (end if isinstance(end, str) else f"{end.family}:{end.tag_id}" for end in (each.a, each.b))
+        told.append(MeasurementResult("distance", a, b, np.array([each.distance_m]), np.array([each.sigma_m]), None))
+    return told
+
+
+def _figures(values: FloatArray) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.3f} m"
+    return f"({values[0]:.3f}, {values[1]:.3f}) m, {values[2]:.4f} rad"

@@ -1,0 +1,67 @@
+"""What a map holds only weakly or not at all, in words: tags seen once, runs that nothing ties, rounding."""
+
+from collections import Counter
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.measurements import TagKey
+from groundsbot.offline.sam import MAX_RELATIVE_ERROR, Graph, Solution
+
+_MOST_NAMED: Final = 12
+
+
+def weak_parts(graph: Graph, solution: Solution) -> list[str]:
+    """Sentences about one component."""
+    return [*_untied(graph, solution), *_seen_once(graph), *_rounded(graph, solution)]
+
+
+def _untied(graph: Graph, solution: Solution) -> list[str]:
+    """Of chains that can still move without any measurement noticing."""
+    seen_by = Counter(tag for chain in graph.chains for tag in chain.tags)
+    sentences = []
+    for index in solution.untied.chains:
+        chain = graph.chains[index]
+        shared = [tag for tag in chain.tags if seen_by[tag] > 1]
+        if not shared:
+            reason = "shares no tag with the others"
+        elif len(shared) == 1:
+            reason = f"shares only tag {shared[0].tag_id} with the others, about which it can turn"
+        else:
+            reason = f"hangs on the others by {_listed(shared)} alone, which leaves it free to move"
+        sentences.append(
+            f"{chain.name} {reason}; its place in this map means nothing, nor do those of tags it alone saw"
+        )
+    return sentences
+
+
+def _seen_once(graph: Graph) -> list[str]:
+    """Of tags that rest on a single reading."""
+    readings = graph.problem.readings
+    once: IntArray = np.flatnonzero(graph.n_readings()[readings.tag] == 1)
+    if not len(once):
+        return []
+    first, second = readings.value[once].T
+    range_m = np.where(readings.polar[once], first, np.hypot(first, second))
+    chain = np.searchsorted(graph.first_pose, readings.pose[once], side="right") - 1
+    names = [graph.chains[c].name for c in chain]
+    tags = [graph.tags[t].tag_id for t in readings.tag[once]]
+    if len(once) == 1:
+        return [f"tag {tags[0]} was seen once, from {range_m[0]:.1f} m, by {names[0]}; nothing checks its place"]
+    named = [f"{tag} (from {far:.1f} m, {name})" for tag, far, name in zip(tags, range_m, names, strict=True)]
+    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    return [f"tags {', '.join(named[:_MOST_NAMED])}{more} were seen once each; nothing checks their places"]
+
+
+def _rounded(graph: Graph, solution: Solution) -> list[str]:
+    """Of a solve that double precision does not carry."""
+    error = solution.relative_error()
+    if error <= MAX_RELATIVE_ERROR:
+        return []
+    reason = "sigmas of very different size, or a long drive past too few tags"
+    return [f"{graph.chains[0].name}: rounding spoils the covariances of its map ({reason}); do not trust them"]
+
+
+def _listed(tags: list[TagKey]) -> str:
+    return "tags " + ", ".join(str(tag.tag_id) for tag in tags)

@@ -1,0 +1,9 @@
+"""Recordings of others made into run logs: CSV folders and ROS bags.
+
+In: a folder or a bag, and what the user says of the robot. Out: a run log that `map` reads like a recorded one. In the
+paper: its recorded data, which can be imported as CSV.
+"""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,0 +1,157 @@
+"""One pass over a bag: odometry, tags and transforms with their times, all but the pictures."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from groundsbot.calib.foundation import counted
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.importing.bags.frames import FixedFrames
+from groundsbot.offline.importing.bags.reader import Bag, BagMessage, BagTopic
+from groundsbot.offline.importing.bags.tags import Look, read_look, told_left_out
+from groundsbot.offline.importing.bags.topics import (
+    APRILTAG_MSGS,
+    CAMERA_INFO,
+    TAGS,
+    TRANSFORMS,
+    BagOptions,
+    ChosenTopics,
+)
+
+_NS_PER_S: Final = 1_000_000_000
+Row = TypeVar("Row")
+
+
+@dataclass
+class BagContent:
+    """What a bag says.
+
+    Attributes:
+        frames: by the fixed transforms.
+        odometry: (stamp in ns, message), rising.
+        looks: of the detections, rising.
+        sent_transforms: (stamp in ns, TransformStamped) that may be tags' places.
+        camera_infos: the first message of each such topic.
+        left_out: detections, counted by why.
+        remarks: what a person should know.
+    """
+
+    frames: FixedFrames
+    odometry: list[tuple[int, Any]] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+    sent_transforms: list[tuple[int, Any]] = field(default_factory=list)
+    camera_infos: dict[str, Any] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def camera_frames(self) -> set[str]:
+        """The frames that detections name."""
+        return {look.frame for look in self.looks if look.sightings}
+
+    @property
+    def base_frame(self) -> str:
+        """The frame that odometry says it is of; empty where it does not say."""
+        return str(getattr(self.odometry[0][1], "child_frame_id", ""))
+
+
+def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: str) -> BagContent:
+    """Reads all but the pictures.
+
+    Args:
+        bag: open.
+        chosen: topics of it.
+        options: of the command line.
+        family: of the tags where messages do not say.
+
+    Raises:
+        OfflineError: the bag is damaged, its messages have no times, or its detections no tags.
+    """
+    content, clock = BagContent(FixedFrames(str(bag.path))), BagClock(bag.path, options)
+    topics = [chosen.odometry, *chosen.transforms, *chosen.camera_infos]
+    topics += [] if chosen.has_pictures else [chosen.tags]
+    for each in bag.messages(topics):
+        if each.msgtype in TRANSFORMS:
+            content.frames.add(each.content)
+            if chosen.tags.msgtype == APRILTAG_MSGS:
+                content.sent_transforms += [(_header_ns(t.header), t) for t in each.content.transforms]
+        elif each.msgtype == CAMERA_INFO:
+            content.camera_infos.setdefault(each.topic, each.content)
+        elif (stamp_ns := clock.stamp_ns(each)) is None:
+            continue
+        elif each.msgtype in TAGS:
+            look, left_out = read_look(each.msgtype, each.content, stamp_ns, family)
+            content.looks.append(look)
+            content.left_out += left_out
+        else:
+            content.odometry.append((stamp_ns, each.content))
+    clock.check([chosen.odometry] if chosen.has_pictures else [chosen.odometry, chosen.tags])
+    content.odometry, n_odometry = _each_time_once(content.odometry, _odometry_keys(content.odometry))
+    content.looks, n_looks = _each_time_once(content.looks, [(look.stamp_ns,) for look in content.looks])
+    if not chosen.has_pictures and not any(look.sightings for look in content.looks):
+        told = "; ".join(
+            [f"no tag was seen in {counted(len(content.looks), 'picture')}", *told_left_out(content.left_out)]
+        )
+        raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
+    content.remarks = clock.remarks()
+    for n, topic in ((n_odometry, chosen.odometry), (n_looks, chosen.tags)):
+        if n:
+            content.remarks.append(f"{topic.name}: {counted(n, 'message')} left out: their times were there already")
+    return content
+
+
+class BagClock:
+    """The times of messages: when they were measured, not when the bag received them, unless that is asked for."""
+
+    def __init__(self, path: Path, options: BagOptions) -> None:
+        """Knows no message yet."""
+        self._path = path
+        self._by_receiving = options.receive_times
+        self._stamped: Counter[str] = Counter()
+        self._without: Counter[str] = Counter()
+
+    def stamp_ns(self, message: BagMessage) -> int | None:
+        """Of one message; None where its header says nothing."""
+        stamp_ns = message.received_ns if self._by_receiving else _header_ns(message.content.header)
+        if stamp_ns <= 0:
+            self._without[message.topic] += 1
+            return None
+        self._stamped[message.topic] += 1
+        return stamp_ns
+
+    def check(self, topics: list[BagTopic]) -> None:
+        """Looks whether these topics have times.
+
+        Raises:
+            OfflineError: one has none.
+        """
+        for topic in topics:
+            if not self._stamped[topic.name]:
+                raise OfflineError(
+                    f"{self._path}: {topic.name}: the header stamps of {counted(self._without[topic.name], 'message')} "
+                    "are 0; give --receive-times for the less exact times at which they were received"
+                )
+
+    def remarks(self) -> list[str]:
+        """For a person."""
+        said = ["times are those at which the bag received the messages"] if self._by_receiving else []
+        return said + [
+            f"{topic}: {counted(n, 'message')} left out: their header stamps are 0"
+            for topic, n in self._without.items()
+        ]
+
+
+def _each_time_once(rows: list[Row], keys: list[tuple[Any, ...]]) -> tuple[list[Row], int]:
+    """Rows in order of their keys, which begin with the time; the first of each key, and how many others there were."""
+    first = dict(zip(reversed(keys), reversed(rows), strict=True))
+    return [first[key] for key in sorted(first)], len(rows) - len(first)
+
+
+def _odometry_keys(odometry: list[tuple[int, Any]]) -> list[tuple[Any, ...]]:
+    """Time, and the joints: each may come in messages of its own."""
+    return [(stamp_ns, *getattr(message, "name", ())) for stamp_ns, message in odometry]
+
+
+def _header_ns(header: Any) -> int:  # noqa: ANN401 - made by rosbags
+    return int(header.stamp.sec) * _NS_PER_S + int(header.stamp.nanosec)

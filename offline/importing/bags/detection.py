@@ -1,0 +1,69 @@
+"""Looks for tags in the pictures of a bag."""
+
+import os
+from collections.abc import Iterator
+
+from groundsbot.calib.camera import CameraModel
+from groundsbot.calib.foundation import counted
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import Progress
+from groundsbot.offline.importing.bags.content import BagClock
+from groundsbot.offline.importing.bags.pictures import picture_of
+from groundsbot.offline.importing.bags.reader import Bag, BagTopic
+from groundsbot.offline.importing.bags.topics import BagOptions
+from groundsbot.offline.importing.run_writer import Entry
+from groundsbot.offline.logs import detectors, in_parallel
+from groundsbot.onboard.detection import DetectorSettings, detections_message
+from groundsbot.onboard.log import Picture, StampSource
+
+
+def detect_in_bag(
+    bag: Bag, topic: BagTopic, camera: CameraModel, robot: Robot, options: BagOptions, progress: Progress
+) -> tuple[list[Entry], list[str]]:
+    """Messages for `/tags/detections`, in order of time, and what a person should know.
+
+    Args:
+        bag: open.
+        topic: of the pictures.
+        camera: that took them.
+        robot: its families of tags are looked for.
+        options: of the command line.
+        progress: told how many pictures have been looked at.
+
+    Raises:
+        GroundsbotError: the bag is damaged, pictures have no times, are of another size than the camera's or cannot be
+            read, or no detector is installed.
+    """
+    clock = BagClock(bag.path, options)
+    families = tuple(robot.recorder.families)
+    settings = DetectorSettings(families, robot.recorder.detector, quad_decimate=1.0, camera=camera)
+    found: dict[int, Entry] = {}
+    unusable, n_processes = [], os.cpu_count() or 1
+    with detectors(settings, n_processes) as (detect, library, described):
+        pictures = _pictures(bag, topic, clock)
+        for n_done, (stamp_ns, result) in enumerate(in_parallel(pictures, detect, n_processes), start=1):
+            progress("looking for tags", n_done, topic.n_messages)
+            if result.error is not None:
+                unusable.append(result.error)
+                continue
+            if result.size_px != (camera.width_px, camera.height_px):
+                raise OfflineError(
+                    f"{bag.path}: {topic.name}: a picture is {result.size_px[0]}x{result.size_px[1]} px, the camera's "
+                    f"calibration is for {camera.width_px}x{camera.height_px} px; choose the one that belongs to the "
+                    "pictures with --camera-info-topic"
+                )
+            source = StampSource.STAMP_SOURCE_UNSPECIFIED
+            message = detections_message(result.detections, result.size_px, stamp_ns, source, 0, library, described)
+            found[stamp_ns] = (stamp_ns, "/tags/detections", message)
+    clock.check([topic])
+    if not found:
+        raise OfflineError(f"{bag.path}: {topic.name}: no picture is of use: {unusable[0]}; name another topic")
+    told = [f"{counted(len(unusable), 'picture')} of no use, the first since: {unusable[0]}"] if unusable else []
+    return [found[stamp] for stamp in sorted(found)], [*clock.remarks(), *told]
+
+
+def _pictures(bag: Bag, topic: BagTopic, clock: BagClock) -> Iterator[tuple[int, Picture]]:
+    for each in bag.messages([topic]):
+        if (stamp_ns := clock.stamp_ns(each)) is not None:
+            yield stamp_ns, picture_of(f"{bag.path}: {topic.name}", each.msgtype, each.content)

@@ -1,0 +1,97 @@
+"""Where the camera of a bag sits: by its fixed transforms, unless the command line or robot.yaml say."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import degrees, radians
+from pathlib import Path
+from typing import Final
+
+from groundsbot.calib.robot import Mount
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.importing.bags.frames import FixedFrames, frame_name, mount_of
+from groundsbot.offline.importing.bags.topics import BagOptions
+from groundsbot.offline.importing.robot import ImportOptions
+
+# ROS's names for the base, in the order of preference, where the odometry names none.
+_BASES: Final = ("base_link", "base_footprint")
+# A camera that looks farther up or down than this is more often a frame that is not the optical one.
+_STEEP_RAD: Final = radians(60.0)
+
+
+@dataclass(frozen=True)
+class FoundMount:
+    """How a camera and its robot hang together.
+
+    Attributes:
+        mount: by tf; None where something else tells.
+        in_camera: whether what the detector says is about the camera; else it is about the base itself.
+        remarks: what a person should know.
+    """
+
+    mount: Mount | None
+    in_camera: bool
+    remarks: tuple[str, ...]
+
+
+def find_mount(
+    path: Path,
+    frames: FixedFrames,
+    base_of_odometry: str,
+    camera_frames: Iterable[str],
+    options: ImportOptions,
+    bag_options: BagOptions,
+) -> FoundMount:
+    """Finds the way from the camera's frame to the base's.
+
+    Args:
+        path: names the bag in errors.
+        frames: of the bag.
+        base_of_odometry: the frame that odometry is of; may be empty.
+        camera_frames: that detections or pictures name.
+        options: of the command line.
+        bag_options: of the command line.
+
+    Raises:
+        OfflineError: several cameras, or tf does not join the frames.
+    """
+    camera = _the_camera(path, set(camera_frames), bag_options)
+    base = _the_base(frames, base_of_odometry, bag_options)
+    if camera == base:
+        return FoundMount(None, False, (f"tags are seen from {base!r}, so no mount is needed",))
+    if options.robot is not None:
+        return FoundMount(None, True, ())
+    if not frames.joins(base, camera):
+        if options.has_mount:
+            return FoundMount(None, True, (f"tf does not join {camera!r} to {base!r}; roll and pitch are taken as 0",))
+        moving = [each for each in (frames.moving_near(camera), frames.moving_near(base)) if each is not None]
+        why = f", since {moving[0]!r} moves on its parent" if moving else ""
+        raise OfflineError(
+            f"{path}: no fixed transforms join the camera's frame {camera!r} to the base {base!r}{why}; record "
+            "/tf_static, or name frames with --camera-frame and --base-frame, or give --camera-x-m, --camera-y-m and "
+            "--camera-yaw-deg, or --robot"
+        )
+    mount = mount_of(frames.transform(base, camera))
+    remarks = [f"tf from {base!r} to {camera!r} says where the camera sits"]
+    if abs(mount.pitch_rad) > _STEEP_RAD:
+        steep = f"the camera's frame {camera!r} looks {abs(degrees(mount.pitch_rad)):.0f} deg"
+        remarks.append(f"{steep} {'down' if mount.pitch_rad > 0 else 'up'}; is it the optical one? see --camera-frame")
+    return FoundMount(mount, True, tuple(remarks))
+
+
+def _the_camera(path: Path, named: set[str], options: BagOptions) -> str:
+    if options.camera_frame is not None:
+        return frame_name(options.camera_frame)
+    if len(named) > 1:
+        raise OfflineError(
+            f"{path}: detections come from {len(named)} frames, {', '.join(sorted(named))}, but a run has one camera; "
+            "import a topic of one camera, or give --camera-frame if all are the same"
+        )
+    return next(iter(named), "")
+
+
+def _the_base(frames: FixedFrames, of_odometry: str, options: BagOptions) -> str:
+    if options.base_frame is not None:
+        return frame_name(options.base_frame)
+    if of_odometry:
+        return frame_name(of_odometry)
+    return next((each for each in _BASES if frames.knows(each)), _BASES[0])

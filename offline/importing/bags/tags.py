@@ -1,0 +1,162 @@
+"""Detections of tags by three ROS packages, each in its own form -> one form with our corners.
+
+- apriltag_ros (ROS 1): no corners; poses, x to the face's right, y to its top, z out of it, as ours.
+- apriltag_msgs (ROS 2): corners as the AprilTag library gives them: from the bottom left against the clock, the first
+  pixel's corner being (0, 0). Poses, if any, in tf.
+- isaac_ros_apriltag: corners from the top left with the clock; pixels are taken to be the AprilTag library's too.
+  Poses, whose axes are not used.
+
+After the sources of AprilRobotics/apriltag_ros (common_functions.cpp), christianrauch/apriltag_ros (AprilTagNode.cpp)
+and NVIDIA-ISAAC-ROS/isaac_ros_apriltag (apriltag_node.cpp, which turns VPI's corners, those of the AprilTag library,
+round). All three look for tags in rectified pictures.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.calib.tags import families, family_size
+from groundsbot.offline.importing.bags.frames import frame_name
+from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, APRILTAG_ROS
+
+# OpenCV's pixels, ours, have their centres at whole numbers.
+_PIXEL_CENTRE_PX: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One tag in one picture, by its corners, its place, or both.
+
+    Attributes:
+        corners_px: (4, 2) in the order of groundsbot.proto.
+        position_m: (3,) of its centre in `Look.frame`.
+        quaternion_xyzw: of the tag as groundsbot.proto has it, in `Look.frame`.
+        covariance: (3, 3) of the position, as the message says, sane or not.
+    """
+
+    family: str
+    tag_id: int
+    hamming: int = 0
+    decision_margin: float = 0.0
+    corners_px: FloatArray | None = None
+    position_m: FloatArray | None = None
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Look:
+    """One picture's tags. `frame` is the camera's optical frame."""
+
+    stamp_ns: int
+    frame: str
+    sightings: tuple[Sighting, ...]
+
+
+def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[Look, Counter[str]]:  # noqa: ANN401 - made by rosbags
+    """One message of detections.
+
+    Args:
+        msgtype: one of `bag_topics.TAGS`.
+        content: the message.
+        stamp_ns: its time.
+        family: of the tags, where the message does not say.
+
+    Returns:
+        The look, and what had to be left out of it, counted by why.
+    """
+    frame, found, left_out = frame_name(content.header.frame_id), [], Counter[str]()
+    for detection in content.detections:
+        if msgtype == APRILTAG_ROS:
+            if len(detection.id) != 1:
+                left_out["a bundle of several tags"] += 1
+                continue
+            frame = frame_name(detection.pose.header.frame_id) or frame
+            sighting = _with_pose(Sighting(family, int(detection.id[0])), detection.pose.pose, with_rotation=True)
+        elif msgtype == APRILTAG_MSGS:
+            sighting = Sighting(
+                _family(detection.family),
+                detection.id,
+                detection.hamming,
+                detection.decision_margin,
+                _corners(detection.corners)[::-1] - _PIXEL_CENTRE_PX,
+            )
+        else:
+            sighting = Sighting(
+                _family(detection.family), detection.id, corners_px=_corners(detection.corners) - _PIXEL_CENTRE_PX
+            )
+            sighting = _with_pose(sighting, detection.pose.pose, with_rotation=False)
+        why_not = _why_not(sighting)
+        if why_not is None:
+            found.append(sighting)
+        else:
+            left_out[why_not] += 1
+    return Look(stamp_ns, frame, tuple(found)), left_out
+
+
+def told_left_out(left_out: Mapping[str, int]) -> list[str]:
+    """For a person."""
+    return [f"{counted(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
+
+
+def with_tf_positions(looks: Sequence[Look], transforms: Iterable[tuple[int, Any]]) -> list[Look]:
+    """Looks whose tags have the places that the detector sent as tf: same stamp, same camera, a name with their number.
+
+    Args:
+        looks: without positions.
+        transforms: (stamp in ns, TransformStamped) of the bag.
+    """
+    places: dict[tuple[int, str, int], FloatArray] = {}
+    for stamp_ns, each in transforms:
+        number = re.search(r"(?:^|\D)(\d+)$", each.child_frame_id)
+        if number is not None:
+            t = each.transform.translation
+            key = (stamp_ns, frame_name(each.header.frame_id), int(number[1]))
+            places[key] = np.array([t.x, t.y, t.z])
+    return [
+        replace(
+            look,
+            sightings=tuple(
+                replace(each, position_m=places.get((look.stamp_ns, look.frame, each.tag_id)))
+                for each in look.sightings
+            ),
+        )
+        for look in looks
+    ]
+
+
+def _with_pose(sighting: Sighting, pose_with_covariance: Any, *, with_rotation: bool) -> Sighting:  # noqa: ANN401
+    p, q = pose_with_covariance.pose.position, pose_with_covariance.pose.orientation
+    return replace(
+        sighting,
+        position_m=np.array([p.x, p.y, p.z]),
+        quaternion_xyzw=(q.x, q.y, q.z, q.w) if with_rotation else None,
+        covariance=np.reshape(pose_with_covariance.covariance, (6, 6))[:3, :3],
+    )
+
+
+def _corners(corners: Any) -> FloatArray:  # noqa: ANN401 - eight numbers in old definitions, four points in new ones
+    if isinstance(corners, np.ndarray):
+        return np.array(corners, dtype=np.float64).reshape(4, 2)
+    return np.array([[corner.x, corner.y] for corner in corners], dtype=np.float64)
+
+
+def _family(name: str) -> str:
+    """As AprilTag spells it; some leave `tag` away."""
+    return name if name.startswith("tag") else f"tag{name}"
+
+
+def _why_not(sighting: Sighting) -> str | None:
+    if sighting.family not in families():
+        return f"family {sighting.family!r} is not known"
+    if not 0 <= sighting.tag_id < family_size(sighting.family):
+        return f"{sighting.family} has no tag {sighting.tag_id}"
+    numbers = [each for each in (sighting.corners_px, sighting.position_m) if each is not None]
+    if not all(np.isfinite(each).all() for each in numbers):
+        return "its numbers are none"
+    return None

@@ -1,0 +1,1 @@
+"""CSV folders, the paper's headerless pair included, to run logs."""

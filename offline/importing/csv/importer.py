@@ -1,0 +1,162 @@
+"""A folder of CSV files -> a run log that `map` reads like a recorded one."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from heapq import merge
+from importlib import metadata
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+from groundsbot.calib.foundation import counted
+from groundsbot.calib.tags import families, family_size
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.importing.csv.forms import (
+    Observation,
+    WheelPath,
+    read_observations,
+    read_odometry,
+    read_paper_landmarks,
+    read_paper_odometry,
+    refuse_tick_options,
+)
+from groundsbot.offline.importing.robot import ImportOptions, describe_robot, safe_name, wheel_scale
+from groundsbot.offline.importing.run_writer import Entry, ImportReport, check_output, write_run
+from groundsbot.onboard.log import PlanarOdometry, RunInfo, TagObservation, TagObservations
+
+_HEADER_PAIR: Final = ("odometry.csv", "observations.csv")
+_PAPER_PAIR: Final = ("odom.csv", "landmarks.csv")
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """One folder's content, whatever its form."""
+
+    wheels: WheelPath
+    n_odometry: int
+    observations: list[Observation]
+    in_camera: bool
+    remarks: list[str]
+
+
+def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportReport:
+    """Writes `output/<run_id>/0000.core.mcap` from a folder of CSV files; the same bytes for the same input.
+
+    Nothing is written before all of the input has been checked, and the run folder appears whole or not at all.
+
+    Raises:
+        GroundsbotError: one line that names file, line, column, value and what to do.
+    """
+    if not folder.is_dir():
+        raise OfflineError(f"{folder}: is no folder; give one with {_pairs()}")
+    run_id = options.run_id or safe_name(folder)
+    run_folder = output / run_id
+    check_output(output, run_folder)
+    if options.tag_family not in families():
+        raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
+    drive = _read_drive(folder, options)
+    robot, robot_yaml, robot_remarks = describe_robot(folder, options, drive.in_camera)
+    info = RunInfo(
+        run_id=run_id,
+        robot_id=robot.robot_id,
+        software_version=metadata.version("groundsbot"),
+        robot_yaml=robot_yaml,
+    )
+    write_run(run_folder, {"/run": info}, _messages(drive, options.tag_family))
+    return ImportReport(
+        run_folder=run_folder,
+        run_id=run_id,
+        robot_id=robot.robot_id,
+        n_odometry=drive.n_odometry,
+        duration_s=(drive.wheels.stamps_ns[-1] - drive.wheels.stamps_ns[0]) * 1e-9,
+        distance_m=drive.wheels.distance_m,
+        n_observations=len(drive.observations),
+        n_tags=len({observation.tag_id for observation in drive.observations}),
+        remarks=(*drive.remarks, *robot_remarks),
+    )
+
+
+def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
+    pairs = [pair for pair in (_HEADER_PAIR, _PAPER_PAIR) if any((folder / name).is_file() for name in pair)]
+    if len(pairs) != 1:
+        found = "both pairs" if pairs else "neither"
+        raise OfflineError(f"{folder}: holds {found} of {_pairs()}; give a folder with one pair")
+    for name in pairs[0]:
+        if not (folder / name).is_file():
+            raise OfflineError(f"{folder / name}: is missing beside the other file of its pair; add it")
+    drive = _paper_drive(folder, options) if pairs[0] == _PAPER_PAIR else _header_drive(folder, options)
+    outside = _n_outside(drive)
+    if outside and outside == len(drive.observations):
+        raise OfflineError(
+            f"{folder}: none of {counted(outside, 'observation')} lies within the odometry's time; "
+            "are both files on one clock?"
+        )
+    if outside:
+        drive.remarks.append(f"{counted(outside, 'observation')} outside the odometry's time: a map cannot place them")
+    return drive
+
+
+def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
+    if options.state_rate_hz is not None:
+        raise OfflineError(f"{folder}: --state-rate-hz is for odom.csv; odometry.csv holds its own times, leave it out")
+    wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options))
+    observations = read_observations(folder / _HEADER_PAIR[1], family_size(options.tag_family) - 1)
+    where = "the camera's frame" if options.has_mount else "base (no --camera option given)"
+    remarks = [f"odometry.csv: {form}", f"observations.csv: taken to be in {where}, y to the left"]
+    return _Drive(wheels, len(wheels.stamps_ns), observations, options.has_mount, remarks)
+
+
+def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
+    rate_hz = options.state_rate_hz
+    if rate_hz is None:
+        raise OfflineError(
+            f"{folder / _PAPER_PAIR[0]}: holds no times; give --state-rate-hz (the paper's authors took 4.2)"
+        )
+    refuse_tick_options(folder / _PAPER_PAIR[0], options.tick_flags)
+    wheels = read_paper_odometry(folder / _PAPER_PAIR[0], rate_hz)
+    n_states = len(wheels.stamps_ns) - 1
+    observations = read_paper_landmarks(folder / _PAPER_PAIR[1], n_states, rate_hz, family_size(options.tag_family) - 1)
+    remarks = [
+        f"odom.csv: the paper's form, {rate_hz:g} states a second",
+        "landmarks.csv: the paper's form, in the camera's frame, y turned from right to left",
+    ]
+    return _Drive(wheels, n_states, observations, True, remarks)
+
+
+def _n_outside(drive: _Drive) -> int:
+    first, last = drive.wheels.stamps_ns[0], drive.wheels.stamps_ns[-1]
+    return sum(not first <= observation.stamp_ns <= last for observation in drive.observations)
+
+
+def _messages(drive: _Drive, family: str) -> Iterator[Entry]:
+    """(stamp, topic, message) in order of time; at one time the odometry first."""
+    frame = "camera_planar" if drive.in_camera else "base"
+    return merge(_odometry(drive.wheels), _observations(drive.observations, frame, family), key=lambda each: each[0])
+
+
+def _odometry(wheels: WheelPath) -> Iterator[Entry]:
+    for stamp_ns, left_m, right_m in zip(wheels.stamps_ns, wheels.left_m, wheels.right_m, strict=True):
+        distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=right_m)
+        yield stamp_ns, "/odometry", PlanarOdometry(stamp_ns=stamp_ns, wheels=distances)
+
+
+def _observations(observations: list[Observation], frame: str, family: str) -> Iterator[Entry]:
+    for stamp_ns, group in groupby(observations, key=lambda observation: observation.stamp_ns):
+        tags = [_tag_observation(observation, family) for observation in group]
+        yield stamp_ns, "/tags/observations", TagObservations(stamp_ns=stamp_ns, frame=frame, observations=tags)
+
+
+def _tag_observation(observation: Observation, family: str) -> TagObservation:
+    message = TagObservation(family=family, tag_id=observation.tag_id)
+    if observation.kind == "polar":
+        message.polar.range_m, message.polar.bearing_rad = observation.first, observation.second
+    else:
+        message.cartesian.x_m, message.cartesian.y_m = observation.first, observation.second
+    if observation.sigmas is not None:
+        sigma_first, sigma_second = observation.sigmas
+        message.covariance.extend([sigma_first**2, 0.0, 0.0, sigma_second**2])
+    return message
+
+
+def _pairs() -> str:
+    return f"{' + '.join(_HEADER_PAIR)} or {' + '.join(_PAPER_PAIR)}"

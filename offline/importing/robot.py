@@ -1,0 +1,220 @@
+"""What is known of an imported run's robot: from the command line, from a robot.yaml, or said to be unknown."""
+
+import re
+from dataclasses import dataclass
+from math import degrees, isfinite, pi, radians
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from groundsbot.calib.robot import Mount, Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.offline.errors import OfflineError
+
+
+@dataclass(frozen=True)
+class WheelScale:
+    """What turns ticks or speeds into wheel distances; None where the command line did not say."""
+
+    track_m: float | None
+    metres_per_tick_left: float | None
+    metres_per_tick_right: float | None
+    tick_flags: tuple[str, ...] = ()  # options of the command line that tell of ticks
+
+
+# Somebody else's CSV seldom says where the camera sat; a robot of this kind holds it within these of its axle's middle.
+UNKNOWN_MOUNT_SIGMA_X_M: Final = 0.2
+UNKNOWN_MOUNT_SIGMA_Y_M: Final = 0.1
+UNKNOWN_MOUNT_SIGMA_YAW_DEG: Final = 2.0
+# The log holds metres, so radius and ticks are not used; robot.yaml must name some.
+_NOMINAL_RADIUS_M: Final = 0.1
+_NOMINAL_TICKS_PER_TURN: Final = 1000
+_NOMINAL_TRACK_M: Final = 0.5  # where odometry holds poses, nothing but the look of robot.yaml depends on it
+# Fewer states a second tell no path, more no robot has; and stamps are whole nanoseconds that 63 bits hold.
+_STATE_RATES_HZ: Final = (0.1, 1000.0)
+_SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the command line says of the run; None where it says nothing."""
+
+    run_id: str | None = None
+    robot_id: str | None = None
+    robot: Path | None = None
+    track_width_m: float | None = None
+    state_rate_hz: float | None = None
+    wheel_radius_m: float | None = None
+    ticks_per_turn: float | None = None
+    camera_x_m: float | None = None
+    camera_y_m: float | None = None
+    camera_yaw_deg: float | None = None
+    tag_family: str = "tag36h11"
+
+    def __post_init__(self) -> None:
+        for option in ("track_width_m", "state_rate_hz", "wheel_radius_m", "ticks_per_turn"):
+            self._check_number(option, positive=True)
+        least_hz, most_hz = _STATE_RATES_HZ
+        if self.state_rate_hz is not None and not least_hz <= self.state_rate_hz <= most_hz:
+            raise OfflineError(
+                f"--state-rate-hz is {self.state_rate_hz}, must be {least_hz:g} to {most_hz:g} states a second"
+            )
+        for option in ("camera_x_m", "camera_y_m", "camera_yaw_deg"):
+            self._check_number(option, positive=False)
+        for option in ("run_id", "robot_id"):
+            value = getattr(self, option)
+            if value is not None and not _SAFE_NAME.fullmatch(value):
+                raise OfflineError(
+                    f"{_flag(option)} is {value!r}; it may hold letters, digits, dot, dash and underscore, "
+                    "begins with a letter or digit and has at most 64 of them"
+                )
+
+    def _check_number(self, option: str, *, positive: bool) -> None:
+        value = getattr(self, option)
+        if value is None:
+            return
+        if not isfinite(value) or (positive and value <= 0):
+            raise OfflineError(f"{_flag(option)} is {value}, must be {'above 0' if positive else 'finite'}; correct it")
+
+    @property
+    def has_mount(self) -> bool:
+        """Whether any part of the camera's place was given."""
+        return any(value is not None for value in (self.camera_x_m, self.camera_y_m, self.camera_yaw_deg))
+
+    @property
+    def tick_flags(self) -> tuple[str, ...]:
+        """Those given that tell how long a tick is."""
+        return tuple(_flag(o) for o in ("wheel_radius_m", "ticks_per_turn") if getattr(self, o) is not None)
+
+
+@dataclass(frozen=True)
+class KnownRobot:
+    """What the recording itself tells of its robot.
+
+    Attributes:
+        mount: where its camera sits.
+        family: of its tags.
+        tag_size_m: of them.
+        needs_track: whether the distance between the wheels matters.
+    """
+
+    mount: Mount | None = None
+    family: str = "tag36h11"
+    tag_size_m: float | None = None
+    needs_track: bool = True
+
+
+def safe_name(recording: Path) -> str:
+    """A folder's name, or a file's without its ending; all but letters, digits, dot, dash, underscore become dashes."""
+    path = recording.resolve()
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem if path.is_file() else path.name).lstrip("._-")[:64]
+    if not name:
+        raise OfflineError(f"{recording}: a run cannot be named after this; give --run-id and --robot-id")
+    return name
+
+
+def wheel_scale(options: ImportOptions) -> WheelScale:
+    """Lengths of ticks and track: an option wins over robot.yaml."""
+    robot = read_robot_yaml(options.robot) if options.robot else None
+    if robot is None:
+        if options.wheel_radius_m is None or options.ticks_per_turn is None:
+            return WheelScale(options.track_width_m, None, None, options.tick_flags)
+        tick_m = 2 * pi * options.wheel_radius_m / options.ticks_per_turn
+        return WheelScale(options.track_width_m, tick_m, tick_m, options.tick_flags)
+    wheels = robot.wheels.model_copy(update=_given_wheels(options))
+    return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags)
+
+
+def describe_robot(
+    recording: Path, options: ImportOptions, in_camera: bool, known: KnownRobot | None = None
+) -> tuple[Robot, str, list[str]]:
+    """The run's robot, its robot.yaml as text for the log, and what a person should know of it.
+
+    Args:
+        recording: after which the robot is named unless it has a name.
+        options: of the command line.
+        in_camera: whether observations are in the camera's frame, so that its mount matters.
+        known: from the recording; robot.yaml and options win over it.
+
+    Raises:
+        OfflineError: the track width is given nowhere.
+        CalibError: robot.yaml cannot be used.
+    """
+    known = known or KnownRobot()
+    if options.robot is not None:
+        data = read_robot_yaml(options.robot).model_dump()
+        said = f"wheels and mount as in {options.robot}, where no option says otherwise"
+    else:
+        data = _bare_robot(recording, options, known)
+        unknown = [] if known.tag_size_m is not None else ["tag size"]
+        unknown += [] if options.wheel_radius_m is not None else ["wheel radii"]
+        told = f"; {' and '.join(unknown)} unknown" if unknown else ""
+        said = f"robot.yaml made from the options{told}"
+    if options.robot_id is not None:
+        data["robot_id"] = options.robot_id
+    _apply_wheels(data["wheels"], options)
+    remarks = [said]
+    if in_camera:
+        remarks.append(_apply_mount(data["mount"], options))
+    text = yaml.safe_dump(data, sort_keys=False)
+    return parse_robot_yaml(text, f"{recording}: robot.yaml for the log"), text, remarks
+
+
+def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> dict[str, Any]:
+    if options.track_width_m is None and known.needs_track:
+        raise OfflineError(
+            f"{recording}: the distance between the wheels is not known; give --track-width-m or --robot"
+        )
+    bare: dict[str, Any] = {
+        "robot_id": options.robot_id or safe_name(recording),
+        "wheels": {
+            "radius_left_m": _NOMINAL_RADIUS_M,
+            "radius_right_m": _NOMINAL_RADIUS_M,
+            "track_m": options.track_width_m or _NOMINAL_TRACK_M,
+            "ticks_per_turn": _NOMINAL_TICKS_PER_TURN,
+        },
+        "mount": known.mount.model_dump() if known.mount is not None else {},
+    }
+    if known.tag_size_m is not None:
+        bare["tags"] = [{"family": known.family, "default_size_m": known.tag_size_m}]
+        bare["recorder"] = {"families": [known.family]}
+    return bare
+
+
+def _apply_wheels(wheels: dict[str, Any], options: ImportOptions) -> None:
+    for field, value in _given_wheels(options).items():
+        wheels[field] = value
+        wheels.pop(f"{field}_sigma", None)  # that of another value
+
+
+def _given_wheels(options: ImportOptions) -> dict[str, float]:
+    given = {
+        "radius_left_m": options.wheel_radius_m,
+        "radius_right_m": options.wheel_radius_m,
+        "track_m": options.track_width_m,
+        "ticks_per_turn": options.ticks_per_turn,
+    }
+    return {field: value for field, value in given.items() if value is not None}
+
+
+def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
+    """Puts the camera where the options say. What neither they nor anything else tells is 0 with a wide sigma."""
+    yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
+    assumed = []
+    for field, given, sigma, said in (
+        ("x_m", options.camera_x_m, UNKNOWN_MOUNT_SIGMA_X_M, f"x (sigma {UNKNOWN_MOUNT_SIGMA_X_M:g} m)"),
+        ("y_m", options.camera_y_m, UNKNOWN_MOUNT_SIGMA_Y_M, f"y (sigma {UNKNOWN_MOUNT_SIGMA_Y_M:g} m)"),
+        ("yaw_rad", yaw_rad, radians(UNKNOWN_MOUNT_SIGMA_YAW_DEG), f"yaw (sigma {UNKNOWN_MOUNT_SIGMA_YAW_DEG:g} deg)"),
+    ):
+        if given is not None:
+            mount[field] = given
+            mount.pop(f"{field}_sigma", None)  # that of another value
+        elif field not in mount:
+            mount[field], mount[f"{field}_sigma"] = 0.0, sigma
+            assumed.append(said)
+    place = f"camera at x {mount['x_m']:g} m, y {mount['y_m']:g} m, yaw {degrees(mount['yaw_rad']):g} deg of the base"
+    return f"{place}; not given, so taken as 0 with a wide sigma: {', '.join(assumed)}" if assumed else place
+
+
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"

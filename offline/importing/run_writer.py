@@ -1,0 +1,82 @@
+"""What every import writes: one run of one robot, whole or not at all."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from google.protobuf.message import Message
+
+from groundsbot.calib.foundation import counted, folder_written_whole
+from groundsbot.offline.errors import OfflineError
+from groundsbot.onboard.log import LogWriter
+
+Entry = tuple[int, str, Message]  # stamp in ns, topic, message
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What was imported, and what a person should know of it."""
+
+    run_folder: Path
+    run_id: str
+    robot_id: str
+    n_odometry: int  # readings in the file
+    duration_s: float
+    distance_m: float
+    n_observations: int
+    n_tags: int
+    remarks: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        drive = (
+            f"{counted(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
+        )
+        seen = f"{counted(self.n_observations, 'observation')} of {counted(self.n_tags, 'tag')}"
+        return [
+            f"robot {self.robot_id}, run {self.run_id}: {drive}; {seen}",
+            *(f"  {remark}" for remark in self.remarks),
+            f"wrote {self.run_folder}",
+        ]
+
+
+def check_output(output: Path, run_folder: Path) -> None:
+    """`output` may hold other runs and what is hidden, nothing else.
+
+    Raises:
+        OfflineError: it does, or holds this run already.
+    """
+    if output.exists() and not output.is_dir():
+        raise OfflineError(f"{output}: is no folder; give a new or empty one")
+    if run_folder.exists():
+        raise OfflineError(f"{run_folder}: exists already; give another output, another --run-id, or remove it")
+    if not output.exists():
+        return
+    for entry in sorted(output.iterdir()):
+        if entry.name.startswith("."):  # of another import under way, or of a desktop
+            continue
+        if not (entry.is_dir() and any(entry.rglob("*.mcap"))):
+            raise OfflineError(f"{output}: is not empty: {entry.name} is no run's log; give a new or empty folder")
+
+
+def write_run(run_folder: Path, head: Mapping[str, Message], entries: Iterable[Entry]) -> None:
+    """Writes `run_folder/0000.core.mcap`.
+
+    Args:
+        run_folder: made, whole or not at all.
+        head: `/run` and what else stands at the head of each file.
+        entries: in order of time, at least one.
+
+    Raises:
+        GroundsbotError: it cannot be written.
+    """
+    with folder_written_whole(run_folder) as partial:
+        try:
+            rest = iter(entries)
+            first = next(rest)
+            with LogWriter(partial, head, first[0]) as writer:
+                for stamp_ns, topic, message in chain([first], rest):
+                    writer.write(topic, message, stamp_ns, stamp_ns)
+        except OSError as error:
+            raise OfflineError(f"{run_folder}: cannot be written: {error.strerror}; choose another output") from error

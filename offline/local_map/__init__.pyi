@@ -1,0 +1,33 @@
+from .archive import (
+    check_can_be_extended,
+    check_sizes_in_map,
+    kept_of,
+    local_map_of,
+    measured_chain,
+    run_without_log,
+    tags_of,
+    tape_of,
+)
+from .correlated_errors import SharedErrors, fit_shared_errors
+from .goodness_of_fit import FALSE_ALARM, WINDOW_M, Goodness, fitted_windows, freedom_of
+from .local_map import LocalMap, solve_local_map
+
+__all__ = [
+    "FALSE_ALARM",
+    "WINDOW_M",
+    "Goodness",
+    "LocalMap",
+    "SharedErrors",
+    "check_can_be_extended",
+    "check_sizes_in_map",
+    "fit_shared_errors",
+    "fitted_windows",
+    "freedom_of",
+    "kept_of",
+    "local_map_of",
+    "measured_chain",
+    "run_without_log",
+    "solve_local_map",
+    "tags_of",
+    "tape_of",
+]

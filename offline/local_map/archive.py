@@ -1,0 +1,240 @@
+"""Local maps from what a finished map kept of them, and what it keeps.
+
+A kept map is extended by the same steps by which all its runs would be mapped at once: merged, solved, searched for
+tags that do not belong. So it keeps each run's measurements whole (motions and readings, some 1 MB for 100 m) and the
+solution of the run alone, which is where its solve ends again at once. Nothing is marginalised, so nothing stays
+linearised where the smaller map had it; and no log is needed.
+"""
+
+import json
+from dataclasses import asdict, astuple, replace
+from pathlib import Path
+
+import numpy as np
+
+from groundsbot.calib.camera import CameraModel
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.local_map.goodness_of_fit import Goodness
+from groundsbot.offline.local_map.local_map import LocalMap
+from groundsbot.offline.maps import KeptChain, MapResult
+from groundsbot.offline.measurements import (
+    SAME_SIZE_M,
+    Chain,
+    ChainOdometry,
+    CovarianceParts,
+    Detections,
+    Positions,
+    Readings,
+    Run,
+    TagKey,
+    TapeOptions,
+)
+from groundsbot.offline.sam import State, build_graph, solve
+
+
+def kept_of(local_map: LocalMap) -> KeptChain:
+    """What a later run needs of a local map."""
+    chain, state = local_map.chain, local_map.solution.state
+    run, odometry, readings = chain.run, chain.odometry, chain.readings
+    return KeptChain(
+        name=chain.name,
+        run=run.name,
+        log=str(run.log),
+        robot_id=run.robot_id,
+        run_id=run.run_id,
+        robot_json=run.robot.model_dump_json(),
+        camera_json="" if run.camera is None else json.dumps(asdict(run.camera)),
+        log_bytes=run.log_bytes,
+        lost=run.lost,
+        warnings=chain.warnings,
+        run_warnings=run.warnings,
+        stamps_ns=chain.stamps_ns,
+        motion=odometry.motion,
+        motion_covariance=odometry.covariance,
+        motion_by_wheels=odometry.jacobian,
+        distance_m=odometry.distance_m,
+        tag_families=tuple(tag.family for tag in chain.tags),
+        tag_ids=np.array([tag.tag_id for tag in chain.tags], dtype=np.int64),
+        tag_instances=tuple(tag.instance for tag in chain.tags),
+        reading_keyframe=readings.keyframe,
+        reading_tag=readings.tag,
+        reading=readings.value,
+        reading_covariance=readings.covariance,
+        reading_by_camera=readings.by_camera,
+        reading_polar=readings.polar,
+        reading_in_camera=readings.in_camera,
+        picture_stamps_ns=run.picture_stamps_ns,
+        poses=state.poses,
+        tags_m=state.tags,
+        calibration=state.calibration,
+        goodness=np.array(astuple(local_map.goodness), dtype=np.float64),
+    )
+
+
+def local_map_of(kept: KeptChain) -> LocalMap:
+    """The local map again, under the noise that it was kept with."""
+    chain = _chain(kept)
+    graph = build_graph([chain])
+    solution = solve(graph.problem, State(kept.poses, kept.tags_m, kept.calibration))
+    chi_square, expected, bound, odometry_factor, reading_factor = kept.goodness.tolist()
+    return LocalMap(
+        chain, graph, solution, Goodness(chi_square, round(expected), bound, odometry_factor, reading_factor)
+    )
+
+
+def measured_chain(
+    run: Run,
+    stamps_ns: IntArray,
+    motions: tuple[FloatArray, FloatArray, FloatArray],
+    tags: tuple[TagKey, ...],
+    keyframe: IntArray,
+    tag: IntArray,
+    value: FloatArray,
+    covariance: FloatArray,
+    by_camera: FloatArray,
+    polar: BoolArray,
+    in_camera: BoolArray,
+    *,
+    distance_m: FloatArray | None = None,
+) -> Chain:
+    """A chain of motions and readings whose noise is settled, named as its run.
+
+    Args:
+        run: whose they are.
+        stamps_ns: (K,) of the keyframes.
+        motions: (K-1, 3), (K-1, 3, 3) and (K-1, 3, 3): motion, covariance and jacobian of `ChainOdometry`.
+        tags: as of `Chain`.
+        keyframe: as of `Readings`, and likewise the others.
+        tag: index into the tags.
+        value: of each reading.
+        covariance: of the value.
+        by_camera: its derivative by the camera's parameters.
+        polar: its form.
+        in_camera: about what.
+        distance_m: (K-1,) driven; None: as far as each motion leads ahead or back.
+    """
+    motion, spread, jacobian = motions
+    driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
+    odometry = ChainOdometry(motion, spread, _settled(spread), jacobian, driven_m)
+    n = len(value)
+    readings = Readings(
+        keyframe,
+        tag,
+        value,
+        covariance,
+        _settled(covariance),
+        by_camera,
+        polar,
+        in_camera,
+        corners_px=np.full((n, 4, 2), np.nan),
+        corner_bias_px=np.zeros((n, 2)),
+        corner_sigmas=np.ones(n),
+    )
+    return Chain(run.name, run, stamps_ns, odometry, tags, readings)
+
+
+def _settled(covariance: FloatArray) -> CovarianceParts:
+    """On which no noise parameter has a bearing any more."""
+    return CovarianceParts((), np.zeros((0, *covariance.shape)), covariance)
+
+
+def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
+    """Without the wheel readings, pictures and events that only a log has."""
+    none: IntArray = np.zeros(0, dtype=np.int64)
+    return Run(
+        name=name,
+        robot_id=robot.robot_id,
+        run_id="",
+        log=Path(),
+        robot=robot,
+        camera=None,
+        stretches=(),
+        picture_stamps_ns=none,
+        tags=tuple(sorted({tag.whole for tag in tags})),
+        detections=Detections(none, none, np.zeros((0, 4, 2))),
+        positions=Positions(
+            none, none, np.zeros((0, 2)), none.astype(np.bool_), np.zeros((0, 2, 2)), none.astype(np.bool_)
+        ),
+        warnings=(),
+    )
+
+
+def _chain(kept: KeptChain) -> Chain:
+    names = zip(kept.tag_families, kept.tag_ids.tolist(), kept.tag_instances, strict=True)
+    tags = tuple(TagKey(*name) for name in names)
+    camera = json.loads(kept.camera_json) if kept.camera_json else None
+    run = replace(
+        run_without_log(kept.run, Robot.model_validate_json(kept.robot_json), tags),
+        run_id=kept.run_id,
+        log=Path(kept.log),
+        camera=None if camera is None else CameraModel(**camera | {"distortion": tuple(camera["distortion"])}),
+        picture_stamps_ns=kept.picture_stamps_ns,
+        warnings=kept.run_warnings,
+        log_bytes=kept.log_bytes,
+        lost=kept.lost,
+    )
+    chain = measured_chain(
+        run,
+        kept.stamps_ns,
+        (kept.motion, kept.motion_covariance, kept.motion_by_wheels),
+        tags,
+        kept.reading_keyframe,
+        kept.reading_tag,
+        kept.reading,
+        kept.reading_covariance,
+        kept.reading_by_camera,
+        kept.reading_polar,
+        kept.reading_in_camera,
+        distance_m=kept.distance_m,
+    )
+    return replace(chain, name=kept.name, warnings=kept.warnings)
+
+
+def check_can_be_extended(known: MapResult) -> None:
+    """Refuses a map that did not keep what its runs measured.
+
+    Raises:
+        OfflineError: it was made by an older program.
+    """
+    if not known.kept:
+        raise OfflineError(
+            "--extend: the map's map.npz does not hold what its runs measured (an older program made it); map their "
+            "logs together with the new ones"
+        )
+
+
+def tags_of(kept: KeptChain) -> list[TagKey]:
+    """The ids of the tags that a chain read, whichever instance."""
+    return [TagKey(family, tag_id) for family, tag_id in zip(kept.tag_families, kept.tag_ids.tolist(), strict=True)]
+
+
+def check_sizes_in_map(run: Run, known: MapResult) -> None:
+    """Refuses a run whose robot.yaml gives a tag another size than the map has.
+
+    Raises:
+        OfflineError: naming run, tag and both sizes.
+    """
+    sizes_m = {(tag.family, tag.tag_id): tag.size_m for component in known.components for tag in component.tags}
+    for index in np.unique(run.detections.tag):
+        family, tag_id, _ = run.tags[index]
+        in_map_m = sizes_m.get((family, tag_id))
+        size_m = run.robot.tag_size_m(family, tag_id)[0]
+        if in_map_m is not None and abs(in_map_m - size_m) > SAME_SIZE_M:
+            raise OfflineError(
+                f"{run.log}: tags: tag {tag_id} of {family} has size {size_m} m in the robot.yaml of {run.name} but "
+                f"{in_map_m} m in the map; give the right robot.yaml with --robot"
+            )
+
+
+def tape_of(known: MapResult, tape: TapeOptions) -> TapeOptions:
+    """What somebody measured for a map that is kept, and for its extension."""
+    starts, distances = [], []
+    for each in known.measurements:
+        numbers = ",".join(f"{value!r}" for value in [*each.measured.tolist(), *each.sigma.tolist()])
+        if each.kind == "start":
+            starts.append(f"{each.b}={numbers}")
+        else:
+            distances.append(f"{each.a},{each.b}={numbers}")
+    return TapeOptions((*starts, *tape.starts), (*distances, *tape.distances))

@@ -1,0 +1,196 @@
+"""One chain solved alone, in the frame of its start.
+
+A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
+from there does not fit together, the drive is built up again under the noise that its windows show, with other draws of
+the wheels' errors, until one fits.
+
+Readings that contradict each other everywhere make each of these solves take a hundred steps, where those of a drive
+take four. So that a small file of them does not take minutes, all of it shares the effort that the log is worth: solves
+end early, and the map says that they did.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import chained, se2
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fitted_windows
+from groundsbot.offline.measurements import (
+    Chain,
+    TagKey,
+    coarse_keyframes,
+    coarsened,
+    least_shared,
+    refined,
+    telling_keyframes,
+)
+from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, build_graph, solve
+
+# A chain is built up in pieces over which dead reckoning stays in the right valley: what a wheel ratio 1 % off turns in
+# this distance (0.2 rad on a half-metre track) is far from losing a tag. Later, when the wheels are known, they grow
+# with the way, so that the time does not grow with its square.
+_PIECE_M: Final = 10.0
+_PIECE_SHARE: Final = 0.01
+# In squared sigmas: a piece is only the next one's start.
+_PIECE_COST_TOLERANCE: Final = 1e-2
+_OTHER_STARTS: Final = 8
+# A piece takes three to five steps on any drive, of one try each.
+_MOST_TRIES_A_PIECE: Final = 60
+# Of the effort that a log is worth.
+_BUILDING_SHARE: Final = 0.5
+_WINDOWS_SHARE: Final = 0.2
+_SOLVING_SHARE: Final = 0.1  # it is solved some times
+
+
+@dataclass(frozen=True)
+class LocalMap:
+    """A chain in the frame of its start, and whether its readings fit together there."""
+
+    chain: Chain
+    graph: Graph
+    solution: Solution
+    goodness: Goodness
+
+    @property
+    def T_start_base(self) -> FloatArray:
+        """(K, 3) of the keyframes."""
+        return self.solution.state.poses
+
+    @property
+    def tags_m(self) -> dict[TagKey, FloatArray]:
+        """Each tag (2,) in the frame of the start."""
+        return self.graph.tags_of(self.solution.state)
+
+    @property
+    def calibration(self) -> dict[Parameter, float]:
+        """What the chain says of the calibration."""
+        return self.graph.calibration_of(self.solution.state)
+
+    def without_factors(self) -> "LocalMap":
+        """The same, less the factorisation that its solution keeps for whoever asks again: it may be most of a map."""
+        return replace(self, solution=replace(self.solution))
+
+
+class _BuiltUp(NamedTuple):
+    """What is known of a chain as far as it has been built up."""
+
+    poses: FloatArray
+    wheel_calibration: FloatArray
+    tags: dict[TagKey, FloatArray]
+    calibration: dict[Parameter, float]
+
+
+def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
+    """Solves the whole chain from where building up leads.
+
+    Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
+    first that fits counts, else the one of least cost, whose `goodness` then says that it does not fit.
+
+    Args:
+        chain: what was measured.
+        effort: what the stretch is worth; the whole log's where None.
+
+    Raises:
+        OfflineError: there are more readings than a log of this size can be worth.
+    """
+    effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    graph = build_graph([chain])
+    effort.check(graph.problem, chain.run.log, chain.name)
+    keyframes = coarse_keyframes(chain)
+    coarse = coarsened(chain, keyframes)
+    known = _built_up(coarse, effort)
+    check = _Check(graph, effort)
+    rng = np.random.default_rng(0)
+    best: LocalMap | None = None
+    for _ in range(1 + _OTHER_STARTS):
+        poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
+        start = graph.start(poses, known.tags, known.calibration)
+        solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+        effort.spend(solution)
+        if best is None or solution.cost < best.solution.cost:
+            best = LocalMap(chain, graph, solution, check.judge(solution))
+            if best.goodness.fits:
+                break
+        if effort.left < _BUILDING_SHARE * effort.allowed:
+            break
+        known = _built_up(_redrawn(_as_shown(coarse, best.goodness), rng), effort)
+    if best is None:
+        raise ValueError(f"{chain.name}: no start was tried")
+    graph.problem.arrowhead.without_scratch()
+    return best
+
+
+class _Check:
+    """Whether solutions of a chain fit together; without most of the poses that read no tag and have little to say."""
+
+    def __init__(self, graph: Graph, effort: Effort) -> None:
+        (chain,) = graph.chains
+        self._keyframes = telling_keyframes(chain)
+        if len(self._keyframes) < len(chain.stamps_ns):
+            chain = coarsened(chain, self._keyframes)
+            graph = build_graph([chain])
+        self._windows: Windows = fitted_windows(
+            graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least_shared(chain.readings)
+        )
+
+    def judge(self, solution: Solution) -> Goodness:
+        state = solution.state
+        return self._windows.judge(replace(state, poses=state.poses[self._keyframes]))
+
+
+def _as_shown(chain: Chain, goodness: Goodness) -> Chain:
+    """The chain under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
+    return replace(
+        chain,
+        odometry=replace(chain.odometry, covariance=goodness.odometry_factor**2 * chain.odometry.covariance),
+        readings=chain.readings.spread(np.full((len(chain.readings), 2), goodness.reading_factor)),
+    )
+
+
+def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The chain with one more draw of the wheels' noise: as likely a drive, whose valleys lie elsewhere."""
+    odometry = chain.odometry
+    error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
+    return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
+
+
+def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
+    """Solves the chain piece by piece, each from the solution of the last; dead reckoning where effort ends."""
+    known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
+    enough = effort.left - _BUILDING_SHARE * effort.allowed
+    for n_keyframes in _pieces(chain):
+        part = chain.prefix(n_keyframes)
+        graph = build_graph([part])
+        poses = _extended(part, known.poses, known.wheel_calibration)
+        start = graph.start(poses, known.tags, known.calibration)
+        most_tries = effort.tries(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
+        effort.spend(solution)
+        state = solution.state
+        wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
+        known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state))
+        if effort.left < enough:
+            break
+    return known._replace(poses=_extended(chain, known.poses, known.wheel_calibration))
+
+
+def _pieces(chain: Chain) -> list[int]:
+    """Numbers of keyframes at which to stop and solve; the last is all of them."""
+    ends, last_m = [], 0.0
+    for keyframe, along_m in enumerate(chain.along_m[1:].tolist(), start=1):
+        if along_m - last_m >= max(_PIECE_M, _PIECE_SHARE * along_m):
+            ends.append(keyframe)
+            last_m = along_m
+    return [*ends, len(chain.stamps_ns)]
+
+
+def _extended(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+    """Poses of a longer chain: those known, then dead reckoning from the last one."""
+    n_known = len(poses)
+    rest = part.odometry.motion[n_known - 1 :]
+    if not len(rest):
+        return poses
+    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ wheel_calibration))
+    return np.concatenate([poses, chained(rest, poses[-1])[1:]])

@@ -1,0 +1,1 @@
+"""Localisation while driving: a fixed-lag smoother in a finished map, tags that moved noticed."""

@@ -1,0 +1,171 @@
+"""What a robot has driven and read since it was put down: as factors for a sweep, and as a chain for a solve."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import cos, sin
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
+from groundsbot.offline.local_map import measured_chain, run_without_log
+from groundsbot.offline.localization.online.kernels import Motions, Sights
+from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.sam import (
+    NO_PARAMETER,
+    Parameter,
+    mount_parameters_of,
+    parameters_of_camera,
+    parameters_of_wheels,
+    whitening,
+)
+
+_NAME: Final = "the drive"
+_ROOM: Final = 1024
+
+
+@dataclass(frozen=True)
+class TagReading:
+    """One tag seen once.
+
+    Attributes:
+        family, tag_id: of the tag.
+        value: (2,) range_m and bearing_rad, left positive; or x_m and y_m.
+        covariance: (2, 2) of the value.
+        by_camera: (2, 4) its derivative by `readings.CAMERA_PARAMETERS`; None where not known.
+        polar: which form.
+        in_camera: about the camera's place and yaw, else about base.
+    """
+
+    family: str
+    tag_id: int
+    value: FloatArray
+    covariance: FloatArray
+    by_camera: FloatArray | None = None
+    polar: bool = True
+    in_camera: bool = True
+
+
+class Table:
+    """Rows of named arrays that grow: copied when they double, so an hour's drive is copied in under a millisecond."""
+
+    def __init__(self, **columns: tuple[tuple[int, ...], type]) -> None:
+        """Without rows; shape and type of each column."""
+        self.n = 0
+        self._columns: dict[str, Any] = {
+            name: np.empty((_ROOM, *shape), kind) for name, (shape, kind) in columns.items()
+        }
+
+    def append(self, **row: Any) -> None:  # noqa: ANN401 (what a column takes)
+        """One more."""
+        if self.n == len(next(iter(self._columns.values()))):
+            self._columns = {name: np.concatenate([each, np.empty_like(each)]) for name, each in self._columns.items()}
+        for name, value in row.items():
+            self._columns[name][self.n] = value
+        self.n += 1
+
+    def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (of the column's type)
+        """A column; what is written to it stays."""
+        return self._columns[name][: self.n]
+
+
+class Drive:
+    """Motions and readings in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
+
+    def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
+        """Has not moved yet.
+
+        Args:
+            robot: whose.
+            parameters: of calibration, which factors index.
+        """
+        self._robot = robot
+        index = {parameter: i for i, parameter in enumerate(parameters)}
+        self._wheels = [index[each] for each in parameters_of_wheels(robot)]
+        self._of_mount = [index[each] for each in mount_parameters_of(robot)]
+        self._of_camera = [index[each] for each in parameters_of_camera(robot)]
+        self._none = index[NO_PARAMETER]
+        square, n_camera = ((3, 3), float), len(CAMERA_PARAMETERS)
+        self._motions = Table(
+            motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
+        )
+        self._poses = Table(T=((3,), float))
+        self._poses.append(T=np.zeros(3))
+        self._readings = Table(
+            keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
+            in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, n_camera), float),
+            parameters=((4 + n_camera,), int),
+        )  # fmt: skip
+
+    @property
+    def poses(self) -> FloatArray:
+        """(K, 3) about where each keyframe is; the factors are linearised there. May be written to."""
+        poses: FloatArray = self._poses["T"]
+        return poses
+
+    @property
+    def keyframe(self) -> IntArray:
+        """(R,) of each reading."""
+        keyframe: IntArray = self._readings["keyframe"]
+        return keyframe
+
+    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
+        """A motion; `poses` ends with what it leads on from twice."""
+        x, y, theta = np.asarray(motion).tolist()
+        self._motions.append(
+            motion=(x, y, theta, cos(theta), sin(theta)),
+            covariance=covariance,
+            whitening=whitening(np.asarray(covariance)),
+            jacobian=by_wheels,
+            parameters=self._wheels,
+        )
+        self._poses.append(T=self._poses["T"][-1])
+
+    def add_reading(self, tag: int, reading: TagReading, scale: int) -> None:
+        """Of a tag, by its index, from the last pose; which parameter scales its size."""
+        in_camera, mount = reading.in_camera, self._robot.mount
+        of_mount = self._of_mount if in_camera else [self._none] * 3
+        is_ours = in_camera and reading.by_camera is not None
+        of_camera = self._of_camera if is_ours else [self._none] * len(CAMERA_PARAMETERS)
+        self._readings.append(
+            keyframe=self._poses.n - 1,
+            tag=tag,
+            value=reading.value,
+            covariance=reading.covariance,
+            polar=reading.polar,
+            in_camera=in_camera,
+            whitening=whitening(np.asarray(reading.covariance, dtype=np.float64)),
+            mount=(mount.x_m, mount.y_m, mount.yaw_rad) if in_camera else 0.0,
+            by_camera=0.0 if reading.by_camera is None else reading.by_camera,
+            parameters=[*of_mount, scale, *of_camera],
+        )
+
+    def motions(self, begin: int, end: int) -> Motions:
+        """The motions to the keyframes after `begin` up to `end`."""
+        return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
+
+    def sights(self, begin: int, end: int, keyframe: int) -> Sights:
+        """Some readings, poses counted from a keyframe."""
+        table = self._readings
+        return Sights(table["keyframe"][begin:end] - keyframe, *(table[name][begin:end] for name in Sights._fields[1:]))
+
+    def chain(self, tags: Mapping[TagKey, int]) -> Chain:
+        """All of it, as from a log; the tags by their indices."""
+        ordered = tuple(sorted(tags))
+        place = np.empty(len(tags), dtype=np.int64)
+        place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
+        motions, readings = self._motions, self._readings
+        return measured_chain(
+            run_without_log(_NAME, self._robot, ordered),
+            np.arange(self._poses.n),
+            (motions["motion"][:, :3], motions["covariance"], motions["jacobian"]),
+            ordered,
+            readings["keyframe"],
+            place[readings["tag"]],
+            readings["value"],
+            readings["covariance"],
+            readings["by_camera"],
+            readings["polar"],
+            readings["in_camera"],
+        )

@@ -1,0 +1,213 @@
+"""Compiled inner loops of the online estimate: rows turned into a square root information matrix by Givens rotations.
+
+The matrix S of the border (calibration, then tags in the order of their first sight) is lower triangular, S x = d, and
+its inverse's square is the covariance. Rows of a pose that has the border after it are held as (pose, d, border): the
+pose is eliminated first, so a motion touches these alone, and a new tag only adds rows to S. Golub and Van Loan,
+"Matrix Computations" (2013), 5.1.8 and 6.5.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.sam import (
+    N_READING,
+    Values,
+    error_by_wheels,
+    error_of,
+    motion_at,
+    reading_factor,
+    wheel_correction,
+    wrapped,
+)
+
+BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
+
+
+class Motions(NamedTuple):
+    """`factors.OdometryFactors`, each from a pose to the next.
+
+    Attributes:
+        motion: (M, 5) x, y, heading, and the heading's cosine and sine.
+        whitening, jacobian: (M, 3, 3).
+        parameters: (M, 3)
+    """
+
+    motion: FloatArray
+    whitening: FloatArray
+    jacobian: FloatArray
+    parameters: IntArray
+
+
+class Sights(NamedTuple):
+    """`factors.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
+
+    pose: IntArray
+    tag: IntArray
+    value: FloatArray
+    polar: BoolArray
+    whitening: FloatArray
+    mount: FloatArray
+    by_camera: FloatArray
+    parameters: IntArray
+
+
+class Border(NamedTuple):
+    """S and d of the border, of which the first n rows and columns count.
+
+    Attributes:
+        root: (N, N); right: (N,).
+        columns: (C,) of calibration in it, -1 where held.
+        first_tag: (1,) column of the first tag.
+    """
+
+    root: FloatArray
+    right: FloatArray
+    columns: IntArray
+    first_tag: IntArray
+
+
+@jitted
+def sweep(
+    border: Border,
+    pose: FloatArray,
+    n: int,
+    motions: Motions,
+    sights: Sights,
+    weights: FloatArray,
+    values: Values,
+    threshold: float,
+    left: FloatArray,
+) -> None:
+    """Takes readings and motions in their order.
+
+    Args:
+        border: of which n rows count.
+        pose: (3, >= 4 + n) rows of the present pose; becomes those of the last.
+        n: length of the border.
+        motions: (M) of them.
+        sights: (R) of them.
+        weights: (R,) of readings; where negative, Huber's by what is left over at the points.
+        values: about which all is linearised; poses (M + 1, 3).
+        threshold: Huber's.
+        left: (M, 3, 7 + n) takes the rows of each pose that is left: (pose, next pose, d, border).
+    """
+    row, work = np.empty(4 + n), np.empty((6, 7 + n))
+    r, J = np.empty(2), np.empty((2, N_READING))
+    k = 0
+    for m in range(len(left) + 1):
+        if m > 0:
+            _take_motion(border, pose, n, motions, m - 1, values, work)
+            left[m - 1] = work[:3]
+        while k < len(weights) and sights.pose[k] == m:
+            reading_factor(sights, k, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
+            weight = weights[k]
+            if weight < 0.0:
+                length = np.sqrt(r[0] * r[0] + r[1] * r[1])
+                weight = threshold / length if length > threshold else 1.0
+            root = np.sqrt(weight)
+            for i in range(2):
+                spread_out(border, sights, k, J[i], row)
+                row *= root
+                row[3] = -root * r[i]
+                _take_row(border, pose, n, row)
+            k += 1
+
+
+@inner
+def spread_out(border: Border, sights: Sights, k: int, derivative: FloatArray, row: FloatArray) -> None:
+    """A reading's derivative by pose, tag and calibration as a row (pose, d, border)."""
+    row[:] = 0.0
+    row[:3] = derivative[:3]
+    tag = 4 + border.first_tag[0] + 2 * sights.tag[k]
+    row[tag], row[tag + 1] = derivative[3], derivative[4]
+    for a in range(N_READING - 5):
+        column = border.columns[sights.parameters[k, a]]
+        if column >= 0:
+            row[4 + column] += derivative[5 + a]
+
+
+@inner
+def _take_row(border: Border, pose: FloatArray, n: int, row: FloatArray) -> None:
+    for c in range(3):
+        if row[c] != 0.0:
+            _rotate(pose[c], row, c, 4 + n)
+    right = border.right
+    for j in range(n - 1, -1, -1):
+        b = row[4 + j]
+        if b == 0.0:
+            continue
+        own = border.root[j]
+        length = np.sqrt(own[j] * own[j] + b * b)
+        cos, sin = own[j] / length, b / length
+        for i in range(j):
+            x, y = own[i], row[4 + i]
+            own[i] = cos * x + sin * y
+            row[4 + i] = cos * y - sin * x
+        own[j] = length
+        x, y = right[j], row[3]
+        right[j] = cos * x + sin * y
+        row[3] = cos * y - sin * x
+
+
+@inner
+def _rotate(upper: FloatArray, lower: FloatArray, at: int, end: int) -> None:
+    """Two rows from a column on, so that the lower has nothing there any more."""
+    a, b = upper[at], lower[at]
+    length = np.sqrt(a * a + b * b)
+    cos, sin = a / length, b / length
+    for i in range(at, end):
+        x, y = upper[i], lower[i]
+        upper[i] = cos * x + sin * y
+        lower[i] = cos * y - sin * x
+    upper[at], lower[at] = length, 0.0
+
+
+@inner
+def _take_motion(
+    border: Border, pose: FloatArray, n: int, motions: Motions, m: int, values: Values, work: FloatArray
+) -> None:
+    """Eliminates a pose; its rows are left in `work`, those of the next in `pose`."""
+    for i in range(3):
+        for c in range(3):
+            work[i, c], work[i, 3 + c] = pose[i, c], 0.0
+        work[i, 6 : 7 + n] = pose[i, 3 : 4 + n]
+    work[3:] = 0.0
+    _linearise_motion(border, motions, m, values, work[3:])
+    for c in range(6):
+        for i in range(c + 1, 6):
+            if work[i, c] != 0.0:
+                _rotate(work[c], work[i], c, 7 + n)
+    for i in range(3):
+        pose[i, : 4 + n] = work[3 + i, 3 : 7 + n]
+
+
+@inner
+def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, out: FloatArray) -> None:
+    """Rows (pose, next pose, d, border) of a motion, see `factors.OdometryFactors` and `linearise_odometry`."""
+    first, second = values.poses[m], values.poses[m + 1]
+    cos, sin = np.cos(first[2]), np.sin(first[2])
+    dx, dy = second[0] - first[0], second[1] - first[1]
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    turn = wrapped(second[2] - first[2])
+    t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # they have what that reads
+    e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type] # likewise
+    s = 1.0 / (1.0 + values.calibration[motions.parameters[m, 0]])
+    C, product = np.empty((3, 3)), np.empty((3, 3))
+    error_by_wheels(motions.jacobian[m], t, e, s, C, product)
+    a, b, p, q = J
+    cos, sin = np.cos(turn), np.sin(turn)
+    u, v = sin * x - cos * y, cos * x + sin * y
+    for i in range(3):
+        W = motions.whitening[m, i]
+        w0, w1, w2 = s * W[0], s * W[1], W[2]
+        j0, j1, j2 = a * w0 + b * w1, a * w1 - b * w0, p * w0 + q * w1 + w2
+        out[i, 0], out[i, 1], out[i, 2] = -(j0 * cos - j1 * sin), -(j0 * sin + j1 * cos), -(j0 * u + j1 * v + j2)
+        out[i, 3], out[i, 4], out[i, 5] = j0, j1, j2
+        out[i, 6] = -(w0 * e[0] + w1 * e[1] + w2 * e[2])
+        for k in range(3):
+            column = border.columns[motions.parameters[m, k]]
+            if column >= 0:
+                out[i, 7 + column] += w0 * C[0, k] + w1 * C[1, k] + w2 * C[2, k]

@@ -1,0 +1,278 @@
+"""What a log holds, for a person or a program."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from itertools import pairwise
+from math import hypot, isfinite
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+from groundsbot.calib.foundation import counted
+from groundsbot.calib.robot import Wheels, parse_robot_yaml
+from groundsbot.offline.errors import OfflineError
+from groundsbot.onboard.log import (
+    TOPICS,
+    Allowance,
+    Event,
+    LogLosses,
+    LogMessage,
+    PlanarOdometry,
+    RunInfo,
+    TagDetections,
+    TagObservations,
+    WheelEncoders,
+    read_log,
+)
+
+_NS_PER_S: Final = 1_000_000_000
+_EARLIEST_NS: Final = 946_684_800 * _NS_PER_S  # 2000-01-01: no log is older
+_GAP_S: Final = 0.5  # wheel readings missing for longer leave the motion unknown
+_GAP_INTERVALS: Final = 5  # and in a slow log, as long as this many usual intervals
+_WHEELS: Final = ("/wheels", "/odometry")
+_STREAMS: Final = (*_WHEELS, "/tags/detections", "/camera/image")
+_GAPS_SHOWN: Final = 5
+_PLACES_TOLD: Final = 20
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A time without messages on a topic that else has a steady rate."""
+
+    topic: str
+    start_s: float  # after the log's first measurement
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """How many messages a topic has and how fast they come (None: fewer than two)."""
+
+    topic: str
+    count: int
+    rate_hz: float | None
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """One run's log."""
+
+    log: Path
+    run_id: str
+    robot_id: str
+    software_version: str
+    start_utc: str | None  # the first measurement, to the second; None where the log's clock tells no date
+    duration_s: float
+    distance_m: float | None  # by the wheels; None where the log has none, or such as are no numbers
+    n_wheel_restarts: int
+    n_wheel_lines_lost: int  # by their sequence numbers
+    n_pictures: int | None  # None: an imported log
+    n_pictures_lost: int
+    tags: dict[str, dict[int, int]]  # family, id: how often seen
+    topics: tuple[TopicInfo, ...]
+    gaps: tuple[Gap, ...]
+    events: dict[str, int]  # kind: how many messages
+    file_bytes: dict[str, int]
+    losses: tuple[str, ...]  # what is amiss with its files, in words
+    lost: str  # what of it cannot be read, in words; empty where all can
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`: plain data."""
+        return asdict(self) | {"log": str(self.log)}
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        size = ", ".join(f"{name} {size_bytes / 1e6:.2f} MB" for name, size_bytes in self.file_bytes.items())
+        lines = [
+            f"{self.log}",
+            f"  robot {self.robot_id}, run {self.run_id}, written by {self.software_version or 'an unnamed version'}",
+            f"  {self._time()}, {self._distance()}; {size}",
+            f"  tags: {self._tags()}",
+        ]
+        for topic in self.topics:
+            rate = "" if topic.rate_hz is None else f"  {topic.rate_hz:8.2f} Hz"
+            lines.append(f"  {topic.topic:<20} {topic.count:8d}{rate}")
+        lines.extend(self._losses())
+        if self.events:
+            lines.append("  events: " + ", ".join(f"{kind} {count}" for kind, count in self.events.items()))
+        return lines
+
+    def _time(self) -> str:
+        return f"{self.duration_s:.1f} s" if self.start_utc is None else f"{self.start_utc}, {self.duration_s:.1f} s"
+
+    def _distance(self) -> str:
+        if self.distance_m is None and any(each.topic in _WHEELS for each in self.topics):
+            return "wheel readings that are no numbers, so no map can use it"
+        if self.distance_m is None:
+            return "no wheel readings, so no map can use it"
+        return f"{self.distance_m:.2f} m driven"
+
+    def _tags(self) -> str:
+        if not self.tags:
+            return "none seen"
+        return "; ".join(
+            f"{len(seen)} of {family} in {counted(sum(seen.values()), 'reading')}: {' '.join(map(str, seen))}"
+            for family, seen in self.tags.items()
+        )
+
+    def _losses(self) -> list[str]:
+        lines = [
+            f"  gap in {gap.topic}: {gap.duration_s:.2f} s from {gap.start_s:.2f} s on"
+            for gap in self.gaps[:_GAPS_SHOWN]
+        ]
+        if len(self.gaps) > _GAPS_SHOWN:
+            lines.append(f"  and {counted(len(self.gaps) - _GAPS_SHOWN, 'more gap')}; --json lists them")
+        if self.n_pictures_lost:
+            lines.append(f"  {counted(self.n_pictures_lost, 'picture')} lost, by the camera's own count")
+        if self.n_wheel_restarts:
+            lines.append(f"  the wheel controller restarted {counted(self.n_wheel_restarts, 'time')}")
+        if self.n_wheel_lines_lost:
+            lines.append(f"  {counted(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
+        lines.extend(f"  damaged: {loss}" for loss in self.losses)
+        if self.lost:
+            lines.append(f"  lost: {self.lost}")
+        return lines
+
+
+def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
+    """Reads a log once.
+
+    Args:
+        log: a file or a run folder.
+        allowance: what it shares with other logs in reading; one of its own where None.
+
+    Raises:
+        GroundsbotError: the log is missing, damaged, no log of ours, or its robot.yaml cannot be used.
+    """
+    collected, losses = _Collected(), LogLosses()
+    for entry in read_log(log, losses=losses, allowance=allowance):
+        collected.add(entry)
+    run = collected.run
+    if run is None:
+        found = "; ".join([f"{log}: holds no /run message", *losses.lines()])
+        raise OfflineError(f"{found}; is it a groundsbot log?")
+    (allowance or Allowance()).check_text(run.robot_yaml, log, sum(_file_bytes(log).values()))
+    wheels = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").wheels
+    stamps = [stamp for stamps in collected.stamps_ns.values() for stamp in stamps]
+    first_ns = min(stamps, default=0)
+    topics = sorted(collected.counts, key=list(TOPICS).index)
+    distance_m = _distance_m(collected, wheels)
+    return LogInfo(
+        log=log,
+        run_id=run.run_id,
+        robot_id=run.robot_id,
+        software_version=run.software_version,
+        start_utc=_utc(first_ns),
+        duration_s=(max(stamps, default=0) - first_ns) / _NS_PER_S,
+        distance_m=distance_m if distance_m is not None and isfinite(distance_m) else None,
+        n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
+        n_wheel_lines_lost=_missing(collected.wheel_lines),
+        n_pictures=collected.counts.get("/tags/detections"),
+        n_pictures_lost=_missing([(0, sequence) for sequence in collected.frame_sequences]),
+        tags={family: dict(sorted(collected.tags[family].items())) for family in sorted(collected.tags)},
+        topics=tuple(TopicInfo(t, collected.counts[t], _rate_hz(collected.stamps_ns[t])) for t in topics),
+        gaps=tuple(gap for topic in _STREAMS for gap in _gaps(topic, collected.stamps_ns[topic], first_ns)),
+        events=dict(sorted(collected.events.items())),
+        file_bytes=_file_bytes(log),
+        losses=tuple(losses.lines(_PLACES_TOLD)),
+        lost=losses.in_words,
+    )
+
+
+@dataclass
+class _Collected:
+    """What one pass over a log gathers."""
+
+    run: RunInfo | None = None
+    counts: Counter[str] = field(default_factory=Counter)
+    stamps_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
+    ticks: list[tuple[int, int, int]] = field(default_factory=list)  # boot, left, right
+    wheel_lines: list[tuple[int, int]] = field(default_factory=list)  # boot, sequence
+    distances_m: list[float] = field(default_factory=list)  # cumulative, of the middle
+    places_m: list[tuple[float, float]] = field(default_factory=list)
+    frame_sequences: list[int] = field(default_factory=list)
+    tags: defaultdict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
+    events: Counter[str] = field(default_factory=Counter)
+
+    def add(self, entry: LogMessage) -> None:
+        """Takes one message; what stands at a file's head is no measurement and has no time."""
+        self.counts[entry.topic] += 1
+        if not TOPICS[entry.topic].every_file:
+            self.stamps_ns[entry.topic].append(entry.publish_time_ns)
+        message = entry.message
+        if isinstance(message, WheelEncoders):
+            self.ticks.append((message.boot_id, message.ticks_left, message.ticks_right))
+            self.wheel_lines.append((message.boot_id, message.sequence))
+        elif isinstance(message, TagDetections):
+            self.frame_sequences.append(message.frame_sequence)
+            self._add_tags((detection.family, detection.tag_id) for detection in message.detections)
+        elif isinstance(message, PlanarOdometry):
+            self._add_odometry(message)
+        elif isinstance(message, TagObservations):
+            self._add_tags((observation.family, observation.tag_id) for observation in message.observations)
+        elif isinstance(message, Event):
+            self.events[message.kind] += 1
+        elif isinstance(message, RunInfo):
+            self.run = message
+
+    def _add_tags(self, tags: Iterable[tuple[str, int]]) -> None:
+        for family, tag_id in tags:
+            self.tags[family][tag_id] += 1
+
+    def _add_odometry(self, message: PlanarOdometry) -> None:
+        if message.WhichOneof("motion") == "pose":
+            self.places_m.append((message.pose.x_m, message.pose.y_m))
+        else:
+            self.distances_m.append((message.wheels.left_m + message.wheels.right_m) / 2)
+
+
+def _distance_m(collected: _Collected, wheels: Wheels) -> float | None:
+    """Length of the path of the point midway between the wheels; unknown motion at a restart counts as none."""
+    if collected.ticks:
+        left_m, right_m = wheels.metres_per_tick
+        return sum(
+            abs((after[1] - before[1]) * left_m + (after[2] - before[2]) * right_m) / 2
+            for before, after in pairwise(collected.ticks)
+            if before[0] == after[0]
+        )
+    if collected.distances_m:
+        return sum(abs(after - before) for before, after in pairwise(collected.distances_m))
+    if collected.places_m:
+        return sum(hypot(after[0] - before[0], after[1] - before[1]) for before, after in pairwise(collected.places_m))
+    return None
+
+
+def _missing(numbered: list[tuple[int, int]]) -> int:
+    """How many numbers are left out in a rising sequence of (epoch, number), within each epoch."""
+    return sum(max(0, after[1] - before[1] - 1) for before, after in pairwise(numbered) if before[0] == after[0])
+
+
+def _utc(stamp_ns: int) -> str | None:
+    """Date and time of day; none for an imported log whose times begin somewhere near zero."""
+    if stamp_ns < _EARLIEST_NS:
+        return None
+    return datetime.fromtimestamp(stamp_ns // _NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _rate_hz(stamps_ns: list[int]) -> float | None:
+    span_ns = max(stamps_ns) - min(stamps_ns) if stamps_ns else 0
+    return (len(stamps_ns) - 1) * _NS_PER_S / span_ns if span_ns else None
+
+
+def _gaps(topic: str, stamps_ns: list[int], first_ns: int) -> list[Gap]:
+    if len(stamps_ns) < 2:
+        return []
+    steps_ns = [after - before for before, after in pairwise(stamps_ns)]
+    limit_ns = max(_GAP_S * _NS_PER_S, _GAP_INTERVALS * median(steps_ns))
+    return [
+        Gap(topic, (start_ns - first_ns) / _NS_PER_S, step_ns / _NS_PER_S)
+        for start_ns, step_ns in zip(stamps_ns, steps_ns, strict=False)
+        if step_ns > limit_ns
+    ]
+
+
+def _file_bytes(log: Path) -> dict[str, int]:
+    files = sorted(log.glob("*.mcap*")) if log.is_dir() else [log]
+    return {file.name: file.stat().st_size for file in files}

@@ -1,0 +1,301 @@
+"""Looks for tags again in recorded pictures: a new log with the new detections and all else, the old one stays."""
+
+import os
+import queue
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation import claimed_size
+from groundsbot.calib.robot import parse_robot_yaml
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import Progress
+from groundsbot.offline.logs.new_log import new_log
+from groundsbot.offline.logs.picture_budget import most_work_pixels, plausible_pixels, work_pixels
+from groundsbot.onboard.detection import ChildDetector, DetectionResult, DetectorSettings, detections_message
+from groundsbot.onboard.log import (
+    PICTURE_TOPIC,
+    TOPICS,
+    CameraCalibration,
+    CompressedImage,
+    Event,
+    EventKind,
+    LogLosses,
+    LogWriter,
+    Picture,
+    RunInfo,
+    SegmentLimits,
+    Severity,
+    StampSource,
+    TagDetections,
+    WheelEncoders,
+    camera_from_message,
+    files_of,
+    read_head,
+    read_log,
+)
+
+_DETECTIONS: Final = "/tags/detections"
+_QUEUED: Final = 4  # pictures in memory for each process
+
+
+@dataclass(frozen=True)
+class DetectOptions:
+    """How to look. None: as robot.yaml in the log says."""
+
+    families: tuple[str, ...] | None = None
+    library: str | None = None
+    quad_decimate: float = 1.0  # there is time, so small tags are looked for too
+    drop_others: bool = False  # leave out detections of pictures that were not kept
+    n_processes: int | None = None  # None: one for each core
+
+
+@dataclass
+class DetectReport:
+    """What came of it."""
+
+    n_pictures: int = 0
+    n_unusable: int = 0
+    n_kept: int = 0  # old detections, of pictures that were not kept
+    tags_before: Counter[tuple[str, int]] = field(default_factory=Counter)
+    tags_after: Counter[tuple[str, int]] = field(default_factory=Counter)
+    losses: LogLosses = field(default_factory=LogLosses)
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        lines = [
+            f"{self.n_pictures} pictures: {_told(self.tags_before)} before, {_told(self.tags_after)} now",
+            f"{self.n_kept} older detections kept, whose pictures were not" if self.n_kept else "",
+            f"{self.n_unusable} pictures are of no use; what was found in them before stays" if self.n_unusable else "",
+            *self.losses.lines(),
+        ]
+        return [line for line in lines if line]
+
+
+def _told(tags: Counter[tuple[str, int]]) -> str:
+    return f"{len(tags)} tags in {tags.total()} readings"
+
+
+def detect_again(log: Path, output: Path, options: DetectOptions, progress: Progress) -> DetectReport:
+    """Detects in every picture of a log and writes a new log, which comes to be whole or not at all.
+
+    Args:
+        log: a file or a run folder with pictures.
+        output: a new run folder, or a new file if it ends in `.mcap`.
+        options: how to look.
+        progress: told what is being done, how much of it is, and of how much.
+
+    Raises:
+        GroundsbotError: the log holds no picture or cannot be read, `output` exists, or no detector is installed.
+    """
+    with new_log(output) as folder:
+        settings = _settings(log, options)
+        old = _OldDetections.read(log)
+        if not old.n_pictures:
+            raise OfflineError(f"{log}: holds no pictures to look at; record with recorder.picture_rate_hz above 0")
+        report = DetectReport()
+        found = _detect_all(log, old, settings, options, report, progress)
+        target = folder / output.name if output.suffix == ".mcap" else folder
+        _write(log, target, old, found, options, report)
+    return report
+
+
+def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
+    head = read_head(log)
+    run, calibration = head.get("/run"), head.get("/camera/calibration")
+    if not isinstance(run, RunInfo):
+        raise OfflineError(f"{log}: what says whose run it is, is damaged; salvage it first")
+    recorder = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").recorder
+    families = options.families or tuple(recorder.families)
+    camera = None
+    if isinstance(calibration, CameraCalibration):
+        with suppress(GroundsbotError):  # mapping says what is wrong with it; tags are found without
+            camera = camera_from_message(calibration)
+    return DetectorSettings(families, options.library or recorder.detector, options.quad_decimate, camera=camera)
+
+
+@dataclass
+class _OldDetections:
+    """What a first pass over the log gathers."""
+
+    n_pictures: int = 0
+    pictures_ns: set[int] = field(default_factory=set)  # of those that were kept, usable or not
+    by_stamp_ns: dict[int, TagDetections] = field(default_factory=dict)  # without their tags
+    wheels: list[tuple[int, int]] = field(default_factory=list)  # stamp, sequence
+
+    @classmethod
+    def read(cls, log: Path) -> "_OldDetections":
+        """Reads all but what the pictures show.
+
+        Raises:
+            OfflineError: they are more than a log of this size can hold.
+        """
+        old = cls()
+        n_left = most = most_work_pixels(sum(file.stat().st_size for file in files_of(log)))
+        for each in read_log(log, ("/wheels", _DETECTIONS, PICTURE_TOPIC), LogLosses()):
+            if isinstance(each.message, WheelEncoders):
+                old.wheels.append((each.message.stamp_ns, each.message.sequence))
+            elif isinstance(each.message, TagDetections):
+                del each.message.detections[:]
+                old.by_stamp_ns[each.message.stamp_ns] = each.message
+            elif isinstance(each.message, CompressedImage):
+                old.n_pictures += 1
+                old.pictures_ns.add(each.publish_time_ns)
+                n_left -= work_pixels(each.message.data)
+                if n_left < 0:
+                    raise OfflineError(
+                        f"{log}: its pictures have more than {most} pixels, the limit for a log of its size; are they "
+                        "a camera's?"
+                    )
+        old.wheels.sort()
+        return old
+
+    def place(self, message: TagDetections) -> None:
+        """Gives a new message what the old one for its picture says beside the tags, or what can be told without."""
+        old = self.by_stamp_ns.get(message.stamp_ns)
+        if old is not None:
+            message.frame_sequence = old.frame_sequence
+            message.stamp_source = old.stamp_source
+            message.has_wheel_sequence = old.has_wheel_sequence
+            message.wheel_sequence = old.wheel_sequence
+            return
+        index = bisect_right(self.wheels, message.stamp_ns, key=lambda wheel: wheel[0]) - 1
+        if index >= 0:
+            message.has_wheel_sequence = True
+            message.wheel_sequence = self.wheels[index][1]
+
+
+def _detect_all(
+    log: Path,
+    old: _OldDetections,
+    settings: DetectorSettings,
+    options: DetectOptions,
+    report: DetectReport,
+    progress: Progress,
+) -> dict[int, bytes]:
+    """New messages, as bytes, by the stamp of their picture."""
+    found: dict[int, bytes] = {}
+    n_processes = options.n_processes or os.cpu_count() or 1
+    with detectors(settings, n_processes) as (detect, library, described):
+        for stamp_ns, result in in_parallel(_pictures(log), detect, n_processes):
+            report.n_pictures += 1
+            progress("looking for tags", report.n_pictures, old.n_pictures)
+            if result.error is not None:
+                report.n_unusable += 1
+                continue
+            source = StampSource.STAMP_SOURCE_UNSPECIFIED
+            message = detections_message(result.detections, result.size_px, stamp_ns, source, 0, library, described)
+            old.place(message)
+            report.tags_after.update((each.family, each.tag_id) for each in message.detections)
+            found[stamp_ns] = message.SerializeToString(deterministic=True)
+    return found
+
+
+Detect = Callable[[Picture], DetectionResult]
+
+
+@contextmanager
+def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[Detect, str, str]]:
+    """A function for several threads, each call of which has a process to itself; and what it detects with."""
+    with ExitStack() as stack:
+        idle: queue.SimpleQueue[ChildDetector] = queue.SimpleQueue()
+        children = []
+        for _ in range(n_processes):
+            children.append(ChildDetector(settings))
+            stack.callback(children[-1].close)
+            idle.put(children[-1])
+
+        def detect(picture: Picture) -> DetectionResult:
+            if isinstance(picture, bytes):
+                width_px, height_px = claimed_size(picture)
+                if plausible_pixels(picture) is None:
+                    return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
+            detector = idle.get()
+            try:
+                return detector.detect(picture)
+            finally:
+                idle.put(detector)
+
+        yield detect, children[0].library, children[0].settings
+
+
+def _pictures(log: Path) -> Iterator[tuple[int, Picture]]:
+    for each in read_log(log, (PICTURE_TOPIC,), LogLosses()):
+        if isinstance(each.message, CompressedImage):
+            yield each.publish_time_ns, each.message.data
+
+
+def in_parallel(
+    pictures: Iterator[tuple[int, Picture]], detect: Detect, n_threads: int
+) -> Iterator[tuple[int, DetectionResult]]:
+    """Results as they come, with few pictures in memory."""
+    with ThreadPoolExecutor(n_threads) as pool:
+        under_way: dict[Future[DetectionResult], int] = {}
+        while True:
+            for stamp_ns, picture in islice(pictures, _QUEUED * n_threads - len(under_way)):
+                under_way[pool.submit(detect, picture)] = stamp_ns
+            if not under_way:
+                return
+            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                yield under_way.pop(future), future.result()
+
+
+def _write(
+    log: Path,
+    target: Path,
+    old: _OldDetections,
+    found: dict[int, bytes],
+    options: DetectOptions,
+    report: DetectReport,
+) -> None:
+    writer: LogWriter | None = None
+    head = read_head(log)
+    limits = None if target.suffix == ".mcap" else SegmentLimits()
+    for each in read_log(log, losses=report.losses):
+        at_ns = max(each.log_time_ns, writer.last_log_time_ns) if writer else each.log_time_ns
+        if writer is None:
+            writer = LogWriter(target, head, at_ns, keep_pictures=True, durable=False, limits=limits)
+        if TOPICS[each.topic].every_file:
+            continue
+        if isinstance(each.message, TagDetections):
+            report.tags_before.update((tag.family, tag.tag_id) for tag in each.message.detections)
+            if each.message.stamp_ns in found:
+                each.message.ParseFromString(found[each.message.stamp_ns])
+            elif not _stays(each.message, old, options, report):
+                continue
+        writer.write(each.topic, each.message, at_ns, each.publish_time_ns)
+        if each.topic == PICTURE_TOPIC and each.publish_time_ns not in old.by_stamp_ns:
+            data = found.get(each.publish_time_ns)  # a picture whose tags nobody had looked for
+            if data is not None:
+                writer.write(_DETECTIONS, TagDetections.FromString(data), at_ns, each.publish_time_ns)
+    if writer is not None:
+        _tell(writer, log, report)
+        writer.close()
+
+
+def _stays(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
+    """Whether detections stay that were not looked for again."""
+    if message.stamp_ns in old.pictures_ns:  # of no use now, and better known when it was taken
+        return True
+    report.n_kept += not options.drop_others
+    return not options.drop_others
+
+
+def _tell(writer: LogWriter, log: Path, report: DetectReport) -> None:
+    now_ns = writer.last_log_time_ns
+    text = f"tags looked for again in the pictures of {log.name}: {'; '.join(report.lines())}"
+    event = Event(
+        stamp_ns=now_ns,
+        severity=Severity.SEVERITY_INFO,
+        kind=EventKind.DETECTED_AGAIN,
+        text=text,
+        count=report.n_unusable,
+    )
+    writer.write("/events", event, now_ns, now_ns)

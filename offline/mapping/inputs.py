@@ -1,0 +1,103 @@
+"""Runs that cannot go into one map, or not into a kept one, refused before anything is computed."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import Inputs, Stages
+from groundsbot.offline.local_map import check_can_be_extended, check_sizes_in_map
+from groundsbot.offline.maps import MapResult
+from groundsbot.offline.measurements import RobotFile, Run, load_run
+from groundsbot.offline.self_calibration import Calibrate
+from groundsbot.onboard.log import Allowance
+
+
+def check_distinct(runs: Sequence[Run]) -> None:
+    """Refuses a drive that is given twice, and runs and stretches that would have one name."""
+    if not runs:
+        raise OfflineError("no log given; name at least one log file or run folder")
+    seen: dict[str, Run] = {}
+    for run in runs:
+        if run.name in seen:
+            other = seen[run.name]
+            if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
+                raise OfflineError(
+                    f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
+                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them apart"
+                )
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
+                "leave one out, or a drive would count as two"
+            )
+        seen[run.name] = run
+    for run in runs:
+        stretch = re.fullmatch(r"(.+)_stretch\d+", run.name)
+        if stretch and stretch[1] in seen:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a stretch of {stretch[1]}, which "
+                f"{seen[stretch[1]].log} is; map them apart"
+            )
+
+
+def check_new(
+    runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
+) -> None:
+    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
+    check_can_be_extended(extending)
+    if corners:
+        raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+    if calibrate.is_on:
+        raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
+    if noise is not None:
+        raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
+    names = {name for each in extending.kept for name in (each.run, each.name)}
+    for run in runs:
+        if run.name in names:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out, or a drive "
+                "would count as two"
+            )
+        check_sizes_in_map(run, extending)
+
+
+def read_runs(
+    logs: Sequence[Path], robot_files: Mapping[str, RobotFile] | None = None, stages: Stages | None = None
+) -> list[Run]:
+    """Reads logs for `build_map`, which sets the map in the frame of the first one's start.
+
+    Args:
+        logs: files or run folders.
+        robot_files: calibrations by robot id that replace those in the logs.
+        stages: told what is being done, and keeps what it took.
+
+    Raises:
+        GroundsbotError: one line that says what is wrong with a log, or which robot has none.
+    """
+    runs, inputs, allowance, n_stretches = list[Run](), Inputs.of(logs), Allowance(), 0
+    if logs:
+        inputs.check_stretches(len(logs), logs[-1])
+    with (stages or Stages()).stage("reading logs", len(logs)) as done:
+        for log in logs:
+            runs.append(load_run(log, robot_files, inputs, allowance))
+            n_stretches += len(runs[-1].stretches)
+            inputs.check_stretches(n_stretches, log)
+            done()
+    check_robots(runs, robot_files or {})
+    return runs
+
+
+def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:
+    """Refuses a robot.yaml that no log is of.
+
+    Raises:
+        OfflineError: naming it, and the robots of the logs.
+    """
+    recorded = {run.robot_id for run in runs}
+    for robot_id in robot_files:
+        if robot_id not in recorded:
+            raise OfflineError(
+                f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
+                "give the file of one of these robots"
+            )

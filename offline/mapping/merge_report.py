@@ -1,0 +1,140 @@
+"""What merging found, in words for a person and typed for the result."""
+
+from collections.abc import Collection, Sequence
+from math import degrees
+
+from groundsbot.offline.alignment import Alignment, Group, Merge, PairAlignment, why_not_joined
+from groundsbot.offline.corners import has_corners
+from groundsbot.offline.global_map import TagJoin
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.maps import AlignmentResult, RivalResult
+from groundsbot.offline.measurements import TagKey
+
+_TOO_LONG = (
+    "that takes more work than logs of their size are worth; map fewer drives at once and add the others by --extend"
+)
+
+
+def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[AlignmentResult, ...]:
+    """Each pair in which any two tags fit together."""
+    return tuple(_result(maps, pair, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
+
+
+def merge_warnings(
+    maps: Sequence[LocalMap],
+    merged: Merge,
+    named: Collection[tuple[str, int]] = (),
+    not_joined: Sequence[TagJoin] | None = None,
+) -> list[str]:
+    """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart.
+
+    Args:
+        maps: that were merged.
+        merged: the result.
+        named: family and id of tags of which nothing more is to be said.
+        not_joined: over single tags, with their reasons; None: that was not tried.
+    """
+    component = {m: i for i, group in enumerate(merged.groups) for m in group.members}
+    warnings = []
+    for pair in merged.pairs:
+        alignment = pair.alignment
+        if alignment is None:
+            continue
+        if alignment.is_sure:
+            warnings += _elsewhere(maps, pair, alignment, named)
+        elif component[pair.a] == component[pair.b]:
+            warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
+    warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
+    for i, group in enumerate(merged.groups[1:], start=1):
+        warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
+    return warnings
+
+
+def reason_apart(
+    maps: Sequence[LocalMap], merged: Merge, group: Group, not_joined: Sequence[TagJoin] | None = None
+) -> str:
+    """Why a component is one of its own, told of the pair that is nearest to joining it, and what would help."""
+    crossing = [pair for pair in merged.pairs if (pair.a in group.members) != (pair.b in group.members)]
+    if crossing:
+        names = {maps[m].chain.name for m in group.members}
+        nearest = max(crossing, key=_nearness)
+        why = _why_not_joined(maps, nearest, names)
+        if len(nearest.shared) > 1:
+            return why
+        if not_joined is None and all(has_corners(maps[m].graph) for m in (nearest.a, nearest.b)):
+            return f"{why}, and --model corners may do with the one"
+        tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
+        return tried[0] if tried else why
+    name = maps[group.members[0]].chain.name
+    if not any(maps[m].graph.tags for m in group.members):
+        return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"
+    return f"{name} shares no tag with the others; drive it past two tags that another run saw"
+
+
+def _not_searched(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
+    left = [pair for pair in merged.pairs if not pair.is_searched]
+    if not left:
+        return []
+    a, b = (maps[m].chain.name for m in (left[0].a, left[0].b))
+    told = f"{len(left)} of {len(merged.pairs)} pairs of drives that share tags were not laid over each other"
+    return [f"{told}, {a} and {b} among them: {_TOO_LONG}"]
+
+
+def _nearness(pair: PairAlignment) -> tuple[float, int]:
+    evidence_nats = float("-inf") if pair.alignment is None else pair.alignment.evidence_nats
+    return evidence_nats, len(pair.shared)
+
+
+def _why_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
+    """Why a pair is not joined; the first name is one of `told_of`."""
+    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
+        a, b = b, a
+    if not pair.is_searched:
+        return f"{b} shares {len(pair.shared)} tags with {a}, but was not laid over it: {_TOO_LONG}"
+    return why_not_joined(a, b, pair.shared, pair.alignment)
+
+
+def _elsewhere(
+    maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment, named: Collection[tuple[str, int]]
+) -> list[str]:
+    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    return [
+        f"tag {tag.tag_id} lies {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
+        "moved between the runs, or carried about?"
+        for tag, fits, off_m, sigmas in zip(
+            alignment.shared, alignment.inlier, alignment.off_m, alignment.off_sigmas, strict=True
+        )
+        if not fits and (tag.family, tag.tag_id) not in named
+    ]
+
+
+def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
+    warnings = []
+    for each in merged.contradictions:
+        ring = ", ".join(maps[m].chain.name for m in each.ring)
+        gap_m, turn_deg = float((each.gap[:2] ** 2).sum() ** 0.5), abs(degrees(each.gap[2]))
+        a, b = (maps[m].chain.name for m in (each.link.a, each.link.b))
+        warnings.append(
+            f"the alignments of {ring} contradict each other (their ring gapes by {gap_m:.2f} m and {turn_deg:.1f} "
+            f"deg, {each.sigmas:.0f} sigma); that of {a} with {b} was left out"
+        )
+    return warnings
+
+
+def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment) -> AlignmentResult:
+    return AlignmentResult(
+        from_run=maps[pair.a].chain.name,
+        to_run=maps[pair.b].chain.name,
+        T_from_to=alignment.T_a_b,
+        n_shared=len(pair.shared),
+        n_inliers=alignment.n_inliers,
+        inlier_rmse_m=alignment.rmse_m,
+        outliers=_ids(alignment.outliers),
+        is_sure=alignment.is_sure,
+        rivals=tuple(RivalResult(each.T_a_b, _ids(each.inliers)) for each in alignment.rivals),
+    )
+
+
+def _ids(tags: Sequence[TagKey]) -> tuple[tuple[str, int], ...]:
+    return tuple((tag.family, tag.tag_id) for tag in tags)

@@ -1,0 +1,192 @@
+"""Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.alignment import Merge, merge
+from groundsbot.offline.foundation import Stages
+from groundsbot.offline.global_map import (
+    SolvedComponent,
+    TagJoin,
+    join_results,
+    join_warnings,
+    joined_over_tags,
+    solved_component,
+    unused,
+)
+from groundsbot.offline.local_map import LocalMap, kept_of, local_map_of, tags_of, tape_of
+from groundsbot.offline.mapping.findings import Found
+from groundsbot.offline.mapping.inputs import check_distinct, check_new
+from groundsbot.offline.mapping.merge_report import alignment_results
+from groundsbot.offline.mapping.warnings import map_warnings
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps import CalibrationChoice, MapResult
+from groundsbot.offline.measurements import (
+    Chain,
+    Measurements,
+    Run,
+    TapeOptions,
+    chains_of,
+    check_tag_sizes,
+    parse_measurements,
+)
+from groundsbot.offline.noise import fit_and_weigh, weighed_as
+from groundsbot.offline.outliers import local_maps_of, told_apart, with_outliers_apart
+from groundsbot.offline.self_calibration import TIMES_MAPPED, Calibrate, about_the_files, free_what_is_told
+
+
+def build_map(
+    runs: Sequence[Run],
+    noise: NoiseParameters | None = None,
+    stages: Stages | None = None,
+    tape: TapeOptions | None = None,
+    prior_noise: NoiseParameters = NoiseParameters(),
+    *,
+    keep_suspects: bool = False,
+    corners: bool = False,
+    upright_sigma_rad: float | None = None,
+    calibrate: Calibrate = Calibrate(),
+    workings: Workings | None = None,
+    extending: MapResult | None = None,
+) -> MapResult:
+    """Turns runs into one map in the frame of the first run's start.
+
+    Args:
+        runs: of `load_run` or `read_runs`.
+        noise: sigmas of wheels and readings; None: they are fitted to the runs.
+        stages: told what is being done, and keeps what it took.
+        tape: what somebody measured.
+        prior_noise: where the fit begins, and what stays where the runs tell nothing.
+        keep_suspects: tags that do not belong are named only, not told apart from what they were.
+        corners: the solved map is refined on the tags' corners, where logs have them.
+        upright_sigma_rad: to which tags are known to hang upright, which corners then respect; None: they may hang
+            anyhow.
+        calibrate: which numbers of robot.yaml the drives may set.
+        workings: takes what the map was made from.
+        extending: a map that was kept, whose runs come first, and under whose noise all is solved.
+
+    Raises:
+        GroundsbotError: one line that says why there can be no map.
+    """
+    stages, tape = stages or Stages(), tape or TapeOptions()
+    check_distinct(runs)
+    check_tag_sizes(runs)
+    noise_fit = None
+    if extending is not None:
+        check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
+        noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
+    workings = workings or Workings()
+    workings.runs += runs
+    runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
+    measurements = _measurements(tape, runs, chains, extending)
+    known = _known_maps(extending, stages)
+    maps, broken = local_maps_of(chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
+    if noise is None:
+        with stages.stage("fitting the noise"):
+            maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
+    else:
+        maps = known + weighed_as(maps, noise, noise_fit)
+    kept = tuple(kept_of(each) for each in maps)
+    maps, merged, components, joins = _solved_together(
+        maps, measurements, stages, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad
+    )
+    workings.maps += maps
+    joined = join_results(components, joins)
+    found = Found()
+    while components:  # each is let go of where it has told its part: a factor on corners may take 100 MiB
+        workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
+    found.measured += unused(measurements, found.measured)
+    found.warnings += join_warnings(joins, joined)
+    runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
+    return MapResult(
+        components=tuple(found.components),
+        alignments=alignment_results(maps, merged) + joined,
+        noise=noise,
+        calibration=tuple(about_the_files(found.calibration, choices)),
+        measurements=tuple(found.measured),
+        checks=tuple(found.checks),
+        metres=tuple(found.metres),
+        warnings=map_warnings(
+            runs, maps, broken, merged, found, [each for each in joins if each.reason] if corners else None
+        ),
+        losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
+        suspects=tuple(found.suspects),
+        noise_fit=noise_fit,
+        advice=tuple(found.advice),
+        choices=choices,
+        kept=kept,
+    )
+
+
+def _calibrated(
+    runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
+) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...]]:
+    """The runs as their robots are to be taken, their stretches, and what self-calibration freed."""
+    chains = _chains(runs, noise, stages)
+    if not calibrate.is_on:
+        return runs, chains, ()
+    with stages.stage("self-calibration"):
+        freed, choices = free_what_is_told(runs, chains, noise, calibrate.names, corners=corners)
+    return freed, _chains(freed, noise, stages) if any(each.is_freed for each in choices) else chains, choices
+
+
+def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:
+    """All stretches of the runs, two tags with one id apart."""
+    chains: list[Chain] = []
+    with stages.stage("keyframes and readings", len(runs)) as done:
+        for run in runs:
+            chains += [told_apart(chain) for chain in chains_of(run, noise)]
+            done()
+    return chains
+
+
+def _measurements(
+    tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain], extending: MapResult | None
+) -> Measurements:
+    names, tags = [run.name for run in runs], {tag for chain in chains for tag in chain.tags}
+    if extending is not None:
+        names = [*dict.fromkeys(each.run for each in extending.kept), *names]
+        tags |= {tag for each in extending.kept for tag in tags_of(each)}
+    return parse_measurements(tape, names, sorted(tags))
+
+
+def _known_maps(extending: MapResult | None, stages: Stages) -> list[LocalMap]:
+    """The local maps of a map that is extended, under the noise that it was kept with."""
+    if extending is None:
+        return []
+    with stages.stage("the map that is extended"):
+        return [local_map_of(each) for each in extending.kept]
+
+
+class _Together(NamedTuple):
+    """Local maps, how they were aligned and solved together, and which single tags were asked to join components."""
+
+    maps: list[LocalMap]  # tags apart that lie elsewhere than in the other maps
+    merged: Merge
+    components: list[SolvedComponent]
+    joins: list[TagJoin]
+
+
+def _solved_together(
+    maps: Sequence[LocalMap],
+    measurements: Measurements,
+    stages: Stages,
+    *,
+    keep_suspects: bool,
+    corners: bool,
+    upright_sigma_rad: float | None,
+) -> _Together:
+    """Aligns local maps and solves each group that hangs together; on corners a single tag may join two of them."""
+    with stages.stage("aligning local maps"):
+        merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
+        maps = with_outliers_apart(maps, merged)
+    solve = partial(solved_component, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
+    components = [solve(maps, members, measurements, stages) for members in merged.groups]
+    joins: list[TagJoin] = []
+    if corners and len(components) > 1:
+        components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
+        merged = replace(merged, groups=tuple(each.members for each in components))
+    return _Together(maps, merged, components, joins)

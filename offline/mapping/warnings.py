@@ -1,0 +1,59 @@
+"""All that a person must be told of a map, in one list."""
+
+from collections.abc import Sequence
+
+from groundsbot.calib.robot import TAG_SCALE
+from groundsbot.offline.alignment import Merge
+from groundsbot.offline.global_map import COMPARED, TagJoin, check_warnings, measurement_warnings
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.mapping.findings import Found
+from groundsbot.offline.mapping.merge_report import merge_warnings
+from groundsbot.offline.maps import MAX_SIGMAS, CalibrationResult, CheckResult
+from groundsbot.offline.measurements import Chain, Run
+
+
+def map_warnings(
+    runs: Sequence[Run],
+    maps: Sequence[LocalMap],
+    broken: Sequence[str],
+    merged: Merge,
+    found: Found,
+    not_joined: Sequence[TagJoin] | None,
+) -> tuple[str, ...]:
+    """All that a person must be told, in the order in which it came up, each sentence once."""
+    chains = [each.chain for each in maps]
+    warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
+    warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
+    warnings += calibration_warnings(found.calibration, found.checks)
+    named = {(each.family, each.tag_id) for each in found.suspects}
+    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
+
+
+def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
+    """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
+    told = {
+        (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)
+        for check in checks
+        if check.contradicts
+        for name in COMPARED[check.name]
+    }
+    return [
+        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
+        "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
+        for entry in calibration
+        if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.owner, entry.name) not in told
+    ]
+
+
+def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
+    warnings = []
+    for chain in chains:
+        if chain.along_m[-1] < 0.05:
+            warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
+        if not chain.tags and len(chains) == 1:
+            warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
+        if len(chain.tags) == 1:
+            warnings.append(
+                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two would make sure how it lies to other runs"
+            )
+    return warnings

@@ -1,0 +1,46 @@
+"""What a map was made from, kept for those who want to look inside: the report and the advice."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.alignment import Group
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measurements import Run
+from groundsbot.offline.sam import Graph, Solution
+
+
+class Solved(NamedTuple):
+    """One component, as it was solved.
+
+    Attributes:
+        group: indices into `Workings.maps`, and where the alignments put their starts.
+        graph: its chains are the group's members in order, its tags those of the component in order.
+        solution: of that graph.
+        poses: (P, 3) of its keyframes as the map has them: refined on corners where that was possible.
+    """
+
+    group: Group
+    graph: Graph
+    solution: Solution
+    poses: FloatArray
+
+    def poses_of(self, chain: int) -> FloatArray:
+        """(K, 3) of one chain."""
+        first = int(self.graph.first_pose[chain])
+        return self.poses[first : first + len(self.graph.chains[chain].stamps_ns)]
+
+
+@dataclass
+class Workings:
+    """Filled by `build_map`.
+
+    Attributes:
+        maps: the local maps as they were aligned.
+        solved: the components, largest first.
+        runs: as they were given.
+    """
+
+    maps: list[LocalMap] = field(default_factory=list)
+    solved: list[Solved] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)

@@ -1,0 +1,66 @@
+from .archive import KeptCalibration, KeptChain, nominal_row
+from .files import JSON_FILE, read_map, write_map
+from .fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from .json_document import advice_as_json, map_as_json
+from .mcap import MAP_FILE, write_mcap
+from .model import MapModel
+from .parameter_results import (
+    MAX_SIGMAS,
+    NOT_NEEDED,
+    CalibrationChoice,
+    CalibrationResult,
+    CheckResult,
+    FittedNoise,
+    FittedParameter,
+    MetreResult,
+)
+from .result import (
+    AdviceResult,
+    Component,
+    FloorSigmas,
+    GraphEdges,
+    MapResult,
+    RunResult,
+    StartToStart,
+    TagPose,
+    TagResult,
+)
+from .tags_table import tags_csv
+from .tum import write_tum
+
+__all__ = [
+    "JSON_FILE",
+    "MAP_FILE",
+    "MAX_SIGMAS",
+    "NOT_NEEDED",
+    "AdviceResult",
+    "AlignmentResult",
+    "CalibrationChoice",
+    "CalibrationResult",
+    "CheckResult",
+    "Component",
+    "FittedNoise",
+    "FittedParameter",
+    "FloorSigmas",
+    "GraphEdges",
+    "KeptCalibration",
+    "KeptChain",
+    "MapModel",
+    "MapResult",
+    "MeasurementResult",
+    "MetreResult",
+    "RivalResult",
+    "RunResult",
+    "StartToStart",
+    "SuspectTag",
+    "TagPose",
+    "TagResult",
+    "advice_as_json",
+    "map_as_json",
+    "nominal_row",
+    "read_map",
+    "tags_csv",
+    "write_map",
+    "write_mcap",
+    "write_tum",
+]

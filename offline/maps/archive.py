@@ -1,0 +1,132 @@
+"""What a finished map keeps for later runs: to place them in it, and to solve them together with its own.
+
+Plain arrays and texts, as map.npz holds them; `kept_maps` makes local maps of them again.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS
+
+# What a calibration number corrects is four numbers at most; the rest of a row is NaN.
+_NOMINAL: Final = 4
+
+
+@dataclass(frozen=True)
+class KeptCalibration:
+    """What a component's solve knows of the calibration, together with its tags.
+
+    Attributes:
+        owners: (C,) robot id or printed batch of each number.
+        names: (C,) as in `CalibrationResult`.
+        nominal: (C, 4) what it corrects, NaN where that is fewer numbers.
+        values: (C,) corrections.
+        covariance: (C, C).
+        with_tags: (C, 2 T) covariance with the component's tags, in order as (x, y), map frame.
+    """
+
+    owners: tuple[str, ...]
+    names: tuple[str, ...]
+    nominal: FloatArray
+    values: FloatArray
+    covariance: FloatArray
+    with_tags: FloatArray
+
+
+@dataclass(frozen=True)
+class KeptChain:
+    """The measurements of one chain as they entered the joint solve, and where its own solve ended.
+
+    Attributes:
+        name, run, log, robot_id, run_id: as in `RunResult`.
+        robot_json: the robot.yaml that was used; camera_json: the camera, empty without one.
+        log_bytes: of the log.
+        lost: what of the log could not be read.
+        warnings: of the chain; run_warnings: of its run.
+        stamps_ns: (K,) of the keyframes.
+        motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels:
+            (K-1, 3, 3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
+        tag_families, tag_ids, tag_instances: (T,) what was read; an instance where the run alone told places apart.
+        reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance:
+            (M, 2, 2); reading_by_camera: (M, 2, 4) derivative by `readings.CAMERA_PARAMETERS`.
+        reading_polar, reading_in_camera: (M,) its form, and whether about the camera or about base.
+        picture_stamps_ns: (F,) of all pictures.
+        poses: (K, 3) in the frame of the chain's start; tags_m: (T, 2) there; calibration: of its graph.
+        goodness: (5,) the fields of `Goodness`.
+    """
+
+    name: str
+    run: str
+    log: str
+    robot_id: str
+    run_id: str
+    robot_json: str
+    camera_json: str
+    log_bytes: int
+    lost: str
+    warnings: tuple[str, ...]
+    run_warnings: tuple[str, ...]
+    stamps_ns: IntArray
+    motion: FloatArray
+    motion_covariance: FloatArray
+    motion_by_wheels: FloatArray
+    distance_m: FloatArray
+    tag_families: tuple[str, ...]
+    tag_ids: IntArray
+    tag_instances: tuple[str, ...]
+    reading_keyframe: IntArray
+    reading_tag: IntArray
+    reading: FloatArray
+    reading_covariance: FloatArray
+    reading_by_camera: FloatArray
+    reading_polar: BoolArray
+    reading_in_camera: BoolArray
+    picture_stamps_ns: IntArray
+    poses: FloatArray
+    tags_m: FloatArray
+    calibration: FloatArray
+    goodness: FloatArray
+
+
+def arrays_of(kept: KeptCalibration | KeptChain, key: str) -> dict[str, Any]:
+    """Arrays by name, each after the key; texts as unicode arrays."""
+    arrays: dict[str, Any] = {}
+    for each in fields(kept):
+        value = getattr(kept, each.name)
+        is_text = isinstance(value, str | tuple)
+        arrays[f"{key}{each.name}"] = np.array(value, dtype=np.str_) if is_text else np.asarray(value)
+    return arrays
+
+
+def calibration_from(arrays: Any, key: str) -> KeptCalibration | None:  # noqa: ANN401 - numpy's file of arrays
+    """What `arrays_of` wrote; None where there is none."""
+    return KeptCalibration(**_values(KeptCalibration, arrays, key)) if f"{key}owners" in arrays else None
+
+
+def chain_from(arrays: Any, key: str) -> KeptChain | None:  # noqa: ANN401 - numpy's file of arrays
+    """What `arrays_of` wrote; None where there is none, or one of a program that knew fewer numbers of a camera."""
+    if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
+        return None
+    return KeptChain(**_values(KeptChain, arrays, key))
+
+
+def _values(kind: type[KeptCalibration | KeptChain], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
+    """Of a dataclass: texts and counts as Python's own, all else as arrays."""
+    values: dict[str, Any] = {}
+    for each in fields(kind):
+        array = arrays[f"{key}{each.name}"]
+        if array.dtype.kind == "U":
+            values[each.name] = str(array) if array.ndim == 0 else tuple(array.tolist())
+        else:
+            values[each.name] = int(array) if array.ndim == 0 else array
+    return values
+
+
+def nominal_row(nominal: tuple[float, ...]) -> FloatArray:
+    """(4,) of what a calibration number corrects."""
+    row = np.full(_NOMINAL, np.nan)
+    row[: len(nominal)] = nominal
+    return row

@@ -1,0 +1,260 @@
+"""A map as JSON, and its entries read back: what map.json holds.
+
+docs/formats.md describes every key.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from groundsbot.offline.maps.parameter_results import CheckResult, FittedNoise, FittedParameter
+from groundsbot.offline.maps.result import (
+    AdviceResult,
+    Component,
+    FloorSigmas,
+    MapResult,
+    RunResult,
+    TagPose,
+    TagResult,
+)
+
+FORMAT_VERSION: Final = 1
+
+
+def map_as_json(result: MapResult) -> dict[str, Any]:
+    """What map.json holds: plain data, null where a number is not known."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "frame": "map",
+        "components": [_component_json(component) for component in result.components],
+        "runs": [_run_json(run, i) for i, component in enumerate(result.components) for run in component.runs],
+        "tags": [_tag_json(tag, i) for i, component in enumerate(result.components) for tag in component.tags],
+        "alignments": [_alignment_json(alignment) for alignment in result.alignments],
+        "start_to_start": [
+            {
+                "a": pair.a,
+                "b": pair.b,
+                "vector_m": _plain(pair.vector_m),
+                "distance_m": _plain(pair.distance_m),
+                "sigma_m": _plain(pair.sigma_m),
+                "covariance": _plain(pair.covariance),
+            }
+            for component in result.components
+            for pair in component.start_to_start
+        ],
+        "noise": result.noise.model_dump() | _floor_json(result.components[0].floor if result.components else None),
+        "noise_fit": None if result.noise_fit is None else _plain(asdict(result.noise_fit)),
+        "calibration": [_plain(vars(entry)) for entry in result.calibration],
+        "choices": [_plain(vars(entry)) for entry in result.choices],
+        "measurements": [_plain(vars(entry)) for entry in result.measurements],
+        "checks": [_plain({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
+        "metres": [_plain(vars(entry)) for entry in result.metres],
+        "suspect_tags": [_suspect_json(suspect) for suspect in result.suspects],
+        "advice": [advice_as_json(advice) for advice in result.advice],
+        "warnings": list(result.warnings),
+        "losses": list(result.losses),
+    }
+
+
+def _component_json(component: Component) -> dict[str, Any]:
+    return {
+        "frame_run": component.frame_run,
+        "runs": [run.name for run in component.runs],
+        "tags": [{"family": t.family, "tag_id": t.tag_id, "instance": t.instance} for t in component.tags],
+        "model": component.model,
+        "cost": _plain(component.cost),
+        "n_residuals": component.n_residuals,
+        "floor": _floor_json(component.floor) or None,
+    }
+
+
+def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:
+    return {} if floor is None else asdict(floor)
+
+
+def noise_from(entry: dict[str, Any]) -> NoiseParameters:
+    """Of `noise`; what it holds of the floor is each component's."""
+    floor = {each.name for each in fields(FloorSigmas)}
+    return NoiseParameters.model_validate({name: value for name, value in entry.items() if name not in floor})
+
+
+def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
+    """Of `floor` of a component."""
+    return None if entry is None else FloorSigmas(**entry)
+
+
+def _run_json(run: RunResult, component: int) -> dict[str, Any]:
+    return {
+        "run": run.name,
+        "log": str(run.log),
+        "robot": run.robot_id,
+        "T_map_start": _plain(run.T_map_start),
+        "covariance": _plain(run.covariance),
+        "n_keyframes": run.n_keyframes,
+        "distance_m": _plain(run.distance_m),
+        "run_id": run.run_id,
+        "stretch_of": None if run.run == run.name else run.run,
+        "component": component,
+        "T_base_camera": None if run.T_base_camera is None else _plain(run.T_base_camera),
+    }
+
+
+def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
+    return {
+        "family": tag.family,
+        "tag_id": tag.tag_id,
+        "instance": tag.instance,
+        "size_m": _plain(tag.size_m),
+        "position_m": _plain(tag.position_m if tag.pose is None else np.append(tag.position_m, tag.pose.height_m)),
+        "quaternion_xyzw": None if tag.pose is None else _plain(tag.pose.quaternion_xyzw),
+        "covariance": _plain(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
+        "pose_covariance": None if tag.pose is None else _plain(tag.pose.covariance),
+        "n_observations": tag.n_observations,
+        "runs": list(tag.runs),
+        "component": component,
+    }
+
+
+def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
+    return {
+        "from": alignment.from_run,
+        "to": alignment.to_run,
+        "transform": _plain(alignment.T_from_to),
+        "n_shared": alignment.n_shared,
+        "n_inliers": alignment.n_inliers,
+        "inlier_rmse_m": _plain(alignment.inlier_rmse_m),
+        "outliers": _tag_names_json(alignment.outliers),
+        "is_sure": alignment.is_sure,
+        "is_weak": alignment.is_weak,
+        "covariance": None if alignment.covariance is None else _plain(alignment.covariance),
+        "rivals": [
+            {"transform": _plain(rival.T_from_to), "n_inliers": len(rival.tags), "tags": _tag_names_json(rival.tags)}
+            for rival in alignment.rivals
+        ],
+    }
+
+
+def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
+    entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence")}
+    other = {} if suspect.swapped_with is None else {"swapped_with": suspect.swapped_with}
+    return entry | {"runs": list(suspect.runs)} | other
+
+
+def advice_as_json(advice: AdviceResult) -> dict[str, Any]:
+    """An entry of `advice` in map.json."""
+    entry = {name: _plain(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
+    return entry | {"tags": [_tag_key_json(tag) for tag in advice.tags], "worst_tag": _tag_key_json(advice.worst_tag)}
+
+
+def _tag_key_json(tag: tuple[str, int, str]) -> dict[str, Any]:
+    return dict(zip(("family", "tag_id", "instance"), tag, strict=True))
+
+
+def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
+    return [{"family": family, "tag_id": tag_id} for family, tag_id in tags]
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any depth
+    """Numbers, texts, nested lists and mappings for JSON, which has no NaN: null instead."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return [_plain(entry) for entry in value] if value.ndim else _plain(float(value))
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def tag_from(entry: dict[str, Any]) -> TagResult:
+    """Of an entry of `tags`."""
+    return TagResult(
+        family=entry["family"],
+        tag_id=entry["tag_id"],
+        instance=entry["instance"],
+        size_m=entry["size_m"],
+        position_m=array_from(entry["position_m"])[:2],
+        covariance=array_from(entry["covariance"])[:2, :2],
+        n_observations=entry["n_observations"],
+        runs=tuple(entry["runs"]),
+        pose=_tag_pose(entry),
+    )
+
+
+def _tag_pose(entry: dict[str, Any]) -> TagPose | None:
+    if entry["quaternion_xyzw"] is None:
+        return None
+    height_m = number_from(entry["position_m"][2])
+    return TagPose(height_m, array_from(entry["quaternion_xyzw"]), array_from(entry["pose_covariance"]))
+
+
+def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
+    """Of an entry of `alignments`."""
+    return AlignmentResult(
+        from_run=entry["from"],
+        to_run=entry["to"],
+        T_from_to=array_from(entry["transform"]),
+        n_shared=entry["n_shared"],
+        n_inliers=entry["n_inliers"],
+        inlier_rmse_m=number_from(entry["inlier_rmse_m"]),
+        outliers=_tag_names(entry["outliers"]),
+        is_sure=entry["is_sure"],
+        rivals=tuple(
+            RivalResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
+        ),
+        is_weak=entry.get("is_weak", False),
+        covariance=None if entry.get("covariance") is None else array_from(entry["covariance"]),
+    )
+
+
+def measurement_from(entry: dict[str, Any]) -> MeasurementResult:
+    """Of an entry of `measurements`."""
+    in_map = entry["in_map"]
+    arrays = {"measured": array_from(entry["measured"]), "sigma": array_from(entry["sigma"])}
+    return MeasurementResult(**entry | arrays | {"in_map": None if in_map is None else array_from(in_map)})
+
+
+def check_from(entry: dict[str, Any]) -> CheckResult:
+    """Of an entry of `checks`."""
+    return CheckResult(**{name: value for name, value in entry.items() if name != "sigmas"})
+
+
+def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:
+    """Of `noise_fit`."""
+    if entry is None:
+        return None
+    parameters = tuple(FittedParameter(**parameter) for parameter in entry["parameters"])
+    return FittedNoise(
+        parameters,
+        shared_range=number_from(entry["shared_range"]),
+        shared_bearing=number_from(entry["shared_bearing"]),
+        runs=tuple(entry["runs"]),
+        contradicting=tuple(entry["contradicting"]),
+    )
+
+
+def advice_from(entry: dict[str, Any]) -> AdviceResult:
+    """Of an entry of `advice`."""
+    tags = [(each["family"], each["tag_id"], each["instance"]) for each in (*entry["tags"], entry["worst_tag"])]
+    named = {"tags": tuple(tags[:-1]), "worst_tag": tags[-1], "way_m": array_from(entry["way_m"]).reshape(-1, 2)}
+    return AdviceResult(**entry | named)
+
+
+def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:
+    return tuple((entry["family"], entry["tag_id"]) for entry in entries)
+
+
+def number_from(value: float | None) -> float:
+    """Of a number, or of null where it was not known."""
+    return float("nan") if value is None else value
+
+
+def array_from(values: Sequence[Any]) -> FloatArray:
+    """Of nested lists of numbers and nulls."""
+    return np.array(values, dtype=np.float64)

@@ -1,0 +1,230 @@
+"""The finished map as an MCAP file: Foxglove, Lichtblick and Rerun show it, and play the drives over it.
+
+Stamps are those of the run logs, so that a log opened beside it runs on the same time line. Topics are not those of a
+log, since one topic has one schema.
+"""
+
+import heapq
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from groundsbot.calib.foundation import written_whole
+from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
+from groundsbot.onboard.log import BASE_FRAME, CAMERA_FRAME, FrameTransform, timestamp
+
+MAP_FILE: Final = "map.mcap"
+TRANSFORMS_TOPIC: Final = "/map/tf"
+TAGS_TOPIC: Final = "/map/tags"
+RUNS_TOPIC: Final = "/map/runs"
+
+_TAG_DIAMETER_M: Final = 0.1
+_FLAT_M: Final = 0.002
+_LINE_PX: Final = 2.0
+_TEXT_M: Final = 0.2
+_TAG_COLOR: Final = Color(r=0.9, g=0.6, b=0.0, a=1.0)
+_ELLIPSE_COLOR: Final = Color(r=0.9, g=0.6, b=0.0, a=0.35)
+# Okabe and Ito's, which people with any colour vision tell apart, on light and dark.
+_RUN_COLORS: Final = tuple(
+    Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
+    for r, g, b in ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (240, 228, 66))
+)
+
+
+class _Entry(NamedTuple):
+    """One message; in order of time, then of topic."""
+
+    stamp_ns: int
+    topic: str
+    message: Message
+
+
+def frame_of(component: int) -> str:
+    """`map`; the others, about which it knows nothing, have frames of their own: `map2`, `map3`."""
+    return "map" if component == 0 else f"map{component + 1}"
+
+
+def write_mcap(result: MapResult, path: Path) -> None:
+    """Writes tags, trajectories and transforms of all components; the same bytes for the same map.
+
+    What does not change stands at the first stamp of all runs; each keyframe moves its run's frame at its own stamp.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with written_whole(path) as partial, partial.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="groundsbot")
+        channels: dict[str, int] = {}
+        for number, (stamp_ns, topic, message) in enumerate(_entries(result)):
+            if topic not in channels:
+                schema = register_schema(writer, type(message))
+                channels[topic] = writer.register_channel(topic, MessageEncoding.Protobuf, schema)
+            data = message.SerializeToString(deterministic=True)
+            writer.add_message(channels[topic], stamp_ns, data, stamp_ns, sequence=number)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
+
+
+def _entries(result: MapResult) -> Iterator[_Entry]:
+    """All messages in order of time."""
+    first_ns = min(int(run.stamps_ns[0]) for run in result.runs)
+    colors = itertools.cycle(_RUN_COLORS)
+    for index, component in enumerate(result.components):
+        frame = frame_of(index)
+        suffix = "" if index == 0 else f"/{frame}"
+        yield _Entry(first_ns, TAGS_TOPIC + suffix, _tags_scene(component, frame, first_ns))
+        for run in component.runs:
+            yield _Entry(first_ns, f"/map/{run.name}/keyframes", _keyframes(run, frame, first_ns))
+        lines = [_line(run, frame, first_ns, color) for run, color in zip(component.runs, colors, strict=False)]
+        yield _Entry(first_ns, RUNS_TOPIC + suffix, SceneUpdate(entities=lines))
+    moving = [
+        _transforms(run, frame_of(index)) for index, component in enumerate(result.components) for run in component.runs
+    ]
+    yield from heapq.merge(*moving, key=lambda entry: entry.stamp_ns)
+
+
+def _transforms(run: RunResult, frame: str) -> Iterator[_Entry]:
+    """The base in the map at each keyframe, and once the camera on the base."""
+    base = f"{run.name}/{BASE_FRAME}"
+    fixed = []
+    if run.T_base_camera is not None:
+        x, y, z, qx, qy, qz, qw = run.T_base_camera.tolist()
+        fixed.append(
+            FrameTransform(
+                timestamp=timestamp(int(run.stamps_ns[0])),
+                parent_frame_id=base,
+                child_frame_id=f"{run.name}/{CAMERA_FRAME}",
+                translation=Vector3(x=x, y=y, z=z),
+                rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+            )
+        )
+    for stamp_ns, (x, y, theta_rad) in zip(run.stamps_ns.tolist(), run.T_map_base.tolist(), strict=True):
+        moved = FrameTransform(
+            timestamp=timestamp(stamp_ns),
+            parent_frame_id=frame,
+            child_frame_id=base,
+            translation=Vector3(x=x, y=y, z=0.0),
+            rotation=_turned(theta_rad),
+        )
+        yield _Entry(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=[moved, *fixed]))
+        fixed = []
+
+
+def _keyframes(run: RunResult, frame: str, stamp_ns: int) -> PosesInFrame:
+    message = PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame)
+    message.poses.extend(_pose(*T_map_base) for T_map_base in run.T_map_base.tolist())
+    return message
+
+
+def _line(run: RunResult, frame: str, stamp_ns: int, color: Color) -> SceneEntity:
+    line = LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=_LINE_PX,
+        scale_invariant=True,
+        color=color,
+    )
+    line.points.extend(Point3(x=x, y=y, z=0.0) for x, y in run.T_map_base[:, :2].tolist())
+    said = {"run": run.name, "robot": run.robot_id, "distance_m": f"{run.distance_m:.3f}"}
+    entity = _entity(run.name, frame, stamp_ns, said)
+    entity.lines.append(line)
+    return entity
+
+
+def _tags_scene(component: Component, frame: str, stamp_ns: int) -> SceneUpdate:
+    return SceneUpdate(entities=[_tag(tag, frame, stamp_ns) for tag in component.tags])
+
+
+def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
+    """A ball, its one-sigma ellipse on the floor plan, and its number; at z = 0 where the map knows no height."""
+    x, y = tag.position_m.tolist()
+    z_m = 0.0 if tag.pose is None else tag.pose.height_m
+    ball = SpherePrimitive(
+        pose=Pose(position=Vector3(x=x, y=y, z=z_m), orientation=_orientation(tag)),
+        size=Vector3(x=_TAG_DIAMETER_M, y=_TAG_DIAMETER_M, z=_TAG_DIAMETER_M),
+        color=_TAG_COLOR,
+    )
+    text = TextPrimitive(
+        pose=Pose(position=Vector3(x=x, y=y, z=z_m + _TAG_DIAMETER_M), orientation=_turned(0.0)),
+        billboard=True,
+        font_size=_TEXT_M,
+        color=_TAG_COLOR,
+        text=tag.label,
+    )
+    sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag.covariance)).tolist()
+    said = {
+        "family": tag.family,
+        "tag_id": str(tag.tag_id),
+        "instance": tag.instance,
+        "sigma_x_m": f"{sigma_x_m:.4f}",
+        "sigma_y_m": f"{sigma_y_m:.4f}",
+        "n_observations": str(tag.n_observations),
+        "runs": " ".join(tag.runs),
+    }
+    entity = _entity(tag.full_label, frame, stamp_ns, said)
+    if tag.pose is not None:
+        entity.metadata.append(KeyValuePair(key="height_m", value=f"{tag.pose.height_m:.4f}"))
+    entity.spheres.append(ball)
+    entity.texts.append(text)
+    if np.isfinite(tag.covariance).all():
+        entity.cylinders.append(_ellipse(tag))
+    return entity
+
+
+def _orientation(tag: TagResult) -> Quaternion:
+    """R_map_tag, z out of the face; none where the map knows none."""
+    if tag.pose is None:
+        return _turned(0.0)
+    x, y, z, w = tag.pose.quaternion_xyzw.tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _ellipse(tag: TagResult) -> CylinderPrimitive:
+    """One sigma, as a flat cylinder."""
+    variances, axes = np.linalg.eigh(tag.covariance)
+    minor_m, major_m = (2.0 * np.sqrt(np.maximum(variances, 0.0))).tolist()
+    x, y = tag.position_m.tolist()
+    return CylinderPrimitive(
+        pose=_pose(x, y, float(np.arctan2(axes[1, 1], axes[0, 1]))),
+        size=Vector3(x=major_m, y=minor_m, z=_FLAT_M),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=_ELLIPSE_COLOR,
+    )
+
+
+def _entity(name: str, frame: str, stamp_ns: int, said: dict[str, str]) -> SceneEntity:
+    """Something that stays for good (a lifetime of zero), still to be drawn."""
+    metadata = [KeyValuePair(key=key, value=value) for key, value in said.items()]
+    return SceneEntity(timestamp=timestamp(stamp_ns), frame_id=frame, id=name, metadata=metadata)
+
+
+def _pose(x_m: float, y_m: float, theta_rad: float) -> Pose:
+    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=_turned(theta_rad))
+
+
+def _turned(theta_rad: float) -> Quaternion:
+    """About z."""
+    half = 0.5 * theta_rad
+    return Quaternion(x=0.0, y=0.0, z=float(np.sin(half)), w=float(np.cos(half)))

@@ -1,0 +1,192 @@
+"""One stretch of a run as the estimate sees it: keyframes, the motions between them, and tag readings from them."""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry, WheelTrack, compose_odometry
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.observations import read_detections, read_positions
+from groundsbot.offline.measurements.sensor_model.readings import Readings, joined
+from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+
+# A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
+KEYFRAME_DISTANCE_M: Final = 0.02
+KEYFRAME_TURN_RAD: Final = np.radians(1.0)
+# it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
+# look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
+_STANDING_TICKS: Final = 1.5
+_STANDING_M: Final = 1e-7  # rounding
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Keyframes with unbroken odometry.
+
+    Attributes:
+        name: the run's, with the stretch where there are several.
+        run: whose measurements these are.
+        stamps_ns: (K,) of the keyframes; the first is the chain's first wheel reading.
+        odometry: the K-1 motions.
+        tags: what was read, sorted; `readings.tag` points here.
+        readings: tag readings, ordered by keyframe.
+        warnings: what a person should know.
+    """
+
+    name: str
+    run: Run
+    stamps_ns: IntArray
+    odometry: ChainOdometry
+    tags: tuple[TagKey, ...]
+    readings: Readings
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def T_base_camera(self) -> FloatArray:
+        """(3,) the camera's place and yaw on the floor plan, nominal."""
+        mount = self.run.robot.mount
+        return np.array([mount.x_m, mount.y_m, mount.yaw_rad])
+
+    @property
+    def along_m(self) -> FloatArray:
+        """(K,) the way driven until each keyframe."""
+        return np.append(0.0, np.cumsum(self.odometry.distance_m))
+
+    def prefix(self, n_keyframes: int) -> "Chain":
+        """The same chain as far as its first keyframes, with the tags read until then."""
+        return self.part(0, n_keyframes)
+
+    def part(self, first: int, end: int) -> "Chain":
+        """Keyframes first to end - 1 of the same chain, with the tags read there."""
+        inside = (self.readings.keyframe >= first) & (self.readings.keyframe < end)
+        readings = self.readings.where(inside)
+        seen, tag = np.unique(readings.tag, return_inverse=True)
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[first:end],
+            odometry=self.odometry.part(first, end - 1),
+            tags=tuple(self.tags[i] for i in seen),
+            readings=replace(readings, tag=tag, keyframe=readings.keyframe - first),
+        )
+
+    def weighed(self, noise: NoiseParameters) -> "Chain":
+        """The same measurements under other noise."""
+        return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
+
+
+def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:
+    """A run's stretches as chains."""
+    several = len(run.stretches) > 1
+    chains = []
+    for i, track in enumerate(run.stretches):
+        name = run.name if i == 0 else f"{run.name}_stretch{i + 1}"
+        chain = _chain(name, run, track, noise)
+        where = f"{name}: " if several else f"{run.name}: "
+        chains.append(replace(chain, warnings=tuple(where + warning for warning in chain.warnings)))
+    lost = sorted(set(run.tags) - {tag for chain in chains for tag in chain.tags})
+    if lost:
+        names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
+        warning = f"{run.name}: tag {names} was detected, but no reading of it can be used; this run does not place it"
+        chains[0] = replace(chains[0], warnings=(*chains[0].warnings, warning))
+    return chains
+
+
+def _chain(name: str, run: Run, track: WheelTrack, noise: NoiseParameters) -> Chain:
+    stamps_ns = _candidate_stamps(run, track)
+    tags_at = _tags_at(run, stamps_ns)
+    keyframe_stamps_ns, keyframe_of = _choose_keyframes(track, stamps_ns, tags_at, run.robot.wheels.track_m)
+    twist = track.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
+    readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
+    seen, tag = np.unique(readings.tag, return_inverse=True)
+    return Chain(
+        name=name,
+        run=run,
+        stamps_ns=keyframe_stamps_ns,
+        odometry=compose_odometry(track, keyframe_stamps_ns, run.robot.wheels.track_m, noise),
+        tags=tuple(run.tags[i] for i in seen),
+        readings=replace(readings, tag=tag),
+        warnings=tuple(warnings),
+    )
+
+
+def _candidate_stamps(run: Run, track: WheelTrack) -> IntArray:
+    """Times at which a pose is wanted: pictures, or whatever an imported log was stamped with."""
+    stamps_ns = run.picture_stamps_ns
+    if not len(stamps_ns):
+        stamps_ns = np.union1d(track.stamps_ns, run.positions.stamps_ns)
+    inside = (stamps_ns >= track.stamps_ns[0]) & (stamps_ns <= track.stamps_ns[-1])
+    return np.asarray(np.union1d(track.stamps_ns[:1], stamps_ns[inside]), dtype=np.int64)
+
+
+def _tags_at(run: Run, stamps_ns: IntArray) -> list[set[int]]:
+    """The tags that each candidate shows."""
+    tags_at: list[set[int]] = [set() for _ in stamps_ns]
+    indices = np.arange(len(stamps_ns))
+    for source in (run.detections, run.positions):
+        at = _keyframe_at(source.stamps_ns, stamps_ns, indices)
+        for candidate, tag in zip(at.tolist(), source.tag.tolist(), strict=True):
+            if candidate >= 0:
+                tags_at[candidate].add(tag)
+    return tags_at
+
+
+def _choose_keyframes(
+    track: WheelTrack, stamps_ns: IntArray, tags_at: list[set[int]], track_m: float
+) -> tuple[IntArray, IntArray]:
+    """Thins by motion: (K,) stamps, and for each candidate its keyframe or -1 (passed over)."""
+    left_m, right_m = track.at(stamps_ns)
+    distance_m, turn_rad = 0.5 * (left_m + right_m), (right_m - left_m) / track_m
+    keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
+    standing_m = _STANDING_TICKS * track.quantum_m + _STANDING_M
+    chosen: list[int] = []
+    for i, (distance, turn) in enumerate(zip(distance_m.tolist(), turn_rad.tolist(), strict=True)):
+        moved_m = abs(distance - distance_m[chosen[-1]]) if chosen else np.inf
+        turned_rad = abs(turn - turn_rad[chosen[-1]]) if chosen else np.inf
+        standing = moved_m + 0.5 * track_m * turned_rad <= standing_m  # the wheel that moved more
+        moved = moved_m >= KEYFRAME_DISTANCE_M or turned_rad >= KEYFRAME_TURN_RAD
+        if moved or (not standing and tags_at[i] - tags_at[chosen[-1]]):
+            chosen.append(i)
+        elif not standing:
+            continue
+        keyframe_of[i] = len(chosen) - 1
+    return stamps_ns[chosen], keyframe_of
+
+
+def _readings(
+    run: Run, stamps_ns: IntArray, keyframe_of: IntArray, twist: FloatArray, noise: NoiseParameters
+) -> tuple[Readings, list[str]]:
+    """Readings of one stretch with the keyframe of each; what fell between keyframes is passed over."""
+    detections, positions = run.detections, run.positions
+    keyframe = _keyframe_at(detections.stamps_ns, stamps_ns, keyframe_of)
+    kept = keyframe >= 0
+    from_corners, warnings = read_detections(
+        run,
+        Detections(detections.stamps_ns[kept], detections.tag[kept], detections.corners_px[kept]),
+        keyframe[kept],
+        twist,
+        noise,
+    )
+    keyframe = _keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
+    kept = keyframe >= 0
+    imported, more_warnings = read_positions(
+        Positions(
+            positions.stamps_ns[kept],
+            positions.tag[kept],
+            positions.value[kept],
+            positions.polar[kept],
+            positions.covariance[kept],
+            positions.in_camera[kept],
+        ),
+        keyframe[kept],
+        noise,
+    )
+    return joined(from_corners, imported), warnings + more_warnings
+
+
+def _keyframe_at(wanted_ns: IntArray, stamps_ns: IntArray, keyframe_of: IntArray) -> IntArray:
+    """Keyframe of each wanted stamp, -1 where it is none of the candidates."""
+    at = np.minimum(np.searchsorted(stamps_ns, wanted_ns), len(stamps_ns) - 1)
+    return np.where(stamps_ns[at] == wanted_ns, keyframe_of[at], -1)

@@ -1,0 +1,251 @@
+"""Wheel readings between keyframes -> one motion, its covariance and its dependence on the wheel calibration.
+
+No reading is thinned out: exact arcs from reading to reading, composed, with the noise of each carried to the
+keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the chain's first wheel reading.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import chained, se2, wheels
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
+
+# In the order of the unit covariances below.
+ODOMETRY_NOISE: Final = (
+    "sigma_distance_m_per_sqrt_m",
+    "sigma_lateral_m_per_sqrt_m",
+    "sigma_heading_rad_per_sqrt_m",
+    "sigma_heading_rad_per_sqrt_rad",
+)
+
+# Where readings are missing for longer, cumulative counts still give distance and turn, not the path between.
+GAP_NS: Final = 500_000_000
+_GAP_SIGMA_PER_M: Final = 0.1
+_WHILE_NS: Final = 25_000_000
+# Over so many one more or less counts for a percent.
+_MANY_TICKS: Final = 100.0
+
+# Below what any encoder resolves; keeps the information of a step that measured no motion finite.
+_SMALLEST_QUANTUM_M: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class WheelTrack:
+    """Wheel readings of one stretch: unbroken cumulative distances.
+
+    Attributes:
+        stamps_ns: (N,) strictly increasing.
+        left_m, right_m: (N,) cumulative, by the nominal radii.
+        quantum_m: distance of one encoder tick; 0 where unknown.
+        covariance: (N, 3, 3) of the right tangent of the step that ends at each reading; NaN where the noise model
+            tells, None where it tells for all.
+    """
+
+    stamps_ns: IntArray
+    left_m: FloatArray
+    right_m: FloatArray
+    quantum_m: float = 0.0
+    covariance: FloatArray | None = None
+
+    @cached_property
+    def _since_first_s(self) -> FloatArray:
+        """(N,) of the readings."""
+        return _seconds(self.stamps_ns, self.stamps_ns[0])
+
+    def at(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Cumulative (left_m, right_m) at other times: speeds are constant between readings."""
+        times = _seconds(stamps_ns, self.stamps_ns[0])
+        return np.interp(times, self._since_first_s, self.left_m), np.interp(times, self._since_first_s, self.right_m)
+
+    def twist_at(self, stamps_ns: IntArray, track_m: float) -> FloatArray:
+        """(K, 2) speed in m/s and turning rate in rad/s about some times, by differences over a short while."""
+        before = np.maximum(stamps_ns - _WHILE_NS, self.stamps_ns[0])
+        after = np.minimum(stamps_ns + _WHILE_NS, self.stamps_ns[-1])
+        left_m, right_m = (m[1] - m[0] for m in self.at(np.stack([before, after])))
+        seconds = np.maximum(after - before, 1) * 1e-9
+        speed_m_s, turning_rad_s = 0.5 * (left_m + right_m) / seconds, (right_m - left_m) / (track_m * seconds)
+        return np.stack([speed_m_s, turning_rad_s], axis=-1)
+
+
+@dataclass(frozen=True)
+class ChainOdometry:
+    """Motion from each of K keyframes to the next.
+
+    Attributes:
+        motion: (K-1, 3) T_k_k+1 by the nominal calibration.
+        covariance: (K-1, 3, 3) of the motion's right tangent.
+        parts: what the covariance is made of.
+        jacobian: (K-1, 3, 3) derivative of that tangent by WHEEL_PARAMETERS.
+        distance_m: (K-1,) driven.
+    """
+
+    motion: FloatArray
+    covariance: FloatArray
+    parts: CovarianceParts
+    jacobian: FloatArray
+    distance_m: FloatArray
+
+    def __len__(self) -> int:
+        """Number of steps."""
+        return len(self.motion)
+
+    def part(self, first: int, end: int) -> "ChainOdometry":
+        """Steps first to end - 1 only."""
+        steps = slice(first, end)
+        return ChainOdometry(
+            self.motion[steps],
+            self.covariance[steps],
+            self.parts.where(steps),
+            self.jacobian[steps],
+            self.distance_m[steps],
+        )
+
+    def weighed(self, noise: NoiseParameters) -> "ChainOdometry":
+        """The same motions under other noise."""
+        return replace(self, covariance=self.parts.under(noise))
+
+    def dead_reckoned(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
+        """(K, 3) poses that follow from the motions alone, from `start` (3,) on, with wheel parameters (3,)."""
+        motion = self.motion
+        if calibration is not None:
+            motion = se2.compose(motion, se2.exp(self.jacobian @ calibration))
+        return chained(motion, np.zeros(3) if start is None else start)
+
+
+def compose_odometry(
+    track: WheelTrack, keyframe_stamps_ns: IntArray, track_m: float, noise: NoiseParameters
+) -> ChainOdometry:
+    """Composes all wheel readings between keyframes.
+
+    Args:
+        track: the stretch's readings.
+        keyframe_stamps_ns: (K,) strictly increasing, within the stretch.
+        track_m: nominal distance between the wheels.
+        noise: what is added per metre and per radian.
+    """
+    if len(keyframe_stamps_ns) < 2:
+        none = np.zeros((0, 3, 3))
+        parts = CovarianceParts(ODOMETRY_NOISE, np.zeros((len(ODOMETRY_NOISE), 0, 3, 3)), none)
+        return ChainOdometry(np.zeros((0, 3)), none, parts, none, np.zeros(0))
+    inner = track.stamps_ns[(track.stamps_ns >= keyframe_stamps_ns[0]) & (track.stamps_ns <= keyframe_stamps_ns[-1])]
+    grid_ns = np.union1d(inner, keyframe_stamps_ns)
+    left_m, right_m = track.at(grid_ns)
+    left_m, right_m = np.diff(left_m), np.diff(right_m)
+    pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
+    poses = chained(pieces, np.zeros(3))
+
+    ends = np.searchsorted(grid_ns, keyframe_stamps_ns)
+    step_of_piece = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+    # A disturbance at a piece's end, seen from the keyframe at the step's end.
+    to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
+
+    duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
+    while_of_piece = _whiles(step_of_piece, 0.5 * (np.abs(left_m) + np.abs(right_m)), track.quantum_m)
+    net_forward_m = _net(0.5 * (left_m + right_m), duration_s, while_of_piece)
+    net_turn_rad = np.abs(_net(right_m - left_m, duration_s, while_of_piece)) / track_m
+    unit, in_gap = _piece_covariances(net_forward_m, net_turn_rad, duration_s)
+    known = _given(track, grid_ns)
+    is_given = np.isfinite(known).all((-1, -2))
+    unit[:, is_given] = 0.0
+    known[~is_given] = 0.0
+    parts = CovarianceParts(
+        ODOMETRY_NOISE,
+        np.stack([_summed(_carried(to_step_end, each), ends) for each in unit]),
+        _summed(_carried(to_step_end, in_gap + known), ends)
+        + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+    )
+    tangent = se2.right_tangent_from_coordinates(pieces)
+    jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
+    return ChainOdometry(
+        motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
+        covariance=parts.under(noise),
+        parts=parts,
+        jacobian=_summed(to_step_end @ jacobian, ends),
+        distance_m=_summed(np.abs(0.5 * (left_m + right_m)), ends),
+    )
+
+
+def _carried(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
+    carried: FloatArray = to_step_end @ covariance @ to_step_end.swapaxes(-1, -2)
+    return carried
+
+
+def _given(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
+    """(N, 3, 3) covariances of pieces as the readings have them, shared out by duration; NaN where they have none."""
+    if track.covariance is None:
+        return np.full((len(grid_ns) - 1, 3, 3), np.nan)
+    reading = np.searchsorted(track.stamps_ns, grid_ns[1:])
+    share = np.diff(grid_ns) / (track.stamps_ns[reading] - track.stamps_ns[reading - 1])
+    return np.asarray(share[:, None, None] * track.covariance[reading])
+
+
+def _whiles(step_of_piece: IntArray, rolled_m: FloatArray, quantum_m: float) -> IntArray:
+    """(N,) rising numbers: pieces that follow each other within a step and some ticks have the same."""
+    rolled = np.cumsum(rolled_m)
+    rolled -= rolled[np.searchsorted(step_of_piece, step_of_piece)]
+    part = np.floor(rolled / max(_MANY_TICKS * quantum_m, _SMALLEST_QUANTUM_M))
+    begins = (np.diff(step_of_piece, prepend=-1) != 0) | (np.diff(part, prepend=0.0) != 0.0)
+    return np.asarray(np.cumsum(begins) - 1)
+
+
+def _net(moved: FloatArray, duration_s: FloatArray, while_of_piece: IntArray) -> FloatArray:
+    """(N,) what came of each while in the end, spread over its pieces by duration.
+
+    Quantised readings taken one by one would add up ways and turns that never were, as would many of them together lose
+    what was driven there and back.
+    """
+    whole = np.bincount(while_of_piece, moved)
+    duration = np.bincount(while_of_piece, duration_s)
+    return np.asarray(whole[while_of_piece] * duration_s / duration[while_of_piece])
+
+
+def _piece_covariances(
+    forward_m: FloatArray, net_turn_rad: FloatArray, duration_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(4, N, 3, 3) by ODOMETRY_NOISE, of the pieces' right tangents, and (N, 3, 3) what a gap adds.
+
+    Noise comes in all along a piece.
+    """
+    distance_m = np.abs(forward_m)
+    heading = np.zeros((len(forward_m), 3, 3))
+    # A heading error made u before the end moves the end sideways by u times it: means of u^2 and u over the piece.
+    heading[:, 1, 1] = forward_m**2 / 3.0
+    heading[:, 1, 2] = heading[:, 2, 1] = forward_m / 2.0
+    heading[:, 2, 2] = 1.0
+    unit = np.zeros((len(ODOMETRY_NOISE), len(forward_m), 3, 3))
+    unit[0, :, 0, 0] = unit[1, :, 1, 1] = distance_m
+    unit[2] = distance_m[:, None, None] * heading
+    unit[3] = net_turn_rad[:, None, None] * heading
+    in_gap = np.zeros((len(forward_m), 3, 3))
+    in_gap[:, 0, 0] = in_gap[:, 1, 1] = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
+    return unit, in_gap
+
+
+def _by_wheel_parameters(
+    d_wheels: FloatArray, d_track: FloatArray, left_m: FloatArray, right_m: FloatArray, track_m: float
+) -> FloatArray:
+    """(N, 3, 3) derivative of the pieces' coordinates by WHEEL_PARAMETERS."""
+    by_left, by_right = d_wheels[..., 0] * left_m[:, None], d_wheels[..., 1] * right_m[:, None]
+    return np.stack([by_left + by_right, 0.5 * (by_right - by_left), d_track * track_m], axis=-1)
+
+
+def _quantisation_variance(quantum_m: float, track_m: float) -> FloatArray:
+    """(3,) of a step: each wheel's two readings are known to a tick."""
+    quantum = max(quantum_m, _SMALLEST_QUANTUM_M)
+    wheel = quantum**2 / 6.0
+    return np.array([wheel / 2.0, wheel / 2.0, 2.0 * wheel / track_m**2])
+
+
+def _summed(values: FloatArray, ends: IntArray) -> FloatArray:
+    """Sums (N, ...) over the pieces of each step."""
+    summed: FloatArray = np.add.reduceat(values, ends[:-1], axis=0)
+    return summed
+
+
+def _seconds(stamps_ns: IntArray, zero_ns: int) -> FloatArray:
+    return np.asarray(stamps_ns - zero_ns, dtype=np.float64) * 1e-9

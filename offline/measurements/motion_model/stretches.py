@@ -1,0 +1,131 @@
+"""Wheel readings of a log -> stretches of unbroken odometry."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray, counted
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances
+from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps
+from groundsbot.onboard.log import PlanarOdometry
+
+WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
+
+# Each begins a chain of its own that only tags can join. Pairs of them grow with the square, so that with the root of a
+# log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
+_FREE_RESETS = 10
+_RESETS_AT_A_MIB = 15
+
+
+def stretches_of(
+    wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path, log_bytes: int
+) -> tuple[list[WheelTrack], list[str]]:
+    """The stretches of one log, and what a person should know of them.
+
+    Args:
+        wheels: of `/wheels`, in order.
+        odometry: of `/odometry`, in order; used where there is no `/wheels`.
+        robot: whose wheels they are.
+        log: named in errors.
+        log_bytes: its size.
+
+    Raises:
+        OfflineError: there are no wheel readings, or none that a robot can have given, or a log of this size has too
+            many restarts of the controller.
+    """
+    if wheels:
+        return _encoder_stretches(wheels, robot, log, log_bytes)
+    if odometry:
+        return _imported_stretch(odometry, robot, log)
+    raise OfflineError(
+        f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
+        "was the encoder port connected? `groundsbot-onboard check` tells"
+    )
+
+
+def _encoder_stretches(
+    readings: Sequence[WheelRow], robot: Robot, log: Path, log_bytes: int
+) -> tuple[list[WheelTrack], list[str]]:
+    """Cuts where the controller was reset: what was driven in between is unknown."""
+    table = np.array(readings, dtype=np.int64)
+    check_stamps(table[:, 0], f"{log}: /wheels")
+    cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
+    most = _FREE_RESETS + int(_RESETS_AT_A_MIB * (log_bytes / 2**20) ** 0.5)
+    if len(cuts) > most:
+        raise OfflineError(
+            f"{log}: /wheels: the controller restarted {len(cuts)} times, limit {most} for a log of {log_bytes} bytes; "
+            "see to its power supply"
+        )
+    m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
+    stretches: list[WheelTrack] = []
+    warnings: list[str] = []
+    for part in np.split(table, cuts):
+        ordered, dropped = _strictly_later(part)
+        if dropped:
+            warnings.append(f"{counted(dropped, 'wheel reading')} not later than the one before; left out")
+        # As floats first: counts far enough apart would wrap round in whole numbers.
+        ticks = np.asarray(ordered[:, 2:], dtype=np.float64)
+        check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
+        left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
+        quantum_m = max(m_per_tick_left, m_per_tick_right)
+        stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
+    if len(stretches) > 1:
+        warnings.append(
+            f"the wheel controller restarted {counted(len(stretches) - 1, 'time')}; the motion in between is unknown, "
+            f"so the run has {len(stretches)} stretches that only tags can join"
+        )
+    return stretches, warnings
+
+
+def _imported_stretch(
+    readings: Sequence[PlanarOdometry], robot: Robot, log: Path
+) -> tuple[list[WheelTrack], list[str]]:
+    warnings: list[str] = []
+    where = f"{log}: /odometry"
+    stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+    check_stamps(stamps_ns, where)
+    left_m = np.array([reading.wheels.left_m for reading in readings])
+    right_m = np.array([reading.wheels.right_m for reading in readings])
+    check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)
+    if readings[0].WhichOneof("motion") == "pose":
+        poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
+        check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
+        left_m, right_m, sideways = wheel_distances(poses, robot.wheels.track_m)
+        if sideways > 0.05:
+            warnings.append(
+                f"{100.0 * sideways:.0f} % of the odometry's motion is sideways, which a differential drive cannot do; "
+                "it is not used"
+            )
+    table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
+    if dropped:
+        warnings.append(f"{counted(dropped, 'odometry reading')} not later than the one before; left out")
+    keep = table[:, 1]
+    check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
+    covariance, n_bad = given_covariances(readings)
+    if n_bad:
+        warnings.append(f"{counted(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
+    given = covariance[keep] if covariance is not None else None
+    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
+
+
+def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:
+    """Cumulative (left_m, right_m) whose arcs join odometry poses (N, 3), and the share of motion that is sideways."""
+    twists = se2.log(se2.between(poses[:-1], poses[1:]))
+    half_turn_m = 0.5 * track_m * twists[:, 2]
+    left_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] - half_turn_m)])
+    right_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] + half_turn_m)])
+    forward = float(np.abs(twists[:, 0]).sum())
+    sideways = float(np.abs(twists[:, 1]).sum())
+    return left_m, right_m, sideways / max(forward, 1e-9) if sideways > 1e-6 else 0.0
+
+
+def _strictly_later(table: IntArray) -> tuple[IntArray, int]:
+    """Rows whose stamp (first column) is later than all before, and how many are not."""
+    latest_before = np.maximum.accumulate(np.concatenate([[table[0, 0] - 1], table[:-1, 0]]))
+    keep = table[:, 0] > latest_before
+    return table[keep], int((~keep).sum())

@@ -1,0 +1,252 @@
+"""One run log -> one Run of measurements, or a refusal with reasons."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from groundsbot.calib.camera import CameraModel, read_camera_yaml
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation import IntArray, counted
+from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.calib.tags import moved_out
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.stretches import WheelRow, stretches_of
+from groundsbot.offline.measurements.plausibility import check_file_name
+from groundsbot.offline.measurements.sensor_model.tag_messages import RunReadings
+from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.onboard.log import (
+    Allowance,
+    CameraCalibration,
+    Event,
+    LogLosses,
+    LogMessage,
+    PlanarOdometry,
+    RunInfo,
+    Severity,
+    TagDetections,
+    TagObservations,
+    WheelEncoders,
+    camera_from_message,
+    read_log,
+)
+
+
+class RunEvent(NamedTuple):
+    """What the recorder told of the drive: a gap, a loss, a reconnection."""
+
+    stamp_ns: int
+    is_loss: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """The measurements of one log.
+
+    Attributes:
+        name: robot id and run id, unique among the runs of a map.
+        stretches: wheel readings with unbroken odometry, in order.
+        picture_stamps_ns: (F,) every picture, also those that show no tag.
+        tags: what was seen, sorted.
+        camera: None in an imported log.
+        warnings: what a person should know.
+        log_bytes: of the log; how much work it is worth.
+        inputs: the logs that were read together with it, itself included.
+        lost: what of the log cannot be read, in words; empty where all can.
+        corners_refined: the corners in it were sharpened on the picture, all of them.
+        events: what the recorder told, in order of their stamps.
+    """
+
+    name: str
+    robot_id: str
+    run_id: str
+    log: Path
+    robot: Robot
+    camera: CameraModel | None
+    stretches: tuple[WheelTrack, ...]
+    picture_stamps_ns: IntArray
+    tags: tuple[TagKey, ...]
+    detections: Detections
+    positions: Positions
+    warnings: tuple[str, ...]
+    log_bytes: int = 0
+    inputs: Inputs = ALONE
+    lost: str = ""
+    corners_refined: bool = False
+    events: tuple[RunEvent, ...] = ()
+
+
+_MOST_EVENTS = 500  # a recorder gathers what happens often into one event
+
+
+@dataclass
+class _Collected:
+    """What one pass over a log gathers."""
+
+    info: RunInfo | None = None
+    calibration: CameraCalibration | None = None
+    wheels: list[WheelRow] = field(default_factory=list)
+    odometry: list[PlanarOdometry] = field(default_factory=list)
+    picture_size: tuple[int, int] | None = None
+    readings: RunReadings = field(default_factory=RunReadings)
+    events: list[RunEvent] = field(default_factory=list)
+    n_other_size: int = 0
+
+    def add(self, entry: LogMessage) -> None:
+        """Takes one message of the log."""
+        message = entry.message
+        if isinstance(message, WheelEncoders):
+            self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
+        elif isinstance(message, TagDetections):
+            self._add_detections(message)
+        elif isinstance(message, PlanarOdometry):
+            self.odometry.append(message)
+        elif isinstance(message, TagObservations):
+            self.readings.add_observations(message)
+        elif isinstance(message, RunInfo):
+            self.info = self.info or message
+        elif isinstance(message, CameraCalibration):
+            self.calibration = self.calibration or message
+        elif isinstance(message, Event) and len(self.events) < _MOST_EVENTS:
+            is_loss = message.severity in (Severity.SEVERITY_WARNING, Severity.SEVERITY_ERROR)
+            self.events.append(RunEvent(message.stamp_ns, is_loss, message.text or message.kind))
+
+    def _add_detections(self, message: TagDetections) -> None:
+        size = (message.width_px, message.height_px)
+        self.picture_size = self.picture_size or size
+        if size != self.picture_size:
+            self.n_other_size += 1
+            return
+        self.readings.add_detections(message)
+
+
+_TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations", "/events")
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """A robot.yaml given by a person, with its camera, to be used instead of what a log holds."""
+
+    robot: Robot
+    camera: CameraModel | None
+
+
+def read_robot_file(path: Path) -> RobotFile:
+    """Reads robot.yaml and the camera file it names.
+
+    Raises:
+        CalibError: one line that names file, field, value and way out.
+    """
+    robot = read_robot_yaml(path)
+    return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
+
+
+def load_run(
+    log: Path | str,
+    robot_files: Mapping[str, RobotFile] | None = None,
+    inputs: Inputs = ALONE,
+    allowance: Allowance | None = None,
+) -> Run:
+    """Reads one log.
+
+    Args:
+        log: a file or a run folder.
+        robot_files: calibrations by robot id that replace what the log holds.
+        inputs: the logs that are read together with it, itself included.
+        allowance: what they share in reading; one of its own where None.
+
+    Raises:
+        GroundsbotError: one line that says why the log cannot be mapped.
+    """
+    log = Path(log)
+    collected, losses = _Collected(), LogLosses()
+    log_bytes = size_bytes(log)
+    for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
+        collected.add(entry)
+        collected.readings.check(log, log_bytes, inputs.n_logs)
+    info = _run_info(collected, log, losses)
+    (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
+    given = (robot_files or {}).get(info.robot_id)
+    robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
+    stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
+    warnings += losses.lines()
+    collected.readings.check_tags(log)
+    read = collected.readings.gathered(log_bytes, inputs.n_logs)
+    warnings += _not_used(collected, read.every, log_bytes)
+    camera = _camera(collected, given.camera if given else None, log)
+    name = f"{info.robot_id}_{info.run_id}"
+    late_ns = round(robot.time_offset_s * 1e9)  # by which the camera's stamps are ahead of the wheels'
+    return Run(
+        name=name,
+        robot_id=info.robot_id,
+        run_id=info.run_id,
+        log=log,
+        robot=robot,
+        camera=camera,
+        stretches=tuple(stretches),
+        picture_stamps_ns=read.pictures_ns - late_ns,
+        tags=read.tags,
+        detections=replace(
+            read.detections,
+            stamps_ns=read.detections.stamps_ns - late_ns,
+            corners_px=moved_out(read.detections.corners_px, -robot.edge_shift_px),
+        ),
+        positions=read.positions,
+        warnings=tuple(f"{name}: {warning}" for warning in warnings),
+        log_bytes=log_bytes,
+        inputs=inputs,
+        lost=losses.in_words,
+        corners_refined=read.corners_refined,
+        events=tuple(sorted(collected.events)),
+    )
+
+
+def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:
+    """Whose run it is, by names that are fit for files."""
+    info = collected.info
+    if info is None:
+        found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
+        raise OfflineError(f"{found}; is it a groundsbot log?")
+    check_file_name(info.robot_id, f"{log}: /run: robot_id")
+    check_file_name(info.run_id, f"{log}: /run: run_id")
+    return info
+
+
+def _not_used(collected: _Collected, every: int, log_bytes: int) -> list[str]:
+    """Sentences about what was read and is left out."""
+    told = []
+    if every > 1:
+        told.append(
+            f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
+            f"{every} is used"
+        )
+    if collected.n_other_size:
+        pictures = counted(collected.n_other_size, "picture")
+        told.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
+    return told
+
+
+def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:
+    """The given calibration, or the log's; None where there are no pictures to need one."""
+    calibration, size = collected.calibration, collected.picture_size
+    camera, source = given, "the camera file given with --robot"
+    if camera is None and calibration is not None:
+        try:
+            camera, source = camera_from_message(calibration), "/camera/calibration"
+        except GroundsbotError as error:
+            raise OfflineError(f"{log}: {error}") from error
+    if camera is None and collected.readings.in_pixels:
+        raise OfflineError(
+            f"{log}: tags were detected but /camera/calibration has 0 messages; "
+            "give the robot's file with --robot, with its `camera` set"
+        )
+    if camera is not None and size is not None and size != (camera.width_px, camera.height_px):
+        raise OfflineError(
+            f"{log}: /tags/detections: pictures are {size[0]}x{size[1]} px but {source} is for "
+            f"{camera.width_px}x{camera.height_px} px; calibrate at the size that is recorded, "
+            "or give the right file with --robot"
+        )
+    return camera

@@ -1,0 +1,287 @@
+"""Detections and imported positions of one run -> tag readings in metres, each with its covariance."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtri
+
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import CAMERA_PARAMETERS, NoiseParameters, Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
+from groundsbot.offline.measurements.sensor_model.readings import Readings, no_readings
+from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
+from groundsbot.offline.measurements.sensor_model.stationary_corners import averaged
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions
+from groundsbot.offline.measurements.sensor_model.tilted_tags import (
+    FALSE_ALARM,
+    UPRIGHT_DOF,
+    askew,
+    doubted,
+    level_of,
+    with_common_turn,
+)
+
+# What the covariance of an imported position without one is made of.
+POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
+
+# A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
+MAX_RANGE_SIGMA_PER_M: Final = 0.03
+# Nearer than this a reading is a phantom, and its covariance would wreck the condition of the solve.
+MIN_RANGE_M: Final = 0.1
+# Farther than this no tag is read; numbers beyond come from broken files.
+MAX_RANGE_M: Final = 1000.0
+_LEAST_VARIANCE: Final = 1e-12
+# One printed size, but for rounding.
+SAME_SIZE_M: Final = 1e-6
+# More than this share of readings left out is worth a sentence.
+MAX_SHARE_LEFT_OUT: Final = 0.05
+
+
+def read_detections(
+    run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
+) -> tuple[Readings, list[str]]:
+    """Turns corners into readings about the camera.
+
+    Pictures that share a keyframe were taken from one standing pose: their corners are averaged, and the average keeps
+    the sigma of one picture, since what a detector gets wrong it gets wrong in each of them. Two tags with one id in
+    one picture are two readings.
+
+    Args:
+        run: whose camera and tag sizes apply.
+        detections: (M,) of one stretch.
+        keyframe: (M,) the keyframe of each.
+        twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
+        noise: for the corners' sigma.
+
+    Returns:
+        The readings, and sentences about those that were left out.
+    """
+    camera = run.camera
+    if camera is None or not len(detections.tag):
+        return no_readings(), []
+    # A corner that is no number would spoil the mean of its standing pose.
+    known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
+    keyframe, tag, corners_px = averaged(
+        keyframe[known], detections.tag[known], detections.corners_px[known], detections.stamps_ns[known]
+    )
+    if not len(tag):
+        return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
+    sides_m = _sides_m(run, tag)
+    at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
+    bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros((len(tag), 2))
+    sigmas_px = np.hypot(noise.sigma_corner_px, bias_px[:, 0])
+    found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
+    good = _good(found, is_askew, level)
+    n, kept = int(good.sum()), found.where(good)
+    by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
+    by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
+    # From base's axes to the camera's yaw, about which all readings in_camera are.
+    bearing_rad = se2.wrap_angle(kept.range_bearing[:, 1] - run.robot.mount.yaw_rad)
+    readings = Readings(
+        keyframe=keyframe[good],
+        tag=tag[good],
+        value=np.stack([kept.range_bearing[:, 0], bearing_rad], axis=-1),
+        covariance=kept.covariance + by_floor,
+        parts=_corner_parts(kept, noise.sigma_corner_px, sigmas_px[good], by_floor),
+        by_camera=_by_camera(run.robot, kept, twist[keyframe[good]]),
+        polar=np.ones(n, dtype=np.bool_),
+        in_camera=np.ones(n, dtype=np.bool_),
+        corners_px=corners_px[good],
+        corner_bias_px=bias_px[good],
+        corner_sigmas=np.ones(n),
+    )
+    return readings, _told(run, tag[is_askew], good)
+
+
+def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArray:
+    """(M,) readings of tags that are near and large enough for their range to have no bias beside its sigma.
+
+    Args:
+        found: the readings.
+        is_askew: (M,) whose range is trusted to little as it is.
+        level: (M,) how many times random errors of corners have the variance that is told.
+    """
+    range_m = found.range_bearing[:, 0]
+    with np.errstate(invalid="ignore"):
+        sure = np.minimum(level, 1.0) * found.covariance[:, 0, 0] < (MAX_RANGE_SIGMA_PER_M * range_m) ** 2
+        return np.asarray(found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew))
+
+
+def _told(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
+    """Sentences about tags that hang askew, and about readings that are not good."""
+    told = [
+        f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
+        for t in np.unique(askew_tags)
+    ]
+    if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
+        told.append(f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has")
+    return told
+
+
+def _upright_or_askew(
+    run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigmas_px: FloatArray
+) -> tuple[TagReadings, BoolArray, FloatArray, float]:
+    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
+
+    Besides (M,) how many times the corners' random errors have the variance that is told of all their errors, and the
+    sigma by which the floor tilts base.
+    """
+    camera, mount = run.camera, run.robot.mount
+    assert camera is not None  # it saw them
+    rotation = mount.T_base_camera.rotation.as_matrix()
+    upright = upright_readings(corners_px, sides_m, camera, rotation, sigmas_px)
+    level, camera_m = max(level_of(upright.chi2), 1.0), np.array([mount.x_m, mount.y_m])
+    tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
+    if tilt_rad:
+        upright = spread_by_tilt(upright, tilt_rad)
+    sigma = np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
+    chi2 = with_common_turn(upright, tag, _mount_axes(run.robot), sigma)
+    level = level_of(chi2)
+    is_doubted = np.isin(tag, doubted(tag, chi2 / min(level, 1.0)))
+    general = upright.replaced(
+        is_doubted,
+        general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
+    )
+    is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
+    spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
+    found = upright.replaced(is_askew, general.where(is_askew))
+    least_px = sigmas_px.min()
+    random = level_of(chi2 * (sigmas_px / least_px) ** 2) * (least_px / sigmas_px) ** 2
+    return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, random, tilt_rad
+
+
+def _sides_m(run: Run, tag: IntArray) -> FloatArray:
+    """(M,) of each tag."""
+    seen, index = np.unique(tag, return_inverse=True)
+    return np.array([run.robot.tag_size_m(run.tags[t].family, run.tags[t].tag_id)[0] for t in seen])[index]
+
+
+def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
+    """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's.
+
+    Returns:
+        The readings, and a sentence if some were left out.
+    """
+    first, second = positions.value[:, 0], positions.value[:, 1]
+    range_m = np.where(positions.polar, first, np.hypot(first, second))
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(second) & (range_m > MIN_RANGE_M) & (range_m < MAX_RANGE_M)
+    unknown = np.isnan(positions.covariance).all((-1, -2))
+    convert = unknown & ~positions.polar
+    value = positions.value.copy()
+    value[convert] = np.stack([range_m, np.arctan2(second, first)], axis=-1)[convert]
+    covariance = positions.covariance.copy()
+    modelled = unknown & good
+    covariance[modelled] = 0.0
+    covariance[modelled, 0, 0] = noise.sigma_range_m**2 + (noise.sigma_range_per_m * range_m[modelled]) ** 2
+    covariance[modelled, 1, 1] = noise.sigma_bearing_rad**2
+    good &= _are_covariances(covariance)
+    parts = _position_parts(range_m, modelled, covariance)
+    unaffected = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
+    readings = Readings(
+        keyframe,
+        positions.tag,
+        value,
+        covariance,
+        parts,
+        unaffected,
+        positions.polar | unknown,
+        positions.in_camera,
+        corners_px=np.full((len(value), 4, 2), np.nan),
+        corner_bias_px=np.zeros((len(value), 2)),
+        corner_sigmas=np.ones(len(value)),
+    )
+    if good.all():
+        return readings, []
+    left_out = (
+        f"{int((~good).sum())} of {len(good)} tag positions left out: nearer than {MIN_RANGE_M} m, farther than "
+        f"{MAX_RANGE_M:.0f} m, or with a covariance that is none"
+    )
+    return readings.where(good), [left_out]
+
+
+def _are_covariances(matrices: FloatArray) -> BoolArray:
+    """(M,) which of (M, 2, 2) are positive definite, and of a size to compute with."""
+    sane = np.asarray((np.abs(matrices) < MAX_RANGE_M**2).all((-1, -2)))
+    smallest = np.linalg.eigvalsh(np.where(sane[:, None, None], matrices, 0.0))[:, 0]
+    return np.asarray(smallest > _LEAST_VARIANCE)
+
+
+def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArray:
+    """(M, 2, 4) derivative of readings by CAMERA_PARAMETERS.
+
+    Args:
+        robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
+        found: (M,) the readings.
+        twist: (M, 2) speed and turning rate.
+    """
+    range_m, bearing_rad = found.range_bearing.T
+    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
+    speed, turning = twist.T
+    # How a tag moves as seen from the camera, whose place moves with base: a picture that was taken later shows that.
+    x_rate = -speed + turning * (robot.mount.y_m + range_m * sin)
+    y_rate = -turning * (robot.mount.x_m + range_m * cos)
+    by_time = np.stack([cos * x_rate + sin * y_rate, (cos * y_rate - sin * x_rate) / range_m], axis=-1)
+    by_turn = found.by_turn @ _mount_axes(robot).T
+    return np.concatenate([by_turn, by_time[..., None], found.by_edge[..., None]], axis=-1)
+
+
+def _mount_axes(robot: Robot) -> FloatArray:
+    """(2, 3) the axes in base about which roll and pitch turn the mount."""
+    yaw, pitch = robot.mount.yaw_rad, robot.mount.pitch_rad
+    return np.array(
+        [
+            [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)],
+            [-np.sin(yaw), np.cos(yaw), 0.0],
+        ]
+    )
+
+
+def _corner_parts(
+    found: TagReadings, sigma_corner_px: float, sigmas_px: FloatArray, by_floor: FloatArray
+) -> CovarianceParts:
+    """By the noise model's sigma, which is fitted; the rest is by the floor, and by what (M,) corners err by alike."""
+    by_corners = found.covariance - found.rest
+    unit = by_corners / sigmas_px[:, None, None] ** 2
+    rest = found.rest + by_floor + by_corners - unit * sigma_corner_px**2
+    return CovarianceParts(("sigma_corner_px",), unit[None], rest)
+
+
+def _position_parts(range_m: FloatArray, modelled: BoolArray, covariance: FloatArray) -> CovarianceParts:
+    """Of imported positions: by the noise model, or as the log says."""
+    unit = np.zeros((len(POSITION_NOISE), len(range_m), 2, 2))
+    unit[0, modelled, 0, 0] = 1.0
+    unit[1, modelled, 0, 0] = range_m[modelled] ** 2
+    unit[2, modelled, 1, 1] = 1.0
+    return CovarianceParts(POSITION_NOISE, unit, np.where(modelled[:, None, None], 0.0, covariance))
+
+
+def check_tag_sizes(runs: Sequence[Run]) -> None:
+    """Refuses detections whose tag has no size, and runs that disagree about a tag's size.
+
+    Raises:
+        GroundsbotError: naming the run, the tag and the sizes.
+    """
+    known: dict[tuple[str, int], tuple[float, Run]] = {}
+    for run in runs:
+        for index in np.unique(run.detections.tag):
+            key = run.tags[index]
+            try:
+                size_m = run.robot.tag_size_m(key.family, key.tag_id)[0]
+            except CalibError as error:
+                raise OfflineError(f"{run.log}: {error}") from error
+            other_m, other = known.setdefault(key, (size_m, run))
+            if abs(other_m - size_m) > SAME_SIZE_M:
+                raise OfflineError(
+                    f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
+                    f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"
+                )

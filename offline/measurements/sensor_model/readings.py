@@ -1,0 +1,116 @@
+"""Tag readings in metres, each with its covariance: what a chain is solved from.
+
+A reading is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS, NoiseParameters
+from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenated
+
+
+@dataclass(frozen=True)
+class Readings:
+    """M tag readings.
+
+    Attributes:
+        keyframe: (M,) index of the pose it was taken from.
+        tag: (M,) index into the tags of the run.
+        value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
+        covariance: (M, 2, 2) of the value.
+        parts: what the covariance is made of.
+        by_camera: (M, 2, 4) derivative of the value by CAMERA_PARAMETERS.
+        polar: (M,)
+        in_camera: (M,) about the camera's place and yaw, else about base.
+        corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
+        corner_bias_px: (M, 2) sigmas of what such corners err by alike in neighbouring readings, whatever noise they
+            have: up and down, which is what the value errs by, and in all ways.
+        corner_sigmas: (M,) how many times the noise's sigma such corners count with.
+    """
+
+    keyframe: IntArray
+    tag: IntArray
+    value: FloatArray
+    covariance: FloatArray
+    parts: CovarianceParts
+    by_camera: FloatArray
+    polar: BoolArray
+    in_camera: BoolArray
+    corners_px: FloatArray
+    corner_bias_px: FloatArray
+    corner_sigmas: FloatArray
+
+    def __len__(self) -> int:
+        """Number of readings."""
+        return len(self.tag)
+
+    def where(self, mask: BoolArray | IntArray) -> "Readings":
+        """Those of a mask, or of indices."""
+        return Readings(
+            self.keyframe[mask],
+            self.tag[mask],
+            self.value[mask],
+            self.covariance[mask],
+            self.parts.where(mask),
+            self.by_camera[mask],
+            self.polar[mask],
+            self.in_camera[mask],
+            self.corners_px[mask],
+            self.corner_bias_px[mask],
+            self.corner_sigmas[mask],
+        )
+
+    def weighed(self, noise: NoiseParameters) -> "Readings":
+        """The same readings under other noise."""
+        return replace(self, covariance=self.parts.under(noise))
+
+    def spread(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Readings":
+        """The same readings with the sigmas of their whitened components (M, 2) so many times as large.
+
+        Those of the corners (M,) grow by what is given for them, else like the larger of the two.
+        """
+        root = np.linalg.cholesky(self.covariance)
+        turn = root @ (sigmas[..., None] * np.linalg.inv(root))
+        back = turn.swapaxes(-1, -2)
+        parts = replace(self.parts, unit=turn @ self.parts.unit @ back, rest=turn @ self.parts.rest @ back)
+        return replace(
+            self,
+            covariance=turn @ self.covariance @ back,
+            parts=parts,
+            corner_sigmas=self.corner_sigmas * (sigmas.max(axis=-1) if of_corners is None else of_corners),
+        )
+
+
+def joined(a: Readings, b: Readings) -> Readings:
+    """Both, ordered by keyframe."""
+    both = Readings(
+        np.concatenate([a.keyframe, b.keyframe]),
+        np.concatenate([a.tag, b.tag]),
+        np.concatenate([a.value, b.value]),
+        np.concatenate([a.covariance, b.covariance]),
+        concatenated(a.parts, b.parts),
+        np.concatenate([a.by_camera, b.by_camera]),
+        np.concatenate([a.polar, b.polar]),
+        np.concatenate([a.in_camera, b.in_camera]),
+        np.concatenate([a.corners_px, b.corners_px]),
+        np.concatenate([a.corner_bias_px, b.corner_bias_px]),
+        np.concatenate([a.corner_sigmas, b.corner_sigmas]),
+    )
+    return both.where(np.argsort(both.keyframe, kind="stable"))
+
+
+def no_readings() -> Readings:
+    """None at all."""
+    empty_int = np.zeros(0, dtype=np.int64)
+    empty_bool = np.zeros(0, dtype=np.bool_)
+    none = np.zeros((0, 2, 2))
+    parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
+    by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
+    corners_px, bias_px, sigmas = np.zeros((0, 4, 2)), np.zeros((0, 2)), np.zeros(0)
+    return Readings(
+        empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
+        sigmas,
+    )  # fmt: skip

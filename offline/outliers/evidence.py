@@ -1,0 +1,255 @@
+"""What readings say of the place of a tag in each sighting, all else eliminated: any split is then dense algebra.
+
+Let every sighting have a place of its own. With poses and calibration eliminated the cost is a quadratic form
+q(p) = p' L p / 2 + z' p in these places p, taken from where a solve has them, and to take some of them for one is to
+put them equal. So one linearisation tells the cost of every split of every tag: the score test (Rao, 1948) with the
+exact joint information of all readings, for all hypotheses at once.
+
+A tag is moved by more than a lean of its board or the remains of a lens shift it: each sighting may be off by a
+centimetre, which the form carries: (L^-1 + s^2)^-1. For that each place gets a prior of a centimetre about where the
+solve has it; one factorisation with each sighting's tag apart then tells all (`suspects_information`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.local_map import Goodness
+from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
+from groundsbot.offline.outliers.joint_information import Information, no_information
+from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.sam import (
+    DEFAULT_LOSSES,
+    PLAIN_SQUARES,
+    Columns,
+    Graph,
+    Measured,
+    Problem,
+    State,
+    factorised,
+    losses_and_weights,
+)
+
+_WEIGHINGS: Final = 5
+_MOVED_IN_SIGHT: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The cost as a function of the places of K of the sightings: those of tags that were sighted more than once.
+
+    Attributes:
+        which: (K,) indices of the sightings.
+        information: (2 K, 2 K) L, and score: (2 K,) z, in squared sigmas by metres from `places_m`.
+        places_m: (K, 2) the linearisation point.
+    """
+
+    which: IntArray
+    information: Information
+    score: FloatArray
+    places_m: FloatArray
+
+
+def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
+    """(C, 2) how many times larger than told the noise of each chain's wheels and readings is, 1 at least.
+
+    By what the windows of each chain leave over, which no tag that was moved between them raises; where windows do not
+    join within that, something that is in no covariance bends the chain, and the covariances say too little.
+    """
+    rows = []
+    for each in goodness:
+        bent = 1.0 if each.fits else float(np.sqrt(each.chi_square / max(each.expected, 1)))
+        rows.append([bent * max(1.0, each.odometry_factor), bent * max(1.0, each.reading_factor)])
+    return np.array(rows).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A problem under its chains' own noise, and what its readings say at a state.
+
+    Attributes:
+        residual: (M, 2) of the readings, whitened.
+        by_tag: (M, 2, 2) their derivatives by the places of tags.
+    """
+
+    problem: Problem
+    state: State
+    residual: FloatArray
+    by_tag: FloatArray
+
+
+def heard(graph: Graph, state: State, scales: FloatArray) -> Heard:
+    """Linearises the readings of a graph.
+
+    Args:
+        graph: of some chains.
+        state: near an optimum.
+        scales: (C, 2) of each chain's noise, see `noise_scales`.
+    """
+    problem = _scaled(graph, scales)
+    readings = problem.readings.linearise(state, problem.columns)
+    return Heard(problem, state, readings.residual, readings.blocks[1][1])
+
+
+def gathered(
+    at: Heard,
+    sightings: Sightings,
+    unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
+    *,
+    weighed: bool = True,
+) -> Evidence:
+    """Linearises all factors at a state and eliminates all but the sightings' places.
+
+    Args:
+        at: the chains that the sightings are of, near an optimum.
+        sightings: S of them.
+        unmodelled_sigma_m: of each coordinate of a sighting, beyond what the covariances say.
+        weighed: whether readings count by how well they fit the others of their sighting, or all alike.
+    """
+    which = np.flatnonzero(np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] > 1)
+    if not len(which):
+        return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
+    apart, state = _apart(_weighed(at, sightings) if weighed else at.problem, at.state, sightings)
+    system, _ = apart.arrowhead.linearise(state, *PLAIN_SQUARES)
+    system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
+    factorisation, _ = factorised(apart.arrowhead, system, 0.0)
+    step = factorisation.solve_in_order(system.gradient)
+    by_tag = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(sightings)].reshape(-1, 2)
+    information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
+    # What is left of the gradient once all else is eliminated, S^-1 times this step, through the slack: s^-2 S S^-1.
+    return Evidence(which, information, unmodelled_sigma_m**-2 * by_tag[which].reshape(-1), state.tags[which])
+
+
+def _apart(problem: Problem, state: State, sightings: Sightings) -> tuple[Problem, State]:
+    """Each sighting with a tag of its own, in the same places; what was measured to a tag was to where it was first."""
+    columns, n = problem.columns, len(sightings)
+    of_tag, first_reading = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    of_tag[sightings.of_reading] = problem.readings.tag
+    first_reading[sightings.of_reading[::-1]] = np.arange(len(problem.readings.tag))[::-1]
+    first = np.full(len(columns.tags), -1, dtype=np.int64)
+    first[of_tag[::-1]] = np.arange(n)[::-1]
+    free_poses, free_calibration = columns.poses >= 0, columns.calibration >= 0
+    n_poses = int(free_poses.sum())
+    n_all = n_poses + 2 * n + int(free_calibration.sum())
+    apart = Columns(
+        np.where(free_poses, np.cumsum(free_poses).reshape(free_poses.shape) - 1, -1),
+        n_poses + np.arange(2 * n).reshape(n, 2),
+        np.where(free_calibration, n_poses + 2 * n + np.cumsum(free_calibration) - 1, -1),
+        n_all,
+    )
+    other = replace(
+        problem,
+        readings=replace(problem.readings, tag=sightings.of_reading),
+        columns=apart,
+        anchor=problem.readings.pose[first_reading],
+        measured=to_other_tags(problem.measured, first),
+    )
+    return other, State(state.poses, state.tags[of_tag], state.calibration)
+
+
+def to_other_tags(measured: Measured, index: IntArray) -> Measured:
+    """What was measured, with tags numbered anew by index (T,)."""
+    distances = measured.distances
+    tag_a, tag_b = (np.where(tag >= 0, index[tag], -1) for tag in (distances.tag_a, distances.tag_b))
+    return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
+
+
+def contradicted(at: Heard, sightings: Sightings) -> BoolArray:
+    """(M,) readings before which a tag seems to have moved though it was in sight.
+
+    The poses count as known, which a few metres apart they nearly are: that finds a move too many rather than one too
+    few, and whether it is one the joint evidence tells.
+    """
+    square = np.einsum("mki,mkj->mij", at.by_tag, at.by_tag)
+    pull = -np.einsum("mki,mk->mi", at.by_tag, at.residual)
+    cut = np.zeros(len(pull), dtype=np.bool_)
+    order = np.lexsort((at.problem.readings.pose, sightings.of_reading))
+    n_readings = sightings.n_readings
+    while len(order):
+        begins, gain = _best_cuts(square[order], pull[order], n_readings)
+        ends = np.cumsum(n_readings)
+        found = gain > -2.0 * np.log(_MOVED_IN_SIGHT / n_readings)  # chi-square with 2 degrees
+        cut[order[begins[found]]] = True
+        # Those that were cut are looked at again, in two parts.
+        order = order[np.repeat(found, n_readings)]
+        before = (begins - (ends - n_readings))[found]
+        n_readings = np.stack([before, n_readings[found] - before], axis=-1).reshape(-1)
+    return cut
+
+
+def _best_cuts(square: FloatArray, pull: FloatArray, n_readings: IntArray) -> tuple[IntArray, FloatArray]:
+    """Of sightings one after the other (S,), the reading that would begin another one, and what that brings (S,).
+
+    Args:
+        square: (M, 2, 2) information of each reading on the place.
+        pull: (M, 2) how it draws it elsewhere.
+        n_readings: (S,) of each sighting.
+    """
+    ends = np.cumsum(n_readings)
+    begins, of = ends - n_readings, np.repeat(np.arange(len(n_readings)), n_readings)
+    rows = np.concatenate([square.reshape(-1, 4), pull], axis=1)
+    # Within each sighting, so that rounding does not run on from one to the next.
+    up_to = np.concatenate([np.cumsum(each, axis=0) for each in np.split(rows, ends[:-1])])
+    inside = np.flatnonzero(np.arange(len(of)) + 1 < ends[of])  # the last reading of a sighting is before nothing
+    gain = np.full(len(of), -np.inf)
+    before, after = up_to[inside], up_to[ends[of[inside]] - 1] - up_to[inside]
+    covariance, covariance_after = _inverse(before[:, :4].reshape(-1, 2, 2)), _inverse(after[:, :4].reshape(-1, 2, 2))
+    off = np.einsum("nij,nj->ni", covariance, before[:, 4:]) - np.einsum("nij,nj->ni", covariance_after, after[:, 4:])
+    gain[inside] = np.einsum("ni,nij,nj->n", off, _inverse(covariance + covariance_after), off)
+    best = np.maximum.reduceat(gain, begins)
+    at = np.full(len(n_readings), len(of), dtype=np.int64)
+    is_best = np.flatnonzero(gain == best[of])
+    np.minimum.at(at, of[is_best], is_best)
+    return at + 1, best
+
+
+def _inverse(matrices: FloatArray) -> FloatArray:
+    """Of symmetric ones (n, 2, 2)."""
+    (a, b), (_, d) = matrices[:, 0].T, matrices[:, 1].T
+    turned = np.stack([d, -b, -b, a], axis=-1).reshape(-1, 2, 2)
+    inverse: FloatArray = turned / (a * d - b * b)[:, None, None]
+    return inverse
+
+
+def _scaled(graph: Graph, scales: FloatArray) -> Problem:
+    """The problem under the chains' own noise."""
+    problem = graph.problem
+    chain_of_pose = np.repeat(np.arange(len(graph.chains)), [len(chain.stamps_ns) for chain in graph.chains])
+    by_wheels = scales[chain_of_pose[problem.odometry.first], 0]
+    by_reading = scales[chain_of_pose[problem.readings.pose], 1]
+    odometry, readings = problem.odometry, problem.readings
+    return replace(
+        problem,
+        odometry=replace(odometry, whitening=odometry.whitening / by_wheels[:, None, None]),
+        readings=replace(readings, whitening=readings.whitening / by_reading[:, None, None]),
+    )
+
+
+def _weighed(at: Heard, sightings: Sightings) -> Problem:
+    """The problem with readings weighed by the others of their sighting.
+
+    Not by where the tag is said to be: what is off together was moved, and is to be heard in full.
+    """
+    readings = at.problem.readings
+    root = np.sqrt(_own_weights(at.residual, at.by_tag, sightings))
+    return replace(at.problem, readings=replace(readings, whitening=readings.whitening * root[:, None, None]))
+
+
+def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Sightings) -> FloatArray:
+    """(M,) robust weights of readings about the place that their passing alone gives the tag, poses held."""
+    of = sightings.passing
+    n_readings = np.bincount(of)
+    order = np.argsort(of, kind="stable")
+    begins = np.cumsum(n_readings) - n_readings
+    squares = np.einsum("mki,mkj->mij", by_tag, by_tag).reshape(-1, 4)
+    rows = np.concatenate([squares, np.einsum("mki,mk->mi", by_tag, residual)], axis=1)[order]
+    weights = np.ones(len(residual))
+    for _ in range(_WEIGHINGS if len(of) else 0):
+        sums = np.add.reduceat(weights[order, None] * rows, begins)
+        off = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
+        left = residual + np.einsum("mki,mi->mk", by_tag, off[of])
+        _, weights = losses_and_weights(DEFAULT_LOSSES.readings, left)
+    return weights

@@ -1,0 +1,113 @@
+"""Readings of tags that are not there: a tag that hangs somewhere is read again from where it was read.
+
+From poses near that of a reading a tag shows the same face at the same size, so a detector that saw it there sees it
+there again, but for what happens to stand between. How often is taken from tags that were sighted twice or more in one
+place: of a hundred such sightings the worst counts. A sighting of few readings that would have been more by that is a
+false detection.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.stats import binom
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.sam import Graph, State
+
+# "Read once or a few times."
+MOST_READINGS: Final = 3
+# A view is much the same up to these.
+_NEAR_RANGE: Final = 0.25
+_NEAR_BEARING_RAD: Final = np.radians(10.0)
+# Keyframes before and after the sighting.
+_WINDOW: Final = 100
+_AT_ONCE: Final = 500
+_WORST_SHARE: Final = 0.01
+# Fewer sightings say too little of how often a tag is read.
+_LEAST_CONFIRMED: Final = 20
+
+
+@dataclass(frozen=True)
+class Views:
+    """Of S sightings: from how many near views the tag was read, and how many there were; none where not counted."""
+
+    read: IntArray
+    near: IntArray
+
+
+def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
+    """Counts near views, in runs that tell when pictures were taken that showed nothing."""
+    n = len(sightings)
+    views = Views(np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64))
+    tells = np.array([len(chain.run.picture_stamps_ns) > 0 for chain in graph.chains], dtype=np.bool_)
+    counted = np.flatnonzero(tells[sightings.chain])
+    for begin in range(0, len(counted), _AT_ONCE):
+        some = counted[begin : begin + _AT_ONCE]
+        views.read[some], views.near[some] = _counted(graph, state, sightings, some)
+    return views
+
+
+def _counted(graph: Graph, state: State, sightings: Sightings, which: IntArray) -> tuple[IntArray, IntArray]:
+    """From how many poses tags were read in some sightings (s,), and how many poses have a near view (s,)."""
+    readings, n = graph.problem.readings, len(which)
+    number = np.full(len(sightings), -1, dtype=np.int64)
+    number[which] = np.arange(n)
+    own = np.flatnonzero(number[sightings.of_reading] >= 0)
+    own = own[np.lexsort((readings.pose[own], number[sightings.of_reading[own]]))]
+    of = number[sightings.of_reading[own]]  # rising
+    pose, n_readings = readings.pose[own], np.bincount(of, minlength=n)
+    begins = np.cumsum(n_readings) - n_readings
+    place = np.add.reduceat(readings.places_in_map(state)[own], begins) / n_readings[:, None]
+    again = np.append(False, (np.diff(pose) == 0) & (np.diff(of) == 0))
+    # Poses before and after the sighting, in the same run.
+    chain = sightings.chain[which]
+    ends = graph.first_pose[chain] + np.array([len(each.stamps_ns) for each in graph.chains])[chain]
+    first = np.maximum(graph.first_pose[chain], pose[begins] - _WINDOW)
+    n_around = np.minimum(ends, pose[begins + n_readings - 1] + _WINDOW + 1) - first
+    around, of_around = _ranges(first, n_around)
+    mount = readings.mount[own[begins]]
+    seen, at = (_view(state.poses[p], mount[s], place[s]) for p, s in ((around, of_around), (pose, of)))
+    near = np.zeros(n, dtype=np.int64)
+    views = np.split(seen, np.cumsum(n_around)[:-1]), np.split(at, np.cumsum(n_readings)[:-1])
+    for i, (here, there) in enumerate(zip(*views, strict=True)):
+        alike = np.abs(here[:, :1] / np.maximum(there[:, 0], 1e-6) - 1.0) < _NEAR_RANGE
+        alike &= here[:, 1:] @ there[:, 1:].T > np.cos(_NEAR_BEARING_RAD)
+        near[i] = np.count_nonzero(alike.any(axis=1))
+    return np.bincount(of[~again], minlength=n), near
+
+
+def _ranges(first: IntArray, length: IntArray) -> tuple[IntArray, IntArray]:
+    """Numbers from each first (n,) on, so many, one range after the other; and the range that each is of."""
+    of = np.repeat(np.arange(len(first)), length)
+    return np.arange(len(of)) - np.repeat(np.cumsum(length) - length, length) + first[of], of
+
+
+def chances(sightings: Sightings, place: IntArray, views: Views) -> FloatArray:
+    """(S,) how likely a tag that hangs there is read from so few of the near views; 1 where that says nothing.
+
+    Args:
+        sightings: S of them.
+        place: (S,) equal where sightings are of one tag.
+        views: of them.
+    """
+    n_sightings = np.bincount(place)[place]
+    confirmed = (n_sightings > 1) & (views.near > 0)
+    found = np.ones(len(sightings))
+    if confirmed.sum() < _LEAST_CONFIRMED:
+        return found
+    share = float(np.quantile(views.read[confirmed] / views.near[confirmed], _WORST_SHARE))
+    few = (n_sightings == 1) & (sightings.n_readings <= MOST_READINGS) & (views.near > 0)
+    # It was read once, or nobody would ask.
+    none = binom.pmf(0, views.near[few], share)
+    found[few] = (binom.cdf(views.read[few], views.near[few], share) - none) / np.maximum(1.0 - none, 1e-300)
+    return found
+
+
+def _view(poses: FloatArray, mount: FloatArray, place_m: FloatArray) -> FloatArray:
+    """(K, 3) range of places (K, 2) about sensors (K, 3) of poses (K, 3), and the direction."""
+    seen = se2.apply(se2.inverse(se2.compose(poses, mount)), place_m)
+    range_m = np.hypot(seen[:, 0], seen[:, 1])
+    return np.column_stack([range_m, seen / np.maximum(range_m, 1e-12)[:, None]])

@@ -1,0 +1,123 @@
+"""Parts of a drive that grow from one of its ends on, and how far their readings fit together."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import chained, se2
+from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.sam import Effort, Parameter, build_graph, solve
+
+# Of all drives whose wheels are right, so many are taken for broken.
+FALSE_ALARM: Final = 1e-3
+COST_TOLERANCE: Final = 1e-2  # a part is only the next one's start
+_PIECE_M: Final = 2.0
+_MOST_PIECES: Final = 60
+
+
+class Grown(NamedTuple):
+    """A part of a chain, solved."""
+
+    first: int
+    end: int
+    poses: FloatArray
+    wheels: FloatArray
+    tags: dict[TagKey, FloatArray]
+    calibration: dict[Parameter, float]
+    cost: float
+    freedom: int
+
+
+def grown_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]:
+    """Longer and longer parts of the chain, from one end on, as long as there is effort for them."""
+    n = len(chain.stamps_ns)
+    parts: list[Grown] = []
+    for end in _coarse_ends(chain):
+        if effort.is_spent():
+            break
+        piece = (n - end, n) if backwards else (0, end)
+        parts.append(_solved(chain, *piece, parts[-1] if parts else None, effort))
+    return parts
+
+
+def noise_factor(grown: Sequence[Sequence[Grown]]) -> float:
+    """How much larger than told the variances are, 1 at least: by what most pieces add, of which a break spoils few."""
+    added = [
+        2.0 * (after.cost - before.cost) / (after.freedom - before.freedom)
+        for parts in grown
+        for before, after in pairwise(parts)
+        if after.freedom > before.freedom
+    ]
+    return max(1.0, float(np.median(added))) if added else 1.0
+
+
+def limit_of(chain: Chain, parts: Sequence[Grown], factor: float, effort: Effort) -> Grown | None:
+    """The longest part whose readings fit together, as far as there is effort; None where all of the chain does."""
+    for before, after in pairwise(parts):
+        if _strains(before, after, factor, len(parts)):
+            return _refined(chain, before, after, factor, effort)
+    return None
+
+
+def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
+    """Between a part that fits and a longer one that does not, keyframe by keyframe."""
+    longest = known
+    reading = np.unique(chain.readings.keyframe)
+    ahead = reading[(reading >= known.end) & (reading < beyond.end)] + 1
+    back = reading[(reading < known.first) & (reading >= beyond.first)][::-1]
+    parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
+    for part in parts:
+        if effort.is_spent():
+            break
+        grown = _solved(chain, *part, longest, effort)
+        if _strains(known, grown, factor, len(parts)):
+            break
+        longest = grown
+    return longest
+
+
+def _strains(before: Grown, after: Grown, factor: float, n_tests: int) -> bool:
+    """Whether a longer part costs more than chance adds."""
+    freedom = max(1, after.freedom - before.freedom)
+    return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
+
+
+def _solved(chain: Chain, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
+    """A part of a chain, from what is known of another that has an end in common with it."""
+    part = chain.part(first, end)
+    graph = build_graph([part])
+    wheels = np.zeros(3) if known is None else known.wheels
+    poses = _poses(chain, first, end, known, wheels)
+    start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
+    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.tries(graph.problem, 1.0))
+    effort.spend(solution, is_built=True)
+    state, problem = solution.state, graph.problem
+    freedom = problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
+    wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
+    return Grown(first, end, state.poses, wheels, tags, graph.calibration_of(state), solution.cost, freedom)
+
+
+def _poses(chain: Chain, first: int, end: int, known: Grown | None, wheels: FloatArray) -> FloatArray:
+    """Of a part: those known, and dead reckoning on from them either way."""
+    odometry = chain.odometry.part(first, end - 1)
+    motion = se2.compose(odometry.motion, se2.exp(odometry.jacobian @ wheels))
+    if known is None:
+        return chained(motion, np.zeros(3))
+    kept = known.poses[max(0, first - known.first) : end - known.first]
+    at = max(0, known.first - first)
+    after = chained(motion[at + len(kept) - 1 :], kept[-1])[1:]
+    before = chained(se2.inverse(motion[:at][::-1]), kept[0])[1:][::-1]
+    return np.concatenate([before, kept, after])
+
+
+def _coarse_ends(chain: Chain) -> list[int]:
+    """Numbers of keyframes, some metres apart; the last is all of them."""
+    along_m = chain.along_m
+    step_m = max(_PIECE_M, along_m[-1] / _MOST_PIECES)
+    marks = np.searchsorted(along_m, np.arange(step_m, along_m[-1], step_m)) + 1
+    ends: list[int] = np.unique([*marks[(marks > 1) & (marks < len(along_m))], len(along_m)]).tolist()
+    return ends

@@ -1,0 +1,373 @@
+"""Where a drive's wheels do not tell how it moved: lifted, pushed, or slipping for metres.
+
+Only tags tell. From the beginning on the drive is built up as far as its readings fit together, and likewise backwards
+from its end. What lies between them, the wheels cannot explain; where they overlap, it is that place without whose
+motion the whole costs least. The drive is split there if that pays: the whole costs less by more than chance explains,
+however many places there were to choose from, and two or more tags seen on both sides agree on how the robot moved.
+
+That takes hundreds of solves. They share what the drive's own solve has left of what its log is worth; where it does
+not suffice the drive stays whole, and that is said.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import degrees, hypot
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.stats import binom, chi2
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import chained, se2
+from groundsbot.offline.alignment import Alignment, align, condense
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements import Chain
+from groundsbot.offline.outliers.grown_segments import (
+    COST_TOLERANCE,
+    FALSE_ALARM,
+    Grown,
+    grown_parts,
+    limit_of,
+    noise_factor,
+)
+from groundsbot.offline.sam import Effort, Graph, Problem, Solution, State, solve
+
+_MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
+_MOST_PLACES: Final = 24
+# Half of what chance adds to a place once in a thousand times: with less, readings do not tell which it was.
+_SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
+_IN_A_ROW_M: Final = 2.5
+# Of the effort that is left: for either side of a place solved on its own, and for the first of two parts.
+_SHARE_OF_A_SOLVE: Final = 0.2
+_SHARE_OF_A_PART: Final = 0.5
+_FREED: Final = 1e-4  # of a motion's whitening: metres and turns for nothing
+
+
+@dataclass(frozen=True)
+class Break:
+    """A part of a drive that its wheels do not tell.
+
+    Attributes:
+        end: of what comes before, one beyond its last keyframe.
+        begin: the first keyframe of what comes after.
+        reach: the keyframes between which it may be as well.
+        jump: (3,) how the robot moved besides, seen from the last keyframe before.
+        chi_square: by how much more it costs to believe the wheels.
+        bound: what chance explains of that.
+    """
+
+    end: int
+    begin: int
+    reach: tuple[int, int]
+    jump: FloatArray
+    chi_square: float
+    bound: float
+
+
+class Mended(NamedTuple):
+    """The chains and local maps of all runs after those that broke were split, and sentences that say so."""
+
+    maps: list[LocalMap]
+    warnings: list[str]
+
+
+class _Place(NamedTuple):
+    """Of a break: one beyond the last keyframe before it, and the first after it."""
+
+    end: int
+    begin: int
+
+
+class _Split(NamedTuple):
+    """Of a drive.
+
+    Attributes:
+        parts: its stretches.
+        breaks: with the keyframe at which the part begins that each is told of.
+        is_searched: whether the effort sufficed to look for breaks in all of it.
+    """
+
+    parts: list[LocalMap]
+    breaks: list[tuple[int, Break]]
+    is_searched: bool
+
+
+class _Start(NamedTuple):
+    """Where to begin a solve with a break."""
+
+    place: _Place
+    state: State
+
+
+def split_where_broken(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
+    """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own.
+
+    Args:
+        maps: of the drives.
+        efforts: what is left of what each of them is worth; the whole log's where None.
+    """
+    mended, warnings = [], []
+    for whole, effort in zip(maps, efforts or [_all_of(each) for each in maps], strict=True):
+        split = _split(whole, _MOST_BREAKS, effort)
+        mended += split.parts
+        warnings += [_sentence(whole.chain, each) for each in split.breaks]
+        if not split.is_searched:
+            warnings.append(_not_searched(whole.chain))
+    return Mended(_numbered(mended) if warnings else mended, warnings)
+
+
+def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | None:
+    """The break that explains most of what does not fit in a drive; None where it fits, or none explains it.
+
+    Nor is there one where the effort is spent before it is found; the whole log's where None.
+    """
+    chain, effort = local_map.chain, effort or _all_of(local_map)
+    if _fits(local_map):
+        return None
+    grown = [grown_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
+    factor = noise_factor(grown)
+    ahead, behind = (limit_of(chain, parts, factor, effort) for parts in grown)
+    if ahead is None or behind is None:
+        return None
+    places = _places(chain, ahead, behind)
+    if not places or effort.is_spent():
+        return None
+    middle = places[len(places) // 2]
+    starts = [
+        _start(local_map.graph, ahead, behind, place, T_ahead_behind)
+        for T_ahead_behind in _ways_to_align(chain, behind, middle, effort)
+        for place in places
+    ]
+    if not starts:
+        return None
+    apart = _solved_from(starts, local_map.graph.problem, effort)
+    if effort.is_spent():
+        return None
+    costs = np.array([solution.cost for solution in apart])
+    equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
+    best = max(equal.tolist(), key=lambda i: _seconds_between(chain, starts[i].place))
+    return _judged(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
+
+
+def _all_of(local_map: LocalMap) -> Effort:
+    return Effort.of_log(local_map.chain.run.log_bytes, local_map.chain.run.inputs)
+
+
+def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
+    found = find_break(whole, effort) if most else None
+    if found is None:
+        return _Split([whole], [], is_searched=not effort.is_spent() or _fits(whole))
+    chain = whole.chain
+    split = _Split([], [(0, found)], is_searched=True)
+    ends = (0, found.end), (found.begin, len(chain.stamps_ns))
+    left = [_without_ends(chain.part(*each), *each, chain) for each in ends]
+    for (first, _), part in zip(ends, left, strict=True):
+        own = effort.taken(_SHARE_OF_A_PART if part is left[0] else 1.0)
+        inner = _split(solve_local_map(part, own), most - 1, own)
+        effort.give_back(own)
+        breaks = [(first + offset, each) for offset, each in inner.breaks]
+        split = _Split(split.parts + inner.parts, split.breaks + breaks, split.is_searched and inner.is_searched)
+    return split
+
+
+def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
+    """Without what was read where the break is: pictures of one standing pose may show two places."""
+    keyframe = part.readings.keyframe
+    kept = (keyframe > 0) | (first == 0)
+    kept &= (keyframe < len(part.stamps_ns) - 1) | (end == len(whole.stamps_ns))
+    readings = part.readings.where(kept)
+    seen, tag = np.unique(readings.tag, return_inverse=True)
+    return replace(part, tags=tuple(part.tags[i] for i in seen), readings=replace(readings, tag=tag))
+
+
+def _fits(local_map: LocalMap) -> bool:
+    """Whether the whole fits together, no stretch between two readings strains the wheels beyond chance, nor a tag.
+
+    What is between two readings is laid out as the wheels like it best, so that its squares add up to those of the
+    motion from one reading to the next: chi-square with 3 degrees of freedom at most.
+    """
+    problem, state = local_map.graph.problem, local_map.solution.state
+    if len(local_map.chain.tags) < 2 or not len(problem.odometry.first):
+        return True
+    reads = np.zeros(len(problem.columns.poses), dtype=np.bool_)
+    reads[problem.readings.pose] = True
+    between = np.cumsum(reads)[problem.odometry.first]
+    squares = np.bincount(between, (problem.odometry.residual(state) ** 2).sum(axis=1))
+    strained = squares > chi2.isf(FALSE_ALARM / len(squares), 3)
+    return local_map.goodness.fits and not strained.any() and not _wild_in_a_row(local_map)
+
+
+def _wild_in_a_row(local_map: LocalMap) -> bool:
+    """Whether more readings of a tag in a part of the way are wild than chance makes so.
+
+    The wheels are known so well that a solve may rather give up the readings around a slip, whose loss is bounded.
+    """
+    chain, readings = local_map.chain, local_map.graph.problem.readings
+    squares = (readings.residual(local_map.solution.state) ** 2).sum(axis=1)
+    squares /= max(1.0, local_map.goodness.reading_factor) ** 2
+    part = (chain.along_m[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
+    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
+    by_chance = np.asarray(binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM))
+    return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
+
+
+def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
+    """Where the break may be: what lies between the two parts, or wherever they overlap.
+
+    Not where all was read on one side, for nothing tells of a break there. A place with a single keyframe on one side
+    stays: it cannot be a break, since no part can be solved there, but where it explains most none other may.
+    """
+    wanted = [_Place(ahead.end, behind.first)]
+    if behind.first <= ahead.end:
+        reading = np.unique(chain.readings.keyframe)
+        cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
+        cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
+        cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
+        wanted = [_Place(cut, cut) for cut in cuts.tolist()]
+    places = dict.fromkeys(_between_readings(chain, each) for each in wanted)
+    return [each for each in places if each.end > 0 and each.begin < len(chain.stamps_ns)]
+
+
+def _seconds_between(chain: Chain, place: _Place) -> float:
+    """Who carries a robot has it stand meanwhile."""
+    return float(chain.stamps_ns[place.begin] - chain.stamps_ns[place.end - 1]) * 1e-9
+
+
+def _between_readings(chain: Chain, place: _Place) -> _Place:
+    """As far as nothing was read: nobody knows where in there it happened."""
+    reading = np.unique(chain.readings.keyframe)
+    before, after = reading[reading < place.end], reading[reading >= place.begin]
+    n = len(chain.stamps_ns)
+    return _Place(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
+
+
+def _ways_to_align(chain: Chain, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
+    """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
+    apart = _solved_apart(chain, place, effort)
+    if apart is None:
+        return []
+    at_begin = behind.poses[place.begin - behind.first]
+    alignment = _aligned(*apart)
+    ways = [] if alignment is None else [alignment, *alignment.rivals]
+    return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
+
+
+def _solved_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> list[Solution]:
+    """With a break, wherever it may be; not from all starts where there is no effort left."""
+    found: list[Solution] = []
+    for start in starts:
+        if effort.is_spent():
+            break
+        freed = _freed(problem, *start.place)
+        found.append(solve(freed, start.state, COST_TOLERANCE, most_tries=effort.tries(freed, 1.0)))
+        effort.spend(found[-1], is_built=True)
+    return found
+
+
+def _solved_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
+    """What comes before and what comes after, each on its own; None where one of them cannot be."""
+    n = len(chain.stamps_ns)
+    if not 1 < place.end <= place.begin < n - 1:
+        return None
+    found = []
+    for part in (chain.part(0, place.end), chain.part(place.begin, n)):
+        own = effort.taken(_SHARE_OF_A_SOLVE)
+        try:
+            found.append(solve_local_map(part, own))
+        except OfflineError:
+            return None
+        effort.give_back(own)
+    return found[0], found[1]
+
+
+def _aligned(before: LocalMap, after: LocalMap) -> Alignment | None:
+    shared = sorted(set(before.graph.tags) & set(after.graph.tags))
+    return align(condense(before, shared), condense(after, shared)) if len(shared) > 1 else None
+
+
+def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_behind: FloatArray) -> _Start:
+    """Starting values for the whole with a break in that place."""
+    before, after = ahead.poses[: place.end], behind.poses[place.begin - behind.first :]
+    between = chained(graph.chains[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
+    poses = np.concatenate([before, between, se2.compose(T_ahead_behind, after)])
+    tags = {tag: se2.apply(T_ahead_behind, at) for tag, at in behind.tags.items()} | ahead.tags
+    return _Start(place, graph.start(poses, tags, ahead.calibration))
+
+
+def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort) -> Break | None:
+    """The break, if two tags agree on it and it pays to believe in it."""
+    chain, problem = local_map.chain, local_map.graph.problem
+    parts = _solved_apart(chain, place, effort)
+    alignment = None if parts is None else _aligned(*parts)
+    if parts is None or alignment is None or not alignment.is_sure:
+        return None
+    freed = _freed(problem, *place)
+    apart = solve(freed, start, most_tries=effort.tries(freed, 1.0))
+    effort.spend(apart)
+    together = solve(problem, apart.state, most_tries=effort.tries(problem, 1.0))
+    effort.spend(together)
+    joined = min(local_map.solution.cost, together.cost)
+    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
+    reading = np.unique(chain.readings.keyframe)
+    # Between two readings all motions are one: freeing the others as well lets nothing else go.
+    n_freed = 3 * (1 + int(((reading >= place.end) & (reading < place.begin)).sum()))
+    bound = factor**2 * chi2.isf(FALSE_ALARM / len(reading), n_freed)
+    chi_square = 2.0 * (joined - apart.cost)
+    if chi_square <= bound:
+        return None
+    jump = _jump(local_map.graph, apart.state, *place)
+    reach = min(other.end for other in equal) - 1, max(other.begin for other in equal)
+    return Break(place.end, place.begin, reach, jump, chi_square, float(bound))
+
+
+def _freed(problem: Problem, end: int, begin: int) -> Problem:
+    """Without the motions from keyframe end - 1 to begin."""
+    inside = (problem.odometry.first >= end - 1) & (problem.odometry.first < begin)
+    weak = np.where(inside[:, None, None], _FREED * problem.odometry.whitening, problem.odometry.whitening)
+    return replace(problem, odometry=replace(problem.odometry, whitening=weak))
+
+
+def _jump(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
+    """(3,) the motion that the wheels do not have."""
+    odometry = graph.chains[0].odometry.part(end - 1, begin)
+    told = odometry.dead_reckoned(graph.wheel_calibration(state, 0))[-1]
+    return se2.between(told, se2.between(state.poses[end - 1], state.poses[begin]))
+
+
+def _numbered(maps: Sequence[LocalMap]) -> list[LocalMap]:
+    """Stretches named after their run and their place in it."""
+    count: dict[str, int] = {}
+    numbered = []
+    for each in maps:
+        run = each.chain.run.name
+        count[run] = count.get(run, 0) + 1
+        chain = replace(each.chain, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
+        numbered.append(replace(each, chain=chain, graph=replace(each.graph, chains=(chain,))))
+    return numbered
+
+
+def _not_searched(chain: Chain) -> str:
+    return (
+        f"{chain.name}: its readings do not fit together, and where its wheels may have lost the way was not searched "
+        "to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, map what "
+        "was recorded before and after as runs of their own, or leave out some of the looks"
+    )
+
+
+def _sentence(chain: Chain, told: tuple[int, Break]) -> str:
+    """When, how much, how sure, and what became of it."""
+    first, found = told
+    keyframes = np.array([found.end - 1, found.begin, *found.reach]) + first
+    begin_s, end_s, earliest_s, latest_s = (chain.stamps_ns[keyframes] - chain.stamps_ns[0]) * 1e-9
+    or_else = ""
+    if (earliest_s, latest_s) != (begin_s, end_s):
+        or_else = f"; readings would as well have it anywhere from {earliest_s:.1f} s to {latest_s:.1f} s"
+    x_m, y_m, theta_rad = found.jump
+    return (
+        f"{chain.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start the robot moved by "
+        f"{hypot(x_m, y_m):.2f} m and {round(degrees(theta_rad))} deg that its wheels do not explain (chi-square "
+        f"{found.chi_square:.0f}, chance explains {found.bound:.0f}): lifted, pushed, or slipping? The run is split "
+        f"there into stretches, which only tags join{or_else}"
+    )

@@ -1,0 +1,158 @@
+"""The tags that do not belong, each with its kind and its evidence in words and numbers."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.offline.maps import SuspectTag
+from groundsbot.offline.outliers.false_detections import MOST_READINGS, Views, chances, views_of
+from groundsbot.offline.outliers.kinds import (
+    INCONSISTENT,
+    MOVED,
+    MOVING,
+    PHANTOM,
+    SWAPPED,
+    Case,
+    cases,
+    shift,
+    swapped_pairs,
+    wrong_runs,
+)
+from groundsbot.offline.outliers.search import FALSE_ALARM
+from groundsbot.offline.outliers.split import Searched
+
+_MOST_NAMED: Final = 4
+
+
+def suspect_tags(searched: Searched) -> list[SuspectTag]:
+    """All suspects of a component, in order of their ids."""
+    return _Report(searched).suspects()
+
+
+class _Report:
+    def __init__(self, searched: Searched) -> None:
+        self._searched = searched
+        self._names = [chain.name for chain in searched.graph.chains]
+        self._cases = cases(searched.sightings, searched.evidence, searched.places)
+        self._views: Views = views_of(searched.graph, searched.solution.state, searched.sightings)
+        self._chances: FloatArray = chances(searched.sightings, searched.place, self._views)
+
+    def suspects(self) -> list[SuspectTag]:
+        """Each case once; then ids that nothing supports."""
+        found: dict[int, SuspectTag] = {}
+        for i, j in swapped_pairs(self._cases, self._searched.evidence, self._searched.places):
+            found[i], found[j] = self._swapped(i, j), self._swapped(j, i)
+        wrong = wrong_runs(self._cases, self._searched.sightings)
+        for i, case in enumerate(self._cases):
+            if i not in found and (stand := self._phantom_stand(case)) is not None:
+                found[i] = self._contradicted_phantom(case, stand)
+        for run, which in wrong.items():
+            left = [i for i in which if i not in found]
+            for i in left:
+                found[i] = self._inconsistent(self._cases[i], run, len(which))
+        for i, case in enumerate(self._cases):
+            if i not in found:
+                found[i] = self._displaced(case)
+        return sorted([*found.values(), *self._unsupported()], key=lambda each: (each.family, each.tag_id))
+
+    def _displaced(self, case: Case) -> SuspectTag:
+        kind = case.kind()
+        apart_m, sigmas = self._shift(case)
+        if kind == MOVED:
+            elsewhere = [c for c in case.seen if c not in case.stands[0].chains]
+            words = f"by {_metres(apart_m)} ({sigmas:.0f} sigma) between runs: {self._where(case)}"
+            return self._suspect(case, kind, elsewhere, words)
+        if kind == MOVING:
+            during = [c for c, way in case.seen.items() if len(way) > 1]
+            words = f"by {_metres(apart_m)} ({sigmas:.0f} sigma) during {self._named(during)}: {self._where(case)}"
+            return self._suspect(case, kind, during, words)
+        words = f"two tags with one id, {_metres(apart_m)} ({sigmas:.0f} sigma) apart: {self._where(case)}"
+        return self._suspect(case, kind, list(case.seen), words)
+
+    def _swapped(self, i: int, j: int) -> SuspectTag:
+        case, other = self._cases[i], self._cases[j]
+        apart_m, sigmas = self._shift(case)
+        first = {c for c, way in case.seen.items() if way == (0,)}
+        words = (
+            f"with tag {other.tag.tag_id}: each hangs where the other was, {_metres(apart_m)} ({sigmas:.0f} sigma) "
+            f"away: {self._where(case)}"
+        )
+        return self._suspect(case, SWAPPED, [c for c in case.seen if c not in first], words, other.tag.tag_id)
+
+    def _inconsistent(self, case: Case, run: int, n_wrong: int) -> SuspectTag:
+        apart_m, sigmas = self._shift(case)
+        words = (
+            f"{self._names[run]} has this tag and {n_wrong - 1} more, most of those it shares, elsewhere than all "
+            f"others have them, this one by {_metres(apart_m)} ({sigmas:.0f} sigma): {self._where(case)}"
+        )
+        return self._suspect(case, INCONSISTENT, [run], words)
+
+    def _phantom_stand(self, case: Case) -> int | None:
+        """A place that only false detections speak for."""
+        searched = self._searched
+        for k, stand in enumerate(case.stands):
+            if stand.n_sightings > 1 or stand.n_readings > MOST_READINGS:
+                continue
+            rest = sum(each.n_readings for each in case.stands) - stand.n_readings
+            of_evidence = searched.evidence.which[searched.places.place == stand.label]
+            came_back = any(way.count(k) and way[0] != k and way[-1] != k for way in case.seen.values())
+            # The place is wrong for sure; what is asked is only why.
+            if rest > MOST_READINGS and (self._chances[of_evidence[0]] < FALSE_ALARM or came_back):
+                return k
+        return None
+
+    def _contradicted_phantom(self, case: Case, k: int) -> SuspectTag:
+        stand = case.stands[k]
+        nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
+        rest = sum(each.n_readings for each in case.stands) - stand.n_readings
+        words = (
+            f"{counted(stand.n_readings, 'reading')} in {self._named(stand.chains)} {_metres(nearest[0])} "
+            f"({nearest[1]:.0f} sigma) from where {counted(rest, 'other')} have it: a false detection"
+        )
+        return self._suspect(case, PHANTOM, list(stand.chains), words)
+
+    def _unsupported(self) -> list[SuspectTag]:
+        """Ids read once or a few times from where they should have been read more often."""
+        searched = self._searched
+        sightings = searched.sightings
+        alone = np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] == 1
+        asked = alone & (self._chances < 1.0)
+        found = []
+        for s in np.flatnonzero(asked & (self._chances < FALSE_ALARM / max(int(asked.sum()), 1))):
+            tag, run = sightings.ids[sightings.id[s]], self._names[sightings.chain[s]]
+            n = int(sightings.n_readings[s])
+            words = (
+                f"{counted(n, 'reading')} in {run} and none elsewhere, though it was in view as much the same in "
+                f"{int(self._views.near[s])} keyframes (by chance once in {1.0 / max(self._chances[s], 1e-9):.0f} "
+                "times): a false detection"
+            )
+            found.append(SuspectTag(tag.family, tag.tag_id, PHANTOM, (run,), words))
+        return found
+
+    def _suspect(
+        self, case: Case, kind: str, runs: Sequence[int], words: str, swapped_with: int | None = None
+    ) -> SuspectTag:
+        names = tuple(self._names[c] for c in sorted(runs))
+        return SuspectTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with)
+
+    def _shift(self, case: Case, first: int = 0, second: int = 1) -> tuple[float, float]:
+        return shift(case, self._searched.evidence, self._searched.places, first, second)
+
+    def _where(self, case: Case) -> str:
+        """Who saw it at which instance."""
+        told = [
+            f"in {self._named(stand.chains)} ({counted(stand.n_readings, 'reading')})"
+            for stand in case.stands[:_MOST_NAMED]
+        ]
+        more = len(case.stands) - _MOST_NAMED
+        return ", then ".join([*told, f"in {more} more places"] if more > 0 else told)
+
+    def _named(self, chains: Sequence[int]) -> str:
+        names = [self._names[c] for c in sorted(chains)]
+        return " and ".join(names[-2:]) if len(names) < 3 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _metres(distance_m: float) -> str:
+    return f"{distance_m:.2f} m"

@@ -1,0 +1,185 @@
+"""Readings of a tag in sightings: what a run saw of it while it passed by once.
+
+A tag that is where it was costs nothing more for having one place in all sightings; one that was moved does. So the
+sighting is what is tested: within one the tag stood still, and its readings lie so close together that the wheels
+alone would hold them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, IntArray
+from groundsbot.offline.measurements import Chain, TagKey
+
+# Longer out of sight, by the way driven or by the clock, and it is another sighting.
+GAP_M: Final = 2.0
+_GAP_S: Final = 10.0
+_INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """S sightings of the tags of some chains, in order of id, chain and time.
+
+    Attributes:
+        ids: N ids that were read, sorted, no instances told apart.
+        of_reading: (M,) the sighting of each reading, in the order of the chains' readings one after the other.
+        passing: (M,) the same, before passings were taken together (`suspects_passings`).
+        id: (S,) index into `ids`; chain: (S,) index of the chain.
+        first_ns, last_ns: (S,) when it began and ended.
+        n_readings: (S,)
+        tag: (S,) index into the chain's own tags.
+    """
+
+    ids: tuple[TagKey, ...]
+    of_reading: IntArray
+    passing: IntArray
+    id: IntArray
+    chain: IntArray
+    first_ns: IntArray
+    last_ns: IntArray
+    n_readings: IntArray
+    tag: IntArray
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.id)
+
+    @cached_property
+    def in_time(self) -> IntArray:
+        """(S,) their order by id, then by the beginning of the chain, then by time."""
+        begin_ns = np.full(int(self.chain.max(initial=-1)) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(begin_ns, self.chain, self.first_ns)
+        return np.lexsort((self.first_ns, self.chain, begin_ns[self.chain], self.id))
+
+    @cached_property
+    def rank(self) -> IntArray:
+        """(S,) of each in that order."""
+        rank = np.empty(len(self), dtype=np.int64)
+        rank[self.in_time] = np.arange(len(self))
+        return rank
+
+    def of_ids(self) -> list[IntArray]:
+        """Those of each id, in order of time."""
+        ends = np.cumsum(np.bincount(self.id, minlength=len(self.ids)))
+        return np.split(self.in_time, ends[:-1]) if len(ends) else []
+
+    def one_after_the_other(self, members: IntArray) -> bool:
+        """Whether the runs that these sightings are of were driven at different times, by what all of them sighted."""
+        chains = np.unique(self.chain[members])
+        spans = [(self.first_ns[self.chain == c].min(), self.last_ns[self.chain == c].max()) for c in chains]
+        return all(before[1] < after[0] for before, after in pairwise(sorted(spans)))
+
+    def came_back(self, members: IntArray, place: IntArray | BoolArray) -> bool:
+        """Whether a tag was sighted (members in order of time) in one place (of each), in another and there again.
+
+        Between runs that overlap there is no order.
+        """
+        parts = [members]
+        if not self.one_after_the_other(members):
+            parts = [members[self.chain[members] == c] for c in np.unique(self.chain[members])]
+        at = dict(zip(members.tolist(), place.tolist(), strict=True))
+        ways = [[at[s] for s in part.tolist()] for part in parts]
+        changes = [[here for i, here in enumerate(way) if i == 0 or here != way[i - 1]] for way in ways]
+        return any(len(set(way)) < len(way) for way in changes)
+
+
+def sightings_of(chains: Sequence[Chain], begins: BoolArray | None = None) -> Sightings:
+    """Cuts the readings of chains into sightings; instances of one id that a chain tells apart stay apart.
+
+    Args:
+        chains: whose readings, one after the other, are M.
+        begins: (M,) readings with which another sighting begins though the tag was not out of sight.
+    """
+    ids = tuple(sorted({tag.whole for chain in chains for tag in chain.tags}))
+    index = {tag: i for i, tag in enumerate(ids)}
+    rows, of_reading = [], []
+    first, n_readings = 0, 0
+    for number, chain in enumerate(chains):
+        n = len(chain.readings)
+        here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_readings : n_readings + n]
+        found, sighting = _of_chain(chain, here)
+        n_readings += n
+        own_ids = np.array([index[tag.whole] for tag in chain.tags], dtype=np.int64)
+        rows.append(np.column_stack([own_ids[found[:, 0]], np.full(len(found), number), found]))
+        of_reading.append(first + sighting)
+        first += len(found)
+    table = np.concatenate(rows) if rows else np.zeros((0, 6), dtype=np.int64)
+    order = np.lexsort((table[:, 3], table[:, 1], table[:, 0]))
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    own, chain_of, tag, first_ns, last_ns, count = table[order].T
+    sighting_of = rank[np.concatenate(of_reading)]
+    return Sightings(ids, sighting_of, sighting_of, own, chain_of, first_ns, last_ns, count, tag)
+
+
+def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:
+    """(s, 4) tag, first and last stamp, number of readings of each sighting; and (M,) the sighting of each reading."""
+    readings = chain.readings
+    order = np.lexsort((readings.keyframe, readings.tag))
+    tag, keyframe = readings.tag[order], readings.keyframe[order]
+    along_m = chain.along_m[keyframe]
+    stamps_ns = chain.stamps_ns[keyframe]
+    begins = np.ones(len(order), dtype=np.bool_)
+    begins[1:] = cut[order][1:] | (np.diff(tag) != 0) | (np.diff(along_m) > GAP_M) | (np.diff(stamps_ns) > _GAP_S * 1e9)
+    number = np.cumsum(begins) - 1
+    starts = np.flatnonzero(begins)
+    count = np.diff(np.append(starts, len(order)))
+    of_reading = np.empty(len(order), dtype=np.int64)
+    of_reading[order] = number
+    ends = starts + count - 1
+    return np.column_stack([tag[starts], stamps_ns[starts], stamps_ns[ends], count]).reshape(-1, 4), of_reading
+
+
+def places_told_apart(chains: Sequence[Chain], sightings: Sightings) -> IntArray:
+    """(S,) equal for sightings of what the chains take for one tag."""
+    keys = [(*chains[c].tags[t],) for c, t in zip(sightings.chain, sightings.tag, strict=True)]
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    return np.array([number[key] for key in keys], dtype=np.int64)
+
+
+def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[TagKey]:
+    """The tag of each sighting: the id alone where it has one place, else a, b, ... in order of time.
+
+    Args:
+        sightings: S of them.
+        place: (S,) equal where two sightings are of one tag.
+        only_in: put before the letter, so that no other chain has a tag of that name.
+    """
+    names: dict[tuple[int, int], str] = {}
+    n_places = np.zeros(len(sightings.ids), dtype=np.int64)
+    for s in sightings.in_time.tolist():
+        own, at = int(sightings.id[s]), int(place[s])
+        if (own, at) not in names:
+            names[own, at] = only_in + _letters(int(n_places[own]))
+            n_places[own] += 1
+    return [
+        sightings.ids[own]._replace(instance=names[own, at] if n_places[own] > 1 else "")
+        for own, at in zip(sightings.id.tolist(), place.tolist(), strict=True)
+    ]
+
+
+def with_instances(chains: Sequence[Chain], sightings: Sightings, tag_of: Sequence[TagKey]) -> list[Chain]:
+    """The same chains with readings of the tags that each sighting (S,) is of."""
+    relabelled = []
+    first = 0
+    for chain in chains:
+        n = len(chain.readings)
+        read = [tag_of[s] for s in sightings.of_reading[first : first + n]]
+        first += n
+        tags = tuple(sorted(set(read)))
+        index = {tag: i for i, tag in enumerate(tags)}
+        tag = np.array([index[each] for each in read], dtype=np.int64)
+        relabelled.append(replace(chain, tags=tags, readings=replace(chain.readings, tag=tag)))
+    return relabelled
+
+
+def _letters(number: int) -> str:
+    """a, b, ... z, aa, ab, ..."""
+    tail = _INSTANCES[number % 26]
+    return tail if number < 26 else _letters(number // 26 - 1) + tail

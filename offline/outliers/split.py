@@ -1,0 +1,292 @@
+"""Tags that do not belong: found after the solve, given places of their own, and solved again.
+
+A run on its own first: a tag that was carried about while it drove wrecks a local map, and with it the alignment. Then
+all runs of a component together, begun with those tags apart that alignments found elsewhere.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.alignment import Merge
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements import TagKey
+from groundsbot.offline.outliers.evidence import (
+    Evidence,
+    Heard,
+    contradicted,
+    gathered,
+    heard,
+    noise_scales,
+    to_other_tags,
+)
+from groundsbot.offline.outliers.grouping import few_of_each_tag
+from groundsbot.offline.outliers.places import Places, settled
+from groundsbot.offline.outliers.search import FALSE_ALARM, bound, excess, search
+from groundsbot.offline.outliers.sightings import Sightings, instances, places_told_apart, sightings_of, with_instances
+from groundsbot.offline.sam import Graph, Measured, Solution, build_graph, solve
+
+# Each search is linearised where the last one led; two do where a move is far beyond its sigma.
+_MOST_SEARCHES: Final = 5
+_LOOSER: Final = 1e3
+# Two tags have one id now and then, three hardly: then other ways to join its sightings are tried, so many at most.
+_MANY_PLACES: Final = 3
+_MOST_JOINS: Final = 12
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A solve whose tags are where its readings say, split where need be.
+
+    Attributes:
+        graph, solution: with the splits.
+        sightings: of the graph's chains.
+        place: (S,) equal where sightings are of one tag.
+        evidence: at the solution, and places: of its sightings.
+    """
+
+    graph: Graph
+    solution: Solution
+    sightings: Sightings
+    place: IntArray
+    evidence: Evidence
+    places: Places
+
+    @property
+    def tags(self) -> list[TagKey]:
+        """The tag of each sighting (S,)."""
+        of = zip(self.sightings.chain, self.sightings.tag, strict=True)
+        return [self.graph.chains[c].tags[t] for c, t in of]
+
+
+class RunsAlone:
+    """Local maps with their tags told apart, each looked at once though two steps ask for it."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[LocalMap, LocalMap]] = []
+
+    def split(self, local_map: LocalMap) -> LocalMap:
+        """As `split_alone`."""
+        for before, after in self._seen:
+            if before is local_map:
+                return after
+        after = split_alone(local_map)
+        self._seen.append((local_map, after))
+        return after
+
+    def explained_by_tags(self, before: LocalMap) -> LocalMap:
+        """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
+
+        Where wheels did not tell how the robot moved, most tags seem to have been moved.
+        """
+        after = self.split(before)
+        sightings = sightings_of([before.chain])
+        n_again = int((np.bincount(sightings.id) > 1).sum())
+        n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
+        return after if after.goodness.fits and 2 * n_split < max(n_again, 3) else before
+
+
+def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalMap:
+    """A local map in which tags that were not in one place all along have several; the same where there are none.
+
+    A drive that does not fit together may have ended in a wrong valley, led there by two tags with one id. Then it is
+    solved with each sighting's tag apart, which wheels alone hold together, and sightings are joined from there, the
+    surest first.
+    """
+    found = local_map
+    if not found.goodness.fits:
+        factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
+        sightings = _sightings(found.graph, heard(found.graph, found.solution.state, factors))
+        if len(sightings) > len(sightings.ids):
+            found = _in_few_places(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
+    # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
+    return _in_few_places(found, noise_scales([found.goodness]), false_alarm)
+
+
+def joined(local_map: LocalMap) -> LocalMap:
+    """With one place for each id again."""
+    if not any(tag.instance for tag in local_map.chain.tags):
+        return local_map
+    sightings = sightings_of([local_map.chain])
+    ids = [sightings.ids[i] for i in sightings.id]
+    return solve_local_map(with_instances([local_map.chain], sightings, ids)[0])
+
+
+def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
+    """Splits and joins until nothing changes; where an id comes out in many places, also from other joins.
+
+    Two tags with one id that are passed again after a long way are both off by what is not known of the way. One may
+    come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
+    """
+    found = _settled_alone(local_map, scales, false_alarm)
+    n_places = Counter(key.whole for key in found.chain.tags)
+    for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
+        seen = _looked_at(local_map.graph, local_map.solution, scales)
+        for place in _joins(seen, tag)[:_MOST_JOINS]:
+            other = _settled_alone(_relabelled(local_map, seen.sightings, place), scales, false_alarm)
+            if other.goodness.fits >= found.goodness.fits and _n_places(other, tag) < _n_places(found, tag):
+                found = other
+            if _n_places(found, tag) < _MANY_PLACES:
+                break
+    return found
+
+
+def _joins(seen: Searched, tag: TagKey) -> list[IntArray]:
+    """(S,) each: the places with two of an id joined, the surest first.
+
+    However far apart they are: what turns by an angle moves on an arc, and a linearisation knows of no arcs.
+    """
+    which, places = seen.evidence.which, seen.places
+    own = np.array([seen.sightings.ids[i] == tag for i in seen.sightings.id[which]], dtype=np.bool_)
+    found = []
+    for p, q in combinations(np.unique(places.place[own]).tolist(), 2):
+        off, covariance = places.apart(seen.evidence, p, q)
+        one, other = (seen.place[which[places.place == label][0]] for label in (p, q))
+        joined = np.where(seen.place == other, one, seen.place)
+        found.append((float(off @ np.linalg.solve(covariance, off)), joined))
+    return [place for _, place in sorted(found, key=lambda each: each[0])]
+
+
+def _n_places(local_map: LocalMap, tag: TagKey) -> int:
+    return sum(key.whole == tag for key in local_map.chain.tags)
+
+
+def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
+    """Splits and joins until nothing changes."""
+    found = local_map
+    for _ in range(_MOST_SEARCHES):
+        seen = _looked_at(found.graph, found.solution, scales)
+        wanted = _wanted(seen, false_alarm)
+        if _same(wanted, seen.place):
+            break
+        found = _relabelled(found, seen.sightings, wanted)
+    return found
+
+
+def _relabelled(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
+    """The chain solved anew with these places, whose names no other run has."""
+    tag_of = instances(sightings, place, f"{local_map.chain.name} ")
+    return solve_local_map(with_instances([local_map.chain], sightings, tag_of)[0])
+
+
+def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
+    """The maps with tags told apart that sure alignments found elsewhere in one map than in another."""
+    names: dict[tuple[int, TagKey], TagKey] = {}
+    sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_sure]
+    outliers = {tag for pair in sure for tag in (pair.alignment.outliers if pair.alignment else ())}
+    for tag in sorted(outliers):
+        group = {m: m for m, each in enumerate(maps) if tag in each.graph.tags}
+        for pair in sure:
+            if pair.alignment is not None and tag in pair.alignment.inliers:
+                one, other = group[pair.a], group[pair.b]
+                group = {m: one if g == other else g for m, g in group.items()}
+        for m, g in group.items():
+            names[m, tag] = tag._replace(instance=f"like {maps[g].chain.name}")
+    return [renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
+
+
+def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+    """Splits and joins the tags of a component until nothing changes.
+
+    What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault.
+
+    Args:
+        graph: of the component.
+        solution: of it.
+        maps: of the graph's chains.
+    """
+    if len(graph.problem.measured):
+        loose = replace(graph, problem=replace(graph.problem, measured=_loosened(graph.problem.measured)))
+        seen = _split(loose, solve(loose.problem, solution.state), maps)
+        problem = replace(seen.graph.problem, measured=_measured_again(graph, seen.graph))
+        return replace(seen, graph=replace(seen.graph, problem=problem), solution=solve(problem, seen.solution.state))
+    return _split(graph, solution, maps)
+
+
+def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+    scales = noise_scales([each.goodness for each in maps])
+    seen = _looked_at(graph, solution, scales)
+    for _ in range(_MOST_SEARCHES):
+        wanted = _wanted(seen, FALSE_ALARM)
+        if instances(seen.sightings, wanted) == seen.tags:
+            break
+        seen = _looked_at(*_solved_again(seen, wanted), scales)
+    return seen
+
+
+def _sightings(graph: Graph, at: Heard) -> Sightings:
+    """Cut also where a tag moved in sight."""
+    whole = sightings_of(graph.chains)
+    cut = contradicted(at, whole)
+    return few_of_each_tag(graph, sightings_of(graph.chains, cut) if cut.any() else whole)
+
+
+def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
+    at = heard(graph, solution.state, scales)
+    sightings = _sightings(graph, at)
+    place = places_told_apart(graph.chains, sightings)
+    evidence = gathered(at, sightings)
+    return Searched(graph, solution, sightings, place, evidence, settled(evidence, place[evidence.which]))
+
+
+def _wanted(seen: Searched, false_alarm: float) -> IntArray:
+    """(S,) the places that the evidence asks for."""
+    which = seen.evidence.which
+    found = seen.place.copy()
+    if len(which):
+        least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm)
+        found[which] = seen.place.max() + 1 + search(seen.evidence, seen.sightings, seen.places, least_gain)
+    return found
+
+
+def _same(place: IntArray, other: IntArray) -> bool:
+    """Whether two ways (S,) to number places gather the same sightings."""
+    pairs = len(np.unique(np.column_stack([place, other]), axis=0))
+    return pairs == len(np.unique(place)) == len(np.unique(other))
+
+
+def _solved_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
+    """The same chains with these places, from the poses as they are."""
+    graph, state = seen.graph, seen.solution.state
+    again = build_graph(with_instances(graph.chains, seen.sightings, instances(seen.sightings, place)))
+    again = replace(again, problem=replace(again.problem, measured=_measured_again(graph, again)))
+    start = again.start(state.poses, _unchanged(graph, again, state.tags), graph.calibration_of(state))
+    return again, solve(again.problem, start)
+
+
+def _loosened(measured: Measured) -> Measured:
+    """With sigmas so wide that it contradicts nothing."""
+    starts, distances = measured.starts, measured.distances
+    return Measured(
+        replace(starts, whitening=starts.whitening / _LOOSER),
+        replace(distances, sigma_m=distances.sigma_m * _LOOSER),
+    )
+
+
+def _measured_again(before: Graph, after: Graph) -> Measured:
+    """What was measured, now to the first instance of each tag."""
+    first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
+    return to_other_tags(before.problem.measured, np.array([first[tag.whole] for tag in before.tags], dtype=np.int64))
+
+
+def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
+    """Places of the tags that have the readings they had."""
+    n_before = dict(zip(before.tags, before.n_readings().tolist(), strict=True))
+    n_after = dict(zip(after.tags, after.n_readings().tolist(), strict=True))
+    places = dict(zip(before.tags, tags_m, strict=True))
+    return {tag: places[tag] for tag, n in n_after.items() if n_before.get(tag) == n}
+
+
+def renamed(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
+    """The same map with some of its tags under other names."""
+    if not names:
+        return local_map
+    chain = local_map.chain
+    renamed = replace(chain, tags=tuple(names.get(tag, tag) for tag in chain.tags))
+    graph = replace(local_map.graph, chains=(renamed,), tags=tuple(names.get(tag, tag) for tag in local_map.graph.tags))
+    return replace(local_map, chain=renamed, graph=graph)

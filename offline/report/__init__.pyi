@@ -1,0 +1,9 @@
+from .picture import write_picture
+from .report import write_report
+from .sentences import advice_sentence
+
+__all__ = [
+    "advice_sentence",
+    "write_picture",
+    "write_report",
+]

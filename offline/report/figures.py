@@ -1,0 +1,150 @@
+"""What the report's figures draw: plain numbers, thinned and rounded, a list for each trace.
+
+Numbers that map.json has too come from its document, so that the two cannot disagree.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.mapping import Solved, Workings
+from groundsbot.offline.report.picture import RUN_COLOURS
+from groundsbot.offline.report.sentences import advice_sentence, has_several_families, tag_label, would_help
+from groundsbot.offline.report.timeline import events_of, timeline
+
+# A trajectory's points in a figure: enough for a screen, zoomed in a few times.
+_MOST_POINTS: Final = 1500
+_MOST_TIMELINES: Final = 24
+_DECIMALS: Final = 3  # millimetres
+
+
+def figures(document: dict[str, Any], workings: Workings) -> dict[str, Any]:
+    """Data of all figures, ready for JSON.
+
+    Args:
+        document: of `map_as_json`.
+        workings: of the same map.
+    """
+    colours = run_colours(document)
+    components = [_component(document, i, solved, workings, colours) for i, solved in enumerate(workings.solved)]
+    events = events_of([chain for solved in workings.solved for chain in solved.graph.chains])
+    timelines: list[dict[str, Any]] = []
+    for solved in workings.solved:
+        sigmas = residual_sigmas(solved)
+        for i, chain in enumerate(solved.graph.chains):
+            if len(timelines) < _MOST_TIMELINES:
+                data = timeline(chain, sigmas[chain_of_reading(solved) == i], events[chain.name])
+                timelines.append(data | {"colour": colours[chain.name]})
+    n_timelines = sum(len(solved.graph.chains) for solved in workings.solved)
+    return {"components": components, "timelines": timelines, "n_timelines": n_timelines}
+
+
+def run_colours(document: dict[str, Any]) -> dict[str, str]:
+    """Each chain's colour, that of its run in map.png."""
+    runs = list(dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"]))
+    return {
+        run["run"]: RUN_COLOURS[runs.index(run["stretch_of"] or run["run"]) % len(RUN_COLOURS)]
+        for run in document["runs"]
+    }
+
+
+def residual_sigmas(solved: Solved) -> FloatArray:
+    """(M,) what each reading leaves over: root mean square of its two whitened coordinates."""
+    residual = solved.graph.problem.readings.residual(solved.solution.state)
+    return np.asarray(np.sqrt((residual**2).mean(axis=1)))
+
+
+def chain_of_reading(solved: Solved) -> IntArray:
+    """(M,) index of the chain that each reading belongs to."""
+    return np.searchsorted(solved.graph.first_pose, solved.graph.problem.readings.pose, side="right") - 1
+
+
+def tag_readings(solved: Solved) -> list[list[dict[str, Any]]]:
+    """For each tag of a component, a record for each chain that read it: how often, and what that leaves over."""
+    n_chains, n_tags = len(solved.graph.chains), len(solved.graph.tags)
+    sigmas = residual_sigmas(solved)
+    cell = solved.graph.problem.readings.tag * n_chains + chain_of_reading(solved)
+    count = np.bincount(cell, minlength=n_tags * n_chains).reshape(n_tags, n_chains)
+    squares = np.bincount(cell, sigmas**2, n_tags * n_chains).reshape(n_tags, n_chains)
+    worst = np.zeros((n_tags, n_chains))
+    np.maximum.at(worst.reshape(-1), cell, sigmas)
+    return [
+        [
+            {
+                "run": solved.graph.chains[c].name,
+                "n": int(count[t, c]),
+                "rms": round(float(np.sqrt(squares[t, c] / count[t, c])), 2),
+                "worst": round(float(worst[t, c]), 1),
+            }
+            for c in np.flatnonzero(count[t]).tolist()
+        ]
+        for t in range(n_tags)
+    ]
+
+
+def _component(
+    document: dict[str, Any], index: int, solved: Solved, workings: Workings, colours: dict[str, str]
+) -> dict[str, Any]:
+    runs = [run for run in document["runs"] if run["component"] == index]
+    tags = [tag for tag in document["tags"] if tag["component"] == index]
+    several = has_several_families(document)
+    merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
+    return {
+        "frame_run": document["components"][index]["frame_run"],
+        "runs": merged,
+        "tags": [
+            _tag(tag, readings, several_families=several)
+            for tag, readings in zip(tags, tag_readings(solved), strict=True)
+        ],
+        "is_merged": len(runs) > 1,
+        "before": _before(solved, workings, colours, several_families=several),
+        "advice": [
+            {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
+            | dict(zip("xy", _rounded(np.array(each["way_m"])), strict=True))
+            for each in document["advice"]
+            if each["component"] == index and would_help(each)
+        ],
+    }
+
+
+def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, Any]:
+    """A trajectory and the heading at its start."""
+    kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // _MOST_POINTS)), len(poses) - 1))
+    x, y = _rounded(poses[kept])
+    return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
+
+
+def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_families: bool) -> dict[str, Any]:
+    (xx, xy), (_, yy) = [row[:2] for row in tag["covariance"][:2]]
+    return {
+        "label": tag_label(tag, several_families=several_families),
+        "family": tag["family"],
+        "position_m": [round(value, 6) for value in tag["position_m"][:2]],
+        "covariance": [None if value is None else float(f"{value:.7g}") for value in (xx, xy, yy)],
+        "n": tag["n_observations"],
+        "readings": list(readings),
+    }
+
+
+def _before(
+    solved: Solved, workings: Workings, colours: dict[str, str], *, several_families: bool
+) -> list[dict[str, Any]]:
+    """Each local map laid where the alignments put it, with its own tags."""
+    layers = []
+    for T_frame_start, member in zip(solved.group.T_frame_start, solved.group.members, strict=True):
+        local_map = workings.maps[member]
+        places = se2.apply(T_frame_start, np.array(list(local_map.tags_m.values())).reshape(-1, 2))
+        x, y = _rounded(places)
+        labels = [tag_label(tag._asdict(), several_families=several_families) for tag in local_map.tags_m]
+        trace = _trace(local_map.chain.name, colours, se2.compose(T_frame_start, local_map.T_start_base))
+        layers.append(trace | {"tags": {"label": labels, "x": x, "y": y}})
+    return layers
+
+
+def _rounded(points: FloatArray) -> tuple[list[float], list[float]]:
+    """Abscissae and ordinates of (N, 2 or more)."""
+    x, y = np.round(points[:, :2], _DECIMALS).T.tolist() if len(points) else ([], [])
+    return x, y

@@ -1,0 +1,47 @@
+"""Where to write beside points so that the writing stays legible."""
+
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+
+_MARKER_PX: Final = 5.0  # half a marker, and a little air
+_DIRECTIONS: Final = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [0, 1], [0, -1], [1, 0], [-1, 0]], dtype=np.float64)
+_RINGS: Final = (1.0, 1.8, 2.8)  # the nearest ring of places first
+# What covering costs: another label most, another marker, a trajectory's point least; and what distance costs.
+_COST_LABEL: Final = 20.0
+_COST_MARKER: Final = 10.0
+_COST_TRAIL: Final = 0.5
+_COST_RING: Final = 1.0
+
+
+def place_labels(points_px: FloatArray, sizes_px: FloatArray, trails_px: FloatArray) -> FloatArray:
+    """Centres (N, 2) of labels of given sizes (N, 2) beside points (N, 2), greedily the least covering place each.
+
+    Args:
+        points_px: what the labels name; none should be covered.
+        sizes_px: width and height of each label.
+        trails_px: (M, 2) what is better not covered.
+    """
+    centres = np.empty_like(points_px)
+    for index, (point, size) in enumerate(zip(points_px, sizes_px, strict=True)):
+        reach = size / 2 + _MARKER_PX
+        candidates = np.concatenate([point + ring * _DIRECTIONS * reach for ring in _RINGS])
+        cost = np.repeat(np.arange(len(_RINGS)) * _COST_RING, len(_DIRECTIONS))
+        others = np.delete(points_px, index, axis=0)
+        cost = cost + _COST_MARKER * _n_covered(candidates, size / 2 + _MARKER_PX / 2, others)
+        cost = cost + _COST_TRAIL * np.minimum(_n_covered(candidates, size / 2, trails_px), 4)
+        cost = cost + _COST_LABEL * _n_covered(candidates, (size + sizes_px[:index]) / 2, centres[:index])
+        centres[index] = candidates[int(np.argmin(cost))]
+    return centres
+
+
+def _n_covered(candidates: FloatArray, half: FloatArray, points: FloatArray) -> FloatArray:
+    """How many points (M, 2) lie within the half widths (2,) or (M, 2) of each candidate (C, 2)."""
+    half = np.broadcast_to(half, points.shape)
+    lowest, highest = candidates.min(axis=0), candidates.max(axis=0)
+    # Most points are far from all candidates.
+    near = np.flatnonzero(((points > lowest - half) & (points < highest + half)).all(axis=-1))
+    apart = np.abs(candidates[:, np.newaxis] - points[near])
+    return np.asarray((apart < half[near]).all(axis=-1).sum(axis=1), dtype=np.float64)

@@ -1,0 +1,219 @@
+"""map.png: trajectories and tags from above, to scale."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from math import ceil, degrees, sqrt
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.patches import Ellipse
+from matplotlib.path import Path as PolygonPath
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Affine2D
+
+from groundsbot.calib.foundation import FloatArray, counted, written_whole
+from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.report.label_places import place_labels
+
+Dashes = Literal["-", "--", "-.", ":"]
+# Okabe and Ito, "Color universal design" (2008), without those too pale for lines; then again with other dashes.
+RUN_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_DASHES: Final[tuple[Dashes, ...]] = ("-", "--", "-.", ":")
+_SHARED: Final = "#222222"
+_DPI: Final = 100
+_WIDTH_IN: Final = 16.0
+_HEIGHT_LIMITS_IN: Final = (7.0, 16.0)
+_FURNITURE_IN: Final = 1.6  # title, axis labels and legend
+_MARGIN: Final = 0.04  # of the extent, so that ids near the rim fit in
+_MOST_PANELS: Final = 6
+_VISIBLE_SHARE: Final = 0.006  # of the extent: a typical ellipse's half axis below it is drawn larger
+_FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
+_LABEL_PT: Final = 9.0
+_START_SIZE: Final = 17.0
+_DART: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)], closed=True)
+
+
+def write_picture(result: MapResult, path: Path) -> None:
+    """Draws a map as PNG, 1600 px wide: one panel a component, in metres, the same scale along both axes."""
+    figure = draw_map(result)
+    with written_whole(path) as partial, partial.open("wb") as stream:
+        figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": "groundsbot"})
+
+
+def draw_map(result: MapResult) -> Figure:
+    """The picture as a matplotlib figure."""
+    components = result.components[:_MOST_PANELS]
+    columns = 1 if len(components) == 1 else 2
+    rows = ceil(len(components) / columns)
+    figure = Figure(figsize=(_WIDTH_IN, _height_in(components, columns, rows)), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(_title(result), fontsize=14)
+    styles = _styles(result.runs)
+    factor = _ellipse_factor(components)
+    panels = []
+    for index, component in enumerate(components):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        if len(result.components) > 1:
+            axes.set_title(
+                f"component {index + 1}: {counted(len(component.tags), 'tag')}, from the start of {component.frame_run}"
+            )
+        _draw_component(axes, component, styles, factor)
+        panels.append(axes)
+    handles = _legend_handles(result, styles, factor)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=10, frameon=False)
+    figure.draw_without_rendering()  # settles the layout, so that ids can be placed in pixels
+    for axes, component in zip(panels, components, strict=True):
+        _write_ids(axes, component, styles)
+    return figure
+
+
+def _height_in(components: Sequence[Component], columns: int, rows: int) -> float:
+    """So that the widest panel fills its column."""
+    panel_in = (_WIDTH_IN - 1.0) / columns
+    ratio = max((high / wide for wide, high in map(_extent_m, components)), default=0.5)
+    return float(np.clip(rows * (panel_in * ratio + 0.6) + _FURNITURE_IN, *_HEIGHT_LIMITS_IN))
+
+
+def _points_m(component: Component) -> FloatArray:
+    parts = [run.T_map_base[:, :2] for run in component.runs]
+    parts += [tag.position_m[np.newaxis, :2] for tag in component.tags]
+    return np.concatenate(parts)
+
+
+def _extent_m(component: Component) -> tuple[float, float]:
+    """Width and height, at least a metre, since a robot may never have moved."""
+    wide, high = np.maximum(np.ptp(_points_m(component), axis=0), 1.0)
+    return float(wide), float(high)
+
+
+def _title(result: MapResult) -> str:
+    runs = {run.run for run in result.runs}
+    n_tags = sum(len(component.tags) for component in result.components)
+    driven_m = sum(run.distance_m for run in result.runs)
+    title = f"{counted(n_tags, 'tag')}, {counted(len(runs), 'run')}, {driven_m:.0f} m driven"
+    pairs = [pair for component in result.components for pair in component.start_to_start]
+    if len(pairs) == 1:
+        title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
+    if len(result.components) > 1:
+        title += f", in {len(result.components)} components"
+    if len(result.components) > _MOST_PANELS:
+        title += f", the {_MOST_PANELS} largest drawn"
+    return title
+
+
+def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
+    """Colour and dashes of each run; a run's stretches look alike."""
+    looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
+    return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
+
+
+def _ellipse_factor(components: Sequence[Component]) -> int:
+    """How much larger than true ellipses are drawn, so that a typical one can be seen."""
+    half_axes = [sqrt(float(np.linalg.eigvalsh(tag.covariance)[-1])) for c in components for tag in c.tags]
+    extent_m = max((max(_extent_m(component)) for component in components), default=1.0)
+    typical_m = float(np.median(half_axes)) if half_axes else extent_m
+    wanted = _VISIBLE_SHARE * extent_m / max(typical_m, 1e-12)
+    return next((factor for factor in _FACTORS if factor >= wanted), _FACTORS[-1])
+
+
+def _draw_component(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+    points = _points_m(component)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = max(_MARGIN * float((high - low).max()), 0.5)
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x in m")
+    axes.set_ylabel("y in m")
+    axes.grid(color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for run in component.runs:
+        colour, dashes = styles[run.run]
+        axes.plot(run.T_map_base[:, 0], run.T_map_base[:, 1], color=colour, linestyle=dashes, linewidth=1.4, zorder=3)
+        _draw_start(axes, run, colour)
+    _draw_tags(axes, component, styles, factor)
+
+
+def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
+    """A dart that points where the robot looked; an even triangle would not tell where."""
+    x_m, y_m, theta_rad = run.T_map_start
+    marker = MarkerStyle(_DART, transform=Affine2D().rotate(theta_rad))
+    (start,) = axes.plot([x_m], [y_m], marker=marker, color=colour, markersize=_START_SIZE, zorder=6, linestyle="")
+    start.set_markeredgecolor("white")
+    start.set_markeredgewidth(1.2)
+
+
+def _draw_tags(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+    places_m: dict[str, list[FloatArray]] = {}
+    for tag in component.tags:
+        colour = _tag_colour(tag, component, styles)
+        places_m.setdefault(colour, []).append(tag.position_m[:2])
+        axes.add_artist(_ellipse(tag, colour, factor))  # add_patch would look for new limits each time
+    for colour, places in places_m.items():
+        axes.plot(*np.array(places).T, marker="s", color=colour, markersize=4.0, zorder=4, linestyle="")
+
+
+def _ellipse(tag: TagResult, colour: str, factor: int) -> Ellipse:
+    variances, directions = np.linalg.eigh(tag.covariance)
+    small_m, large_m = np.sqrt(np.maximum(variances, 0.0)) * factor
+    angle_deg = degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+    ellipse = Ellipse(
+        (tag.position_m[0], tag.position_m[1]), 2 * large_m, 2 * small_m, angle=angle_deg, linewidth=0.8, zorder=2
+    )
+    ellipse.set(facecolor=(colour, 0.15), edgecolor=(colour, 0.7))
+    return ellipse
+
+
+def _tag_colour(tag: TagResult, component: Component, styles: dict[str, tuple[str, Dashes]]) -> str:
+    """Its run's, or dark if several runs saw it: those tags hold the map together."""
+    run_of = {run.name: run.run for run in component.runs}
+    seen_by = {run_of.get(name, name) for name in tag.runs}
+    if len(seen_by) != 1:
+        return _SHARED
+    return styles.get(seen_by.pop(), (_SHARED, "-"))[0]
+
+
+def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], factor: int) -> list[Line2D]:
+    handles = []
+    for run, (colour, dashes) in styles.items():
+        parts = [part for part in result.runs if part.run == run]
+        names = {part.name for part in parts}
+        n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
+        stretches = f", {len(parts)} stretches" if len(parts) > 1 else ""
+        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {counted(n_tags, 'tag')}{stretches}"
+        handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
+    handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
+    shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"
+    handles.append(_marker_handle("s", 4.0, "#777777", f"tag seen by one run (its colour), with {shown}"))
+    if any(len(tag.runs) > 1 for component in result.components for tag in component.tags):
+        handles.append(_marker_handle("s", 4.0, _SHARED, "tag seen by several runs"))
+    return handles
+
+
+def _marker_handle(marker: Literal["s"] | PolygonPath, size: float, colour: str, label: str) -> Line2D:
+    return Line2D([], [], color=colour, marker=marker, markersize=size, linestyle="", label=label)
+
+
+def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]]) -> None:
+    """Every tag's id beside it, where it covers no other tag or id if there is such a place."""
+    if not component.tags:
+        return
+    families = {tag.family for tag in component.tags}
+    texts = [tag.label if len(families) == 1 else tag.full_label for tag in component.tags]
+    px_per_pt = axes.figure.dpi / 72.0
+    places_px = axes.transData.transform(np.array([tag.position_m[:2] for tag in component.tags]))
+    trails = np.concatenate([run.T_map_base[:, :2] for run in component.runs])
+    trails_px = axes.transData.transform(trails[:: ceil(len(trails) / _TRAIL_POINTS)])
+    sizes_px = np.array([[0.64 * len(text) * _LABEL_PT, 1.1 * _LABEL_PT] for text in texts]) * px_per_pt
+    centres = axes.transData.inverted().transform(place_labels(places_px, sizes_px, trails_px))
+    for tag, text, (x_m, y_m) in zip(component.tags, texts, centres, strict=True):
+        label = axes.text(x_m, y_m, text, fontsize=_LABEL_PT, ha="center", va="center", zorder=7)
+        label.set_color(_tag_colour(tag, component, styles))
+        label.set_path_effects([withStroke(linewidth=2.0, foreground="white")])

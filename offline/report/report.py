@@ -1,0 +1,36 @@
+"""report.html: a map to look at, in one file that opens from disk without a network."""
+
+from pathlib import Path
+
+from groundsbot.calib.foundation import counted, written_whole
+from groundsbot.offline.mapping import Workings
+from groundsbot.offline.maps import MapResult, map_as_json
+from groundsbot.offline.report.figures import figures
+from groundsbot.offline.report.page import page
+from groundsbot.offline.report.sentences import sentences
+from groundsbot.offline.report.tables import tables
+
+
+def write_report(result: MapResult, workings: Workings, path: Path) -> None:
+    """Writes the report of a map.
+
+    Args:
+        result: the map.
+        workings: what it was made from.
+        path: of the file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    document = map_as_json(result)
+    n_runs = len({run.run for run in result.runs})
+    title = f"Map of {counted(n_runs, 'run')} and {counted(len(document['tags']), 'tag')}"
+    text = page(
+        title,
+        sentences(document),
+        [*document["losses"], *document["warnings"]],
+        tables(document),
+        figures(document, workings),
+    )
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")

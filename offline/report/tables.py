@@ -1,0 +1,113 @@
+"""The report's tables, from the document that map.json is written from."""
+
+from math import degrees
+from typing import Any
+
+from groundsbot.offline.report.cells import Table, number, table_of
+from groundsbot.offline.report.join_tables import alignments, holding, start_to_start
+from groundsbot.offline.report.parameter_tables import calibration, checks, choices, measurements, metres, noise
+from groundsbot.offline.report.sentences import advice_sentence, has_several_families, largest_sigma_m
+
+
+def tables(document: dict[str, Any]) -> list[Table]:
+    """Those that hold something."""
+    made = [
+        _suspects(document),
+        _advice(document),
+        alignments(document),
+        holding(document),
+        start_to_start(document),
+        checks(document),
+        metres(document),
+        measurements(document),
+        _runs(document),
+        _tags(document),
+        noise(document),
+        calibration(document),
+        choices(document),
+    ]
+    return [table for table in made if table.rows]
+
+
+def _suspects(document: dict[str, Any]) -> Table:
+    rows = [
+        (str(each["tag_id"]), each["family"], each["kind"], ", ".join(each["runs"]), each["evidence"])
+        for each in document["suspect_tags"]
+    ]
+    note = "Tags that do not belong, each with what speaks against it."
+    return table_of("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows)
+
+
+def _advice(document: dict[str, Any]) -> Table:
+    several = has_several_families(document)
+    rows = [
+        (
+            str(each["component"] + 1),
+            advice_sentence(each, several_families=several),
+            number(each["sigma_m"], 3),
+            number(each["sigma_then_m"], 3),
+        )
+        for each in document["advice"]
+    ]
+    note = "What would lower the largest sigma of a tag most, foretold from the covariances; drawn into the map."
+    columns = ("component", "what", "largest sigma (m)", "and then (m)")
+    return table_of("advice", "What to do next", note, columns, rows)
+
+
+def _runs(document: dict[str, Any]) -> Table:
+    rows = []
+    for run in document["runs"]:
+        x_m, y_m, theta_rad = run["T_map_start"]
+        n_tags = sum(run["run"] in tag["runs"] for tag in document["tags"])
+        rows.append(
+            (
+                run["run"],
+                run["robot"],
+                str(run["component"] + 1),
+                str(run["n_keyframes"]),
+                number(run["distance_m"], 1),
+                str(n_tags),
+                f"{x_m:.2f}, {y_m:.2f}",
+                f"{degrees(theta_rad):.1f}",
+                run["log"],
+            )
+        )
+    columns = ("run", "robot", "component", "keyframes", "driven (m)", "tags", "start x, y (m)", "heading (deg)", "log")
+    return table_of("runs", "Runs", "", columns, rows)
+
+
+def _tags(document: dict[str, Any]) -> Table:
+    rows = []
+    for tag in document["tags"]:
+        covariance = tag["covariance"]
+        rows.append(
+            (
+                f"{tag['tag_id']}{tag['instance']}",
+                tag["family"],
+                str(tag["component"] + 1),
+                *(number(value, 3) for value in tag["position_m"][:2]),
+                number(_root(covariance[0][0]), 3),
+                number(_root(covariance[1][1]), 3),
+                number(largest_sigma_m(covariance), 3),
+                str(tag["n_observations"]),
+                ", ".join(tag["runs"]),
+            )
+        )
+    columns = (
+        "tag",
+        "family",
+        "component",
+        "x (m)",
+        "y (m)",
+        "sigma x (m)",
+        "sigma y (m)",
+        "largest sigma (m)",
+        "readings",
+        "runs",
+    )
+    note = "Sigmas are of the place as seen from the frame's start; the largest is along the worst direction."
+    return table_of("tags", "Tags", note, columns, rows)
+
+
+def _root(variance: float | None) -> float | None:
+    return None if variance is None else max(variance, 0.0) ** 0.5

@@ -1,0 +1,82 @@
+"""What each drive was like, second by second: speed, tags in view, what its readings leave over, gaps and events."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.measurements import GAP_NS, Chain, RunEvent
+
+# As many points as a screen is wide.
+_MOST_POINTS: Final = 800
+_S: Final = 1e-9
+
+
+def timeline(chain: Chain, residual_sigmas: FloatArray, events: Sequence[RunEvent]) -> dict[str, Any]:
+    """One chain's columns over time, thinned: means of speed, largest of what else there is.
+
+    Args:
+        chain: whose keyframes are the times.
+        residual_sigmas: (M,) what each of its readings leaves over, in sigmas a coordinate.
+        events: of `events_of`.
+    """
+    n = len(chain.stamps_ns)
+    seconds = (chain.stamps_ns - chain.stamps_ns[0]) * _S
+    n_tags = np.bincount(chain.readings.keyframe, minlength=n)
+    squares = np.bincount(chain.readings.keyframe, residual_sigmas**2, n)
+    worst = np.zeros(n)
+    np.maximum.at(worst, chain.readings.keyframe, residual_sigmas)
+    first = np.arange(0, n, -(-n // _MOST_POINTS))
+    readings = np.add.reduceat(n_tags, first)
+    # A run may be one keyframe long: then there is no speed.
+    step_m = np.append(chain.odometry.distance_m, 0.0)
+    step_s = np.append(np.diff(seconds), 0.0)
+    driven_m, lasting_s = np.add.reduceat(step_m, first), np.add.reduceat(step_s, first)
+    return {
+        "run": chain.name,
+        "t_s": np.round(seconds[first], 2).tolist(),
+        "speed_m_s": _known(driven_m, lasting_s, 3),
+        "tags": np.maximum.reduceat(n_tags, first).tolist(),
+        "rms": _known(np.add.reduceat(squares, first), readings, 4, root=True),
+        "worst": _known(np.where(readings > 0, np.maximum.reduceat(worst, first), 0.0), readings.clip(0, 1), 2),
+        "gaps": _gaps(chain),
+        "events": [_shown(event, chain) for event in events],
+    }
+
+
+def _known(total: FloatArray, count: FloatArray | IntArray, digits: int, *, root: bool = False) -> list[float | None]:
+    """Total by count, None where nothing counts."""
+    mean = total / np.where(count > 0, count, 1)
+    values = np.round(np.sqrt(mean) if root else mean, digits).tolist()
+    return [value if known else None for value, known in zip(values, (count > 0).tolist(), strict=True)]
+
+
+def events_of(chains: Sequence[Chain]) -> dict[str, list[RunEvent]]:
+    """What recorders told, by the name of the chain that was driven then or, between two of them, nearest then."""
+    told: dict[str, list[RunEvent]] = {chain.name: [] for chain in chains}
+    for name in dict.fromkeys(chain.run.name for chain in chains):
+        own = [chain for chain in chains if chain.run.name == name]
+        spans = [(int(chain.stamps_ns[0]), int(chain.stamps_ns[-1])) for chain in own]
+        for event in own[0].run.events:
+            away_ns = [max(first - event.stamp_ns, event.stamp_ns - last, 0) for first, last in spans]
+            told[own[away_ns.index(min(away_ns))].name].append(event)
+    return told
+
+
+def _gaps(chain: Chain) -> list[list[float]]:
+    """Begin and end in seconds where no wheel was read for longer than a gap may be."""
+    if not chain.run.stretches:  # of a map that was kept: its log alone knows
+        return []
+    stamps_ns = np.concatenate([track.stamps_ns for track in chain.run.stretches])
+    stamps_ns = stamps_ns[(stamps_ns >= chain.stamps_ns[0]) & (stamps_ns <= chain.stamps_ns[-1])]
+    before = np.flatnonzero(np.diff(stamps_ns) > GAP_NS)
+    begin_s, end_s = ((stamps_ns[i] - chain.stamps_ns[0]) * _S for i in (before, before + 1))
+    gaps: list[list[float]] = np.round(np.stack([begin_s, end_s], axis=-1), 2).tolist()
+    return gaps
+
+
+def _shown(event: RunEvent, chain: Chain) -> dict[str, Any]:
+    """An event at its time, or at the rim of the drive."""
+    at_ns = min(max(event.stamp_ns, int(chain.stamps_ns[0])), int(chain.stamps_ns[-1])) - int(chain.stamps_ns[0])
+    return {"t_s": round(at_ns * _S, 2), "loss": event.is_loss, "text": event.text}

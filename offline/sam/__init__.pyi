@@ -1,0 +1,105 @@
+from .arrowhead.build import compiled_motions
+from .arrowhead.covariance import SquareRoot
+from .arrowhead.dissection import LEVELS
+from .arrowhead.elimination import eliminate_columns
+from .arrowhead.tree import Tree
+from .budget import Effort, efforts_of
+from .damping import Damping
+from .factors.losses import Loss, huber, loss_and_weight, losses_and_weights
+from .factors.planar import (
+    CalibrationPrior,
+    Columns,
+    Linearised,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+    stacked,
+    whitening,
+)
+from .factors.priors import NOTHING_MEASURED, DistanceFactors, KnownPlaces, Measured, StartFactors, ends_of
+from .graph import Graph, build_graph, unheld
+from .linearisation.kernels import Odometry, Values, advance, go_along, multiply, series, wrapped
+from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
+from .linearisation.readings import N_READING, reading_factor
+from .parameters import (
+    NO_PARAMETER,
+    Parameter,
+    mount_parameters_of,
+    parameter_of_scale,
+    parameters_of_camera,
+    parameters_of_wheels,
+)
+from .solver import (
+    DEFAULT_LOSSES,
+    HUBER_THRESHOLD,
+    MAX_RELATIVE_ERROR,
+    MAX_TRIES,
+    PLAIN_SQUARES,
+    Losses,
+    Problem,
+    Solution,
+    factorised,
+    solve,
+)
+
+__all__ = [
+    "DEFAULT_LOSSES",
+    "HUBER_THRESHOLD",
+    "LEVELS",
+    "MAX_RELATIVE_ERROR",
+    "MAX_TRIES",
+    "NOTHING_MEASURED",
+    "NO_PARAMETER",
+    "N_READING",
+    "PLAIN_SQUARES",
+    "CalibrationPrior",
+    "Columns",
+    "Damping",
+    "DistanceFactors",
+    "Effort",
+    "Graph",
+    "KnownPlaces",
+    "Linearised",
+    "Loss",
+    "Losses",
+    "Measured",
+    "Odometry",
+    "OdometryFactors",
+    "Parameter",
+    "Problem",
+    "ReadingFactors",
+    "Solution",
+    "SquareRoot",
+    "StartFactors",
+    "State",
+    "Tree",
+    "Values",
+    "advance",
+    "build_graph",
+    "compiled_motions",
+    "efforts_of",
+    "eliminate_columns",
+    "ends_of",
+    "error_by_wheels",
+    "error_of",
+    "factorised",
+    "go_along",
+    "huber",
+    "loss_and_weight",
+    "losses_and_weights",
+    "motion_at",
+    "mount_parameters_of",
+    "multiply",
+    "parameter_of_scale",
+    "parameters_of_camera",
+    "parameters_of_wheels",
+    "reading_factor",
+    "scaled_information",
+    "series",
+    "solve",
+    "stacked",
+    "unheld",
+    "wheel_correction",
+    "whitening",
+    "wrapped",
+]

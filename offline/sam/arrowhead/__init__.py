@@ -1,0 +1,5 @@
+"""The normal equations as an arrowhead: chains eliminated one by one, met in tags and calibration.
+
+Ordering (`dissection`, `tree`), elimination, substitution, and exact covariances from the factor (`covariance`,
+`marginals`).
+"""

@@ -1,0 +1,85 @@
+"""Cuts chains into nested pieces; see `arrowhead_tree`."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.foundation import jitted
+
+_LEAF_POSES: Final = 30
+_LEAVES_IN_MIDDLE: Final = 8
+_MIDDLES_IN_LARGE: Final = 4
+LEVELS: Final = 4  # leaf, middle, large, top
+
+
+class Pieces(NamedTuple):
+    """The tree before tags.
+
+    Attributes:
+        level, parent, chain, first, end, left, right: (N,) as in `arrowhead_tree.Tree`.
+        pose_level: (P,) at which each pose is eliminated.
+    """
+
+    level: IntArray
+    parent: IntArray
+    chain: IntArray
+    first: IntArray
+    end: IntArray
+    left: IntArray
+    right: IntArray
+    pose_level: IntArray
+
+
+def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
+    """Cuts each chain evenly into leaves, and joins these; the first poses of some chains become separators too."""
+    n_poses = int(chain_start[-1])
+    pose_level = np.zeros(n_poses, dtype=np.int64)
+    in_top = set(top_chains.tolist())
+    rows = []  # level, chain, cut on the left, cut on the right
+    for chain, (first, end) in enumerate(zip(chain_start[:-1].tolist(), chain_start[1:].tolist(), strict=True)):
+        # A cut is a pose, a separator; those at the chain's ends lie outside of it, or the first one is the top's.
+        is_top = chain in in_top
+        pose_level[first : first + is_top] = LEVELS - 1
+        cuts = _thinned(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
+        for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):
+            pose_level[cuts[1:-1]] = level + 1
+            n = len(cuts) - 1
+            rows.append(np.stack([np.full(n, level), np.full(n, chain), cuts[:-1], cuts[1:]]))
+            cuts = _thinned(cuts, n_joined)
+    level, chain_of, left, right = np.concatenate(rows, axis=1)
+    order = np.lexsort([level, right])
+    level, chain_of, left, right = level[order], chain_of[order], left[order], right[order]
+    top = len(level)
+    parent = np.full(top, top)
+    for lower in range(LEVELS - 2):
+        above = np.flatnonzero(level == lower + 1)
+        children = np.flatnonzero(level == lower)
+        parent[children] = above[np.searchsorted(above, children)]
+    return Pieces(
+        level=np.append(level, LEVELS - 1),
+        parent=np.append(parent, top),
+        chain=np.append(chain_of, -1),
+        first=np.append(left + 1, 0),
+        end=np.append(right, n_poses),
+        left=np.append(np.where(left < chain_start[chain_of], -1, left), -1),
+        right=np.append(np.where(right == chain_start[chain_of + 1], -1, right), -1),
+        pose_level=pose_level,
+    )
+
+
+def _thinned(cuts: IntArray, n_joined: int) -> IntArray:
+    """The first, the last and evenly some between, so that about `n_joined` pieces become one."""
+    n = max(1, round((len(cuts) - 1) / n_joined))
+    return cuts[(np.arange(n + 1) * (len(cuts) - 1)) // n]
+
+
+@jitted
+def nodes_of_poses(level: IntArray, first: IntArray, end: IntArray, pose_level: IntArray) -> IntArray:
+    """(P, LEVELS) node of each level that a pose lies in; -1 below the level at which it is eliminated."""
+    node_of = np.full((len(pose_level), LEVELS), -1)
+    for node in range(len(level)):
+        for pose in range(first[node], end[node]):
+            if pose_level[pose] <= level[node]:
+                node_of[pose, level[node]] = node
+    return node_of

@@ -1,0 +1,187 @@
+"""Compiled inner loops of the arrowhead system: eliminate. See `arrowhead_tree` for the order.
+
+Fronts are square, their upper triangles used. What is eliminated leaves rows of R, with R^T R = H: the square root
+information matrix. The poses of a leaf leave only their own 3 x 3 blocks; their coupling to the border is taken from
+the blocks of H again when needed, so that fill is never stored.
+"""
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.sam.arrowhead.dissection import LEVELS
+from groundsbot.offline.sam.arrowhead.leaf_elimination import eliminate_leaf
+from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
+from groundsbot.offline.sam.linearisation.blocks import Rows, System
+
+
+@jitted
+def eliminate(tree: Tree, system: System, damping: float, rows: Rows, begin: int, end: int) -> int:
+    """Eliminates some nodes, but for the top, whose front is left in the workspace.
+
+    Args:
+        tree: the order.
+        system: the blocks.
+        damping: share of the diagonal that is added to it.
+        rows: takes the result; its workspace must be zero but for what earlier nodes have left for the top.
+        begin: the first node.
+        end: one beyond the last; they are whole chains, or the top, or both.
+
+    Returns:
+        -1, or the first column whose pivot is not positive.
+    """
+    tree, system, rows = borrowed(tree), borrowed(system), borrowed(rows)
+    for node in range(begin, end):
+        front = _front_of(tree, node, rows.workspace)
+        if tree.level[node] == 0:
+            failed = eliminate_leaf(tree, system, damping, node, rows, front)
+        else:
+            _add_separators(tree, system, damping, node, front)
+            _add_tags(tree, system, damping, node, front)
+            if tree.level[node] == LEVELS - 1:
+                _add_calibration(tree, system, damping, front)
+                return -1
+            failed = _eliminate_front(tree, node, rows, front)
+        if failed >= 0:
+            return int(failed)
+        _add_to_parent(tree, node, front, rows.workspace)
+        for i in range(len(front)):
+            for j in range(len(front)):
+                front[i, j] = 0.0
+    return -1
+
+
+@inner
+def _front_of(tree: Tree, node: int, workspace: FloatArray) -> FloatArray:
+    size = tree.front_start[node + 1] - tree.front_start[node]
+    start = tree.workspace_start[tree.level[node]]
+    return workspace[start : start + size * size].reshape((size, size))
+
+
+@inner
+def _add_separators(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
+    """The separators' own entries of H."""
+    is_top = tree.level[node] == LEVELS - 1
+    for k in range(tree.separator_start[node], tree.separator_start[node + 1]):
+        pose, row = tree.separators[k], 3 * (k - tree.separator_start[node])
+        for i in range(3):
+            for j in range(i, 3):
+                front[row + i, row + j] += system.pose[pose, i, j]
+            front[row + i, row + i] += damping * system.pose[pose, i, i]
+        for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
+            for i in range(3):
+                for j in range(2):
+                    front[row + i, tree.reading_at[m] + j] += system.pose_tag[m, i, j]
+        chain = tree.separator_chain[k]
+        for a in range(tree.slot_start[chain], tree.slot_start[chain + 1]):
+            slot = a - tree.slot_start[chain]
+            at = tree.calibration_at[node] + (tree.slots[a] if is_top else slot)
+            for i in range(3):
+                front[row + i, at] += system.pose_calibration[pose, i, slot]
+
+
+@inner
+def _add_tags(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
+    """The own entries of H of the tags that a node eliminates."""
+    is_top = tree.level[node] == LEVELS - 1
+    row = 3 * (tree.separator_start[node + 1] - tree.separator_start[node])
+    n_calibration = tree.n_calibration if is_top else n_slots_of(tree, node)
+    for k in range(tree.tag_start[node], tree.tag_start[node + 1]):
+        tag = tree.tags[k]
+        front[row, row] += (1.0 + damping) * system.tag[tag, 0, 0]
+        front[row, row + 1] += system.tag[tag, 0, 1]
+        front[row + 1, row + 1] += (1.0 + damping) * system.tag[tag, 1, 1]
+        for a in range(n_calibration):
+            column = a if is_top else tree.slots[tree.slot_start[tree.chain[node]] + a]
+            for i in range(2):
+                front[row + i, tree.calibration_at[node] + a] += system.tag_calibration[tag, i, column]
+        row += 2
+
+
+@inner
+def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArray) -> None:
+    first = tree.calibration_at[-1]
+    for a in range(tree.n_calibration):
+        for b in range(a, tree.n_calibration):
+            front[first + a, first + b] += system.calibration[a, b]
+        front[first + a, first + a] += damping * system.calibration[a, a]
+
+
+@inner
+def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> int:
+    """Partial Cholesky: the first columns become rows of R, the rest loses what they explain."""
+    n, size = tree.n_eliminated[node], front.shape[0]
+    failed = eliminate_columns(front, n)
+    if failed >= 0:
+        return int(tree.front[tree.front_start[node] + failed])
+    start = tree.rows_start[node]
+    for i in range(n):
+        for j in range(size):
+            rows.inner[start + i * size + j] = front[i, j]
+    return -1
+
+
+@inner
+def eliminate_columns(front: FloatArray, n: int) -> int:
+    """Partial Cholesky of a matrix's upper triangle by its first n columns; -1, or the one without a positive pivot."""
+    for first in range(0, n, 4):
+        end = min(first + 4, n)
+        failed = _eliminate_panel(front, first, end)
+        if failed >= 0:
+            return failed
+        if end - first == 4:
+            _subtract_four(front, first)
+        else:
+            for k in range(first, end):
+                for r in range(end, len(front)):
+                    _subtract_one(front, k, r)
+    return -1
+
+
+@inner
+def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
+    """Rows first to end - 1 of R; -1, or the row without a positive pivot."""
+    for k in range(first, end):
+        if not front[k, k] > 0.0:
+            return k
+        root = np.sqrt(front[k, k])
+        inverse = 1.0 / root
+        front[k, k] = root
+        row = front[k, k + 1 :]
+        for j in range(len(row)):
+            row[j] *= inverse
+        for r in range(k + 1, end):
+            _subtract_one(front, k, r)
+    return -1
+
+
+@inner
+def _subtract_one(front: FloatArray, k: int, r: int) -> None:
+    """Row r loses its product with row k of R. Loops over slices need no look at the sign of an index."""
+    factor, row, rest = front[k, r], front[k, r:], front[r, r:]
+    for j in range(len(rest)):
+        rest[j] -= factor * row[j]
+
+
+@inner
+def _subtract_four(front: FloatArray, k: int) -> None:
+    """The rows below four rows of R, from k on, lose their products."""
+    for r in range(k + 4, len(front)):
+        f0, f1, f2, f3 = front[k, r], front[k + 1, r], front[k + 2, r], front[k + 3, r]
+        if f0 == 0.0 and f1 == 0.0 and f2 == 0.0 and f3 == 0.0:
+            continue  # separators do not reach all tags
+        rest, r0, r1, r2, r3 = front[r, r:], front[k, r:], front[k + 1, r:], front[k + 2, r:], front[k + 3, r:]
+        for j in range(len(rest)):
+            rest[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
+
+
+@inner
+def _add_to_parent(tree: Tree, node: int, front: FloatArray, workspace: FloatArray) -> None:
+    """What is left of a front is added to the parent's."""
+    above = _front_of(tree, tree.parent[node], workspace)
+    start, size = tree.front_start[node], front.shape[0]
+    up = tree.up[start : start + size]
+    for a in range(tree.n_eliminated[node], size):
+        row = up[a]
+        for b in range(a, size):
+            above[min(row, up[b]), max(row, up[b])] += front[a, b]

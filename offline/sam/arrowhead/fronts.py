@@ -1,0 +1,161 @@
+"""What each node of the elimination tree holds, in which order: see `arrowhead_tree`."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.sam.arrowhead.dissection import LEVELS, Pieces
+
+
+class Lists(NamedTuple):
+    """What belongs to each node, one list after the other: members of `values` from start[node] to start[node + 1]."""
+
+    start: IntArray
+    values: IntArray
+
+
+class Fronts(NamedTuple):
+    """Fields as in Tree."""
+
+    n_eliminated: IntArray
+    front_start: IntArray
+    front: IntArray
+    calibration_at: IntArray
+
+
+@jitted
+def fronts_of(
+    pieces: Pieces,
+    separators: Lists,
+    tags: Lists,
+    shared_tags: Lists,
+    slots: Lists,
+    n_poses: int,
+    n_tags: int,
+    n_free: int,
+) -> Fronts:
+    """Lays out each front: separators, own tags, separator on the left, calibration, others' tags, right separator."""
+    n_nodes = len(pieces.level)
+    n_eliminated, calibration_at = np.empty(n_nodes, dtype=np.int64), np.empty(n_nodes, dtype=np.int64)
+    start, front = np.zeros(n_nodes + 1, dtype=np.int64), np.empty(0, dtype=np.int64)
+    first_tag, first_free = 3 * n_poses, 3 * n_poses + 2 * n_tags
+    for is_filling in (False, True):  # counted first
+        at = 0
+        for node in range(n_nodes):
+            at = _add_columns(separators, node, 0, 3, front, at, is_filling)
+            at = _add_columns(tags, node, first_tag, 2, front, at, is_filling)
+            n_eliminated[node] = at - start[node]
+            at = _add_pose(pieces.left[node], front, at, is_filling)
+            calibration_at[node] = at - start[node]
+            if pieces.chain[node] >= 0:
+                at = _add_columns(slots, pieces.chain[node], first_free, 1, front, at, is_filling)
+            else:
+                n_eliminated[node] += n_free
+                for a in range(n_free):
+                    if is_filling:
+                        front[at + a] = first_free + a
+                at += n_free
+            at = _add_columns(shared_tags, node, first_tag, 2, front, at, is_filling)
+            at = _add_pose(pieces.right[node], front, at, is_filling)
+            start[node + 1] = at
+        if not is_filling:
+            front = np.empty(at, dtype=np.int64)
+    return Fronts(n_eliminated, start, front, calibration_at)
+
+
+@inner
+def _add_columns(lists: Lists, member: int, base: int, width: int, front: IntArray, at: int, is_filling: bool) -> int:
+    """The columns of a list's variables, each `width` wide; returns where the next go."""
+    for k in range(lists.start[member], lists.start[member + 1]):
+        if is_filling:
+            for i in range(width):
+                front[at + i] = base + width * lists.values[k] + i
+        at += width
+    return at
+
+
+@inner
+def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
+    """The columns of a separator at an end, unless it is a chain's end."""
+    if pose < 0:
+        return at
+    if is_filling:
+        for i in range(3):
+            front[at + i] = 3 * pose + i
+    return at + 3
+
+
+@jitted
+def places_of(
+    parent: IntArray,
+    children: IntArray,
+    front_start: IntArray,
+    front: IntArray,
+    home_of_reading: IntArray,
+    readings: IntArray,
+    column_of_reading: IntArray,
+    n_columns: int,
+) -> tuple[IntArray, IntArray]:
+    """Where each front's columns lie in the parent's front, and each reading's tag in the front of its pose's node.
+
+    `children` are sorted by their parents, `readings` by their homes: sorting takes a second to compile.
+    """
+    n_nodes = len(parent)
+    place = np.full(n_columns, -1)
+    up = np.full(len(front), -1)
+    reading_at = np.empty(len(home_of_reading), dtype=np.int64)
+    next_child, next_reading = 0, 0
+    for node in range(n_nodes):
+        for i in range(front_start[node], front_start[node + 1]):
+            place[front[i]] = i - front_start[node]
+        while next_reading < len(readings) and home_of_reading[readings[next_reading]] == node:
+            reading_at[readings[next_reading]] = place[column_of_reading[readings[next_reading]]]
+            next_reading += 1
+        while next_child < len(children) and parent[children[next_child]] == node:
+            child = children[next_child]
+            for i in range(front_start[child], front_start[child + 1]):
+                up[i] = place[front[i]]
+            next_child += 1
+    return up, reading_at
+
+
+@jitted
+def homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_tag: IntArray, n_tags: int) -> IntArray:
+    """(T,) the lowest node above the leaves in which all readings of a tag lie."""
+    common = np.full((n_tags, LEVELS), -2)
+    for m in range(len(reading_pose)):
+        for level in range(1, LEVELS - 1):
+            node, tag = node_of[reading_pose[m], level], reading_tag[m]
+            if common[tag, level] == -2:
+                common[tag, level] = node
+            elif common[tag, level] != node:
+                common[tag, level] = -1
+    home = np.full(n_tags, top)
+    for tag in range(n_tags):
+        for level in range(LEVELS - 2, 0, -1):
+            if common[tag, level] >= 0:
+                home[tag] = common[tag, level]
+    return home
+
+
+@jitted
+def tags_in_nodes(
+    node_of: IntArray, reading_pose: IntArray, reading_tag: IntArray, home: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Nodes and tags, in the order of first reading: which tags a front holds without eliminating them."""
+    n_tags = len(home)
+    n_found = 0
+    node = np.empty(LEVELS * len(reading_pose), dtype=np.int64)
+    tag = np.empty(LEVELS * len(reading_pose), dtype=np.int64)
+    for level in range(LEVELS - 1):
+        last_seen = np.full(n_tags, -1)
+        for m in range(len(reading_pose)):
+            here, seen = node_of[reading_pose[m], level], reading_tag[m]
+            if here >= 0 and last_seen[seen] != here:
+                last_seen[seen] = here
+                if home[seen] > here:
+                    node[n_found], tag[n_found] = here, seen
+                    n_found += 1
+    return node[:n_found].copy(), tag[:n_found].copy()

@@ -1,0 +1,162 @@
+"""What somebody measured, and what a map holds, in the blocks of the arrowhead system.
+
+A measured start is one more 3 x 3 block of a pose. A measured distance couples its two ends, which both lie in the top:
+there its products fill what elimination has left anyway. So do those of a map's tags, which it couples all with all.
+These are few, so all of that is plain numpy.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.sam.arrowhead.tree import Tree
+from groundsbot.offline.sam.factors.planar import Columns, State
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured
+from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.linearisation.kernels import Free
+
+_NONE: Final = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class MeasuredBlocks:
+    """Measured starts and distances, and where they go.
+
+    Attributes:
+        factors: by the arrowhead's poses.
+        columns: in the arrowhead's order, -1 where held.
+        ends: (D, 2, 5) column of the pose's and the tag's directions at each end of each distance; -1 where it is the
+            other kind, or held.
+        at: (D, 2, 5) their places in the top's front.
+        known_at: (2 K,) places of a map's tags there.
+    """
+
+    factors: Measured
+    columns: Columns
+    ends: IntArray
+    at: IntArray
+    known_at: IntArray
+
+    @cached_property
+    def known_information(self) -> FloatArray:
+        """(2 K + C, 2 K + C) of a map's tags and calibration."""
+        whitening = self.factors.known.whitening
+        return whitening.T @ whitening
+
+    @cached_property
+    def known_across(self) -> FloatArray:
+        """(2 K, 2 K) of it, what couples different tags."""
+        n = 2 * len(self.factors.known.tags)
+        across = self.known_information[:n, :n].copy()
+        each = np.arange(n // 2)
+        across.reshape(n // 2, 2, n // 2, 2)[each, :, each, :] = 0.0
+        return across
+
+    def add(self, state: State, system: System) -> float:
+        """Adds all of them to the blocks; returns the sum of their squares."""
+        starts = self.factors.starts.linearise(state, self.columns)
+        ((columns, derivative),) = starts.blocks
+        _add_squares(system.pose, self.factors.starts.pose, _where_free(derivative, columns))
+        _add_gradient(system, columns, derivative, starts.residual)
+        distances = self.factors.distances.linearise(state, self.columns)
+        blocks = [_where_free(by_end, columns) for columns, by_end in distances.blocks]
+        ends = self.factors.distances
+        _add_squares(system.pose, ends.pose_a, blocks[0])
+        _add_squares(system.tag, ends.tag_a, blocks[1])
+        _add_squares(system.pose, ends.pose_b, blocks[2])
+        _add_squares(system.tag, ends.tag_b, blocks[3])
+        system.distance[:] = np.concatenate(blocks, axis=-1).reshape(-1, 2, 5)
+        _add_gradient(system, self.ends.reshape(-1, 10), system.distance.reshape(-1, 1, 10), distances.residual)
+        return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_known(state, system)
+
+    def _add_known(self, state: State, system: System) -> float:
+        """Adds a map's tags and calibration but for what couples tags; returns the sum of squares."""
+        known, information = self.factors.known, self.known_information
+        n, each = 2 * len(known.tags), np.arange(len(known.tags))
+        numbers = self.columns.calibration[known.calibration]
+        system.tag[known.tags] += information[:n, :n].reshape(len(each), 2, len(each), 2)[each, :, each, :]
+        system.tag_calibration[known.tags[:, None], :, numbers] += (
+            information[:n, n:].reshape(len(each), 2, len(numbers)).transpose(0, 2, 1)
+        )
+        system.calibration[np.ix_(numbers, numbers)] += information[n:, n:]
+        first = len(system.gradient) - len(system.calibration)
+        at = np.concatenate([self.columns.tags[known.tags].reshape(-1), first + numbers])
+        system.gradient[at] += information @ known.off(state)
+        return float((known.residual(state) ** 2).sum())
+
+    def add_to_top(self, system: System, front: FloatArray) -> None:
+        """Adds what distances couple to the top's front, whose upper triangle counts."""
+        first, second = self.at[:, 0, :, None], self.at[:, 1, None, :]
+        products = system.distance[:, 0, :, None] * system.distance[:, 1, None, :]
+        np.add.at(front, (np.minimum(first, second), np.maximum(first, second)), products)
+        row, column = np.nonzero(self.known_at[:, None] < self.known_at)
+        front[self.known_at[row], self.known_at[column]] += self.known_across[row, column]
+
+    def add_product(self, system: System, x: FloatArray, y: FloatArray) -> None:
+        """Adds to y what distances couple, times x."""
+        along = (system.distance * x[self.ends]).sum(axis=-1)
+        np.add.at(y, self.ends, system.distance * along[:, ::-1, None])
+        tags = self.columns.tags[self.factors.known.tags].reshape(-1)
+        y[tags] += self.known_across @ x[tags]
+
+
+def measured_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | None:
+    """Lays out what was measured; None where nothing was."""
+    if not len(factors):
+        return None
+    n_poses, n_tags = tree.n_poses, tree.n_tags
+    poses, tags = np.split(np.arange(3 * n_poses + 2 * n_tags), [3 * n_poses])
+    columns = Columns(
+        np.where(free.poses > 0.0, poses.reshape(-1, 3), -1),
+        np.where(free.tags > 0.0, tags.reshape(-1, 2), -1),
+        free.calibration,
+        len(poses) + len(tags) + tree.n_calibration,
+    )
+    ends = _ends(factors.distances, columns)
+    place = np.full(columns.n + 1, -1)
+    top = tree.front[tree.front_start[-2] :]
+    place[top] = np.arange(len(top))
+    return MeasuredBlocks(factors, columns, ends, place[ends], place[columns.tags[factors.known.tags].reshape(-1)])
+
+
+def ends_in_top(factors: Measured, chain_start: IntArray) -> tuple[IntArray, IntArray]:
+    """Chains at whose first pose a distance ends, and tags at which one does or that a map holds.
+
+    Raises:
+        ValueError: one ends at another pose.
+    """
+    if not len(factors.distances.distance_m):
+        return _NONE, factors.tags
+    ends = np.concatenate([factors.distances.pose_a, factors.distances.pose_b])
+    poses = np.unique(ends[ends >= 0])
+    if not np.isin(poses, chain_start[:-1]).all():
+        raise ValueError("a distance can be measured from the first pose of a chain, and from no other")
+    return np.searchsorted(chain_start, poses), factors.tags
+
+
+def _ends(distances: DistanceFactors, columns: Columns) -> IntArray:
+    of_poses, of_tags = np.vstack([columns.poses, [-1] * 3]), np.vstack([columns.tags, [-1] * 2])
+    ends = ((distances.pose_a, distances.tag_a), (distances.pose_b, distances.tag_b))
+    return np.stack([np.concatenate([of_poses[pose], of_tags[tag]], axis=-1) for pose, tag in ends], axis=1)
+
+
+def _where_free(derivative: FloatArray, columns: IntArray) -> FloatArray:
+    """(M, n, k) with zeros where held."""
+    return np.where(columns[:, None, :] >= 0, derivative, 0.0)
+
+
+def _add_squares(diagonal: FloatArray, index: IntArray, derivative: FloatArray) -> None:
+    """J^T J to the diagonal blocks of these variables; -1: there is none."""
+    there = index >= 0
+    J = derivative[there]
+    np.add.at(diagonal, index[there], J.swapaxes(-1, -2) @ J)
+
+
+def _add_gradient(system: System, columns: IntArray, derivative: FloatArray, residual: FloatArray) -> None:
+    """J^T r of (M, n, k) and (M, n)."""
+    by_column = np.einsum("mnk,mn->mk", derivative, residual)
+    free = columns >= 0
+    np.add.at(system.gradient, columns[free], by_column[free])

@@ -1,0 +1,68 @@
+"""A step taken motion by motion along each chain, instead of pose by pose.
+
+Poses that move on their own arcs keep the motion between neighbours to first order only. Odometry knows it to a
+millimetre, so where a stretch of a hundred metres bends by a metre, what is left of second order outweighs everything
+and only tiny steps would go down. Here each motion takes its own part of the step and the chain is laid out anew from
+its start: odometry then follows its linear model all but exactly, and what is left shows where a tag is seen again.
+"""
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.sam.linearisation.kernels import Values
+
+
+@jitted
+def rolled(
+    values: Values, step: FloatArray, anchor: IntArray, chain_start: IntArray, moved: Values, out: Values
+) -> None:
+    """Lays the chains out anew.
+
+    Args:
+        values: before the step.
+        step: (3 P + 2 T + C,) in the arrowhead's order.
+        anchor: (T,) poses that the tags go along with.
+        chain_start: (number of chains + 1,)
+        moved: the same step pose by pose; tags keep their place about their anchors.
+        out: takes poses and tags.
+    """
+    for chain in range(len(chain_start) - 1):
+        first = chain_start[chain]
+        for i in range(3):
+            out.poses[first, i] = moved.poses[first, i]
+        for pose in range(first, chain_start[chain + 1] - 1):
+            _roll_on(values.poses[pose], values.poses[pose + 1], step[3 * pose : 3 * pose + 6], out.poses, pose)
+    for tag in range(len(moved.tags)):
+        before, after = moved.poses[anchor[tag]], out.poses[anchor[tag]]
+        turn = after[2] - before[2]
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = moved.tags[tag, 0] - before[0], moved.tags[tag, 1] - before[1]
+        out.tags[tag, 0] = after[0] + cos * x - sin * y
+        out.tags[tag, 1] = after[1] + sin * x + cos * y
+
+
+@inner
+def _roll_on(here: FloatArray, there: FloatArray, step: FloatArray, poses: FloatArray, pose: int) -> None:
+    """T_j <- T_i o M o exp(d_j - Ad d_i), Ad that of M^-1, M = T_i^-1 o T_j before the step."""
+    cos, sin = np.cos(here[2]), np.sin(here[2])
+    x, y = there[0] - here[0], there[1] - here[1]
+    x, y, turn = cos * x + sin * y, cos * y - sin * x, there[2] - here[2]
+    cos, sin = np.cos(turn), np.sin(turn)
+    # Where d_i takes the far end, in its axes.
+    carried_x, carried_y = step[0] - step[2] * y, step[1] + step[2] * x
+    own_x = step[3] - (cos * carried_x + sin * carried_y)
+    own_y = step[4] - (cos * carried_y - sin * carried_x)
+    own_turn = step[5] - step[2]
+    # exp: a chord, in the middle of its turn.
+    half = 0.5 * own_turn
+    chord = np.sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
+    c, s = chord * np.cos(half), chord * np.sin(half)
+    own_x, own_y = c * own_x - s * own_y, s * own_x + c * own_y
+    x, y = x + cos * own_x - sin * own_y, y + sin * own_x + cos * own_y
+    theta = poses[pose, 2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    poses[pose + 1, 0] = poses[pose, 0] + cos * x - sin * y
+    poses[pose + 1, 1] = poses[pose, 1] + sin * x + cos * y
+    theta += turn + own_turn
+    poses[pose + 1, 2] = theta - 2.0 * np.pi * np.ceil((theta - np.pi) / (2.0 * np.pi))

@@ -1,0 +1,197 @@
+"""Compiled inner loops of the arrowhead system: substitute. See `arrowhead_kernels` for what elimination leaves."""
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
+from groundsbot.offline.sam.linearisation.blocks import Rows, System
+
+
+@jitted
+def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
+    """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
+    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
+    inside, outside = rows.inside, rows.border[0, 0]
+    for node in range(len(tree.level) - 1):
+        start, end = tree.front_start[node], tree.front_start[node + 1]
+        if tree.level[node] == 0:
+            _take_leaf(tree, node, vector, inside)
+            solve_leaf(tree, rows, node, inside)
+            for a in range(end - start):
+                outside[a] = 0.0
+            leaf_to_front(tree, system, node, inside, outside)
+            for a in range(start, end):
+                vector[tree.front[a]] -= outside[a - start]
+            continue
+        columns, R = tree.front[start:end], _rows_of(tree, node, rows)
+        for k in range(len(R)):
+            value = vector[columns[k]] / R[k, k]
+            vector[columns[k]] = value
+            for a in range(k + 1, len(columns)):
+                vector[columns[a]] -= R[k, a] * value
+
+
+@jitted
+def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
+    """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
+    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
+    inside, outside = rows.inside, rows.border[0, 0]
+    for node in range(len(tree.level) - 2, -1, -1):
+        start, end = tree.front_start[node], tree.front_start[node + 1]
+        columns = tree.front[start:end]
+        if tree.level[node] == 0:
+            for a in range(end - start):
+                outside[a] = vector[columns[a]]
+            _take_leaf(tree, node, vector, inside)
+            _front_to_leaf(tree, system, node, outside, inside)
+            solve_leaf(tree, rows, node, inside)
+            for pose in range(tree.first[node], tree.end[node]):
+                for i in range(3):
+                    vector[3 * pose + i] = inside[pose - tree.first[node], i]
+            continue
+        R = _rows_of(tree, node, rows)
+        for k in range(len(R) - 1, -1, -1):
+            rest = vector[columns[k]]
+            for a in range(k + 1, len(columns)):
+                rest -= R[k, a] * vector[columns[a]]
+            vector[columns[k]] = rest / R[k, k]
+
+
+@inner
+def _take_leaf(tree: Tree, leaf: int, vector: FloatArray, inside: FloatArray) -> None:
+    """A leaf's part of a vector."""
+    first = tree.first[leaf]
+    for pose in range(first, tree.end[leaf]):
+        for i in range(3):
+            inside[pose - first, i] = vector[3 * pose + i]
+
+
+@inner
+def _rows_of(tree: Tree, node: int, rows: Rows) -> FloatArray:
+    n, size = tree.n_eliminated[node], tree.front_start[node + 1] - tree.front_start[node]
+    return rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape((n, size))
+
+
+@jitted
+def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
+    """Takes inside (K, 3) to A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
+    first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
+    x0, x1, x2 = 0.0, 0.0, 0.0
+    for k in range(n):
+        U = rows.pose[first + k]
+        b0, b1, b2 = inside[k, 0], inside[k, 1], inside[k, 2]
+        if k:
+            Z = rows.pose_next[first + k - 1]
+            b0 -= Z[0, 0] * x0 + Z[1, 0] * x1 + Z[2, 0] * x2
+            b1 -= Z[0, 1] * x0 + Z[1, 1] * x1 + Z[2, 1] * x2
+            b2 -= Z[0, 2] * x0 + Z[1, 2] * x1 + Z[2, 2] * x2
+        b1 -= U[0, 1] * b0
+        b2 -= U[0, 2] * b0 + U[1, 2] * b1
+        x0, x1, x2 = b0 * U[0, 0], b1 * U[1, 1], b2 * U[2, 2]
+        inside[k, 0], inside[k, 1], inside[k, 2] = b0, b1, b2
+    for k in range(n - 1, -1, -1):
+        U = rows.pose[first + k]
+        b0, b1, b2 = inside[k, 0], inside[k, 1], inside[k, 2]
+        if k + 1 < n:
+            Z = rows.pose_next[first + k]
+            b0 -= Z[0, 0] * x0 + Z[0, 1] * x1 + Z[0, 2] * x2
+            b1 -= Z[1, 0] * x0 + Z[1, 1] * x1 + Z[1, 2] * x2
+            b2 -= Z[2, 0] * x0 + Z[2, 1] * x1 + Z[2, 2] * x2
+        x2 = b2 * U[2, 2]
+        x1 = b1 * U[1, 1] - U[1, 2] * x2
+        x0 = b0 * U[0, 0] - U[0, 1] * x1 - U[0, 2] * x2
+        inside[k, 0], inside[k, 1], inside[k, 2] = x0, x1, x2
+
+
+@jitted
+def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
+    """Adds to outside (w,) B^T inside, with B the blocks of H between the leaf's poses and its front."""
+    first, end = tree.first[leaf], tree.end[leaf]
+    n_left = tree.calibration_at[leaf]
+    size = tree.front_start[leaf + 1] - tree.front_start[leaf]
+    if first == end:
+        return  # a chain of one pose, which the top eliminates
+    for i in range(3):
+        for j in range(3):
+            if n_left:
+                outside[i] += system.pose_next[first - 1, i, j] * inside[0, j]
+            if tree.right[leaf] >= 0:
+                outside[size - 3 + i] += system.pose_next[end - 1, j, i] * inside[end - 1 - first, j]
+    for pose in range(first, end):
+        x0, x1, x2 = inside[pose - first, 0], inside[pose - first, 1], inside[pose - first, 2]
+        for a in range(n_slots_of(tree, leaf)):
+            C = system.pose_calibration[pose]
+            outside[n_left + a] += C[0, a] * x0 + C[1, a] * x1 + C[2, a] * x2
+        for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
+            L, at = system.pose_tag[m], tree.reading_at[m]
+            outside[at] += L[0, 0] * x0 + L[1, 0] * x1 + L[2, 0] * x2
+            outside[at + 1] += L[0, 1] * x0 + L[1, 1] * x1 + L[2, 1] * x2
+
+
+@inner
+def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, inside: FloatArray) -> None:
+    """Takes B outside from inside (K, 3)."""
+    first, end = tree.first[leaf], tree.end[leaf]
+    n_left = tree.calibration_at[leaf]
+    size = tree.front_start[leaf + 1] - tree.front_start[leaf]
+    if first == end:
+        return
+    for i in range(3):
+        for j in range(3):
+            if n_left:
+                inside[0, j] -= system.pose_next[first - 1, i, j] * outside[i]
+            if tree.right[leaf] >= 0:
+                inside[end - 1 - first, j] -= system.pose_next[end - 1, j, i] * outside[size - 3 + i]
+    for pose in range(first, end):
+        for i in range(3):
+            rest = inside[pose - first, i]
+            for a in range(n_slots_of(tree, leaf)):
+                rest -= system.pose_calibration[pose, i, a] * outside[n_left + a]
+            for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
+                at = tree.reading_at[m]
+                rest -= system.pose_tag[m, i, 0] * outside[at] + system.pose_tag[m, i, 1] * outside[at + 1]
+            inside[pose - first, i] = rest
+
+
+@jitted
+def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
+    """H x, in the arrowhead's order."""
+    y = np.zeros(len(x))
+    first_tag = 3 * tree.n_poses
+    first_calibration = first_tag + 2 * tree.n_tags
+    for chain in range(len(tree.chain_start) - 1):
+        first, end = tree.chain_start[chain], tree.chain_start[chain + 1]
+        slots = tree.slots[tree.slot_start[chain] : tree.slot_start[chain + 1]]
+        for pose in range(first, end):
+            p = 3 * pose
+            _add_one_way(system.pose[pose], p, x, y)
+            if pose + 1 < end:
+                _add_both_ways(system.pose_next[pose], p, p + 3, x, y)
+            for a in range(len(slots)):
+                _add_both_ways(system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y)
+            for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
+                _add_both_ways(system.pose_tag[m], p, first_tag + 2 * tree.reading_tag[m], x, y)
+    for tag in range(tree.n_tags):
+        t = first_tag + 2 * tag
+        _add_one_way(system.tag[tag], t, x, y)
+        _add_both_ways(system.tag_calibration[tag], t, first_calibration, x, y)
+    _add_one_way(system.calibration, first_calibration, x, y)
+    return y
+
+
+@inner
+def _add_one_way(block: FloatArray, at: int, x: FloatArray, y: FloatArray) -> None:
+    """Adds a block on the diagonal."""
+    for i in range(block.shape[0]):
+        for j in range(block.shape[1]):
+            y[at + i] += block[i, j] * x[at + j]
+
+
+@inner
+def _add_both_ways(block: FloatArray, row: int, column: int, x: FloatArray, y: FloatArray) -> None:
+    """Adds an off-diagonal block and its transpose."""
+    for i in range(block.shape[0]):
+        for j in range(block.shape[1]):
+            y[row + i] += block[i, j] * x[column + j]
+            y[column + j] += block[i, j] * x[row + i]

@@ -1,0 +1,322 @@
+"""The normal equations of chains that meet in tags and calibration: an arrowhead, eliminated chain by chain.
+
+Linearise all factors, eliminate every piece of every chain on its own, meet in the small border, substitute back.
+Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissection along the chains, see
+`arrowhead_tree`.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from scipy import linalg
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.sam.arrowhead import block_substitution as arrowhead_many
+from groundsbot.offline.sam.arrowhead import substitution as arrowhead_substitution
+from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
+from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
+from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
+from groundsbot.offline.sam.arrowhead.preintegration import expand
+from groundsbot.offline.sam.arrowhead.prior_blocks import MeasuredBlocks
+from groundsbot.offline.sam.arrowhead.relative_retraction import rolled
+from groundsbot.offline.sam.arrowhead.threads import eliminate_chains
+from groundsbot.offline.sam.arrowhead.tree import Tree
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
+from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
+from groundsbot.offline.sam.linearisation import readings as linearise_readings
+from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Readings, Values
+
+_CONDITION_STEPS: Final = 12
+
+
+class UnderDeterminedError(ValueError):
+    """A column of the tangent vector that nothing ties down."""
+
+    def __init__(self, column: int) -> None:
+        super().__init__(f"column {column} of the normal equations has no positive pivot")
+        self.column = column
+
+
+@dataclass(frozen=True)
+class Arrowhead:
+    """What stays the same from step to step: factors in the order of poses, and the order of elimination.
+
+    Attributes:
+        tangent: (n,) column of the arrowhead for each column of the tangent vector.
+    """
+
+    tree: Tree
+    odometry: Odometry
+    readings: Readings
+    prior_sigma: FloatArray
+    free: Free
+    tangent: IntArray
+    measured: MeasuredBlocks | None = None
+
+    def linearise(
+        self, state: State, odometry_loss: Loss = SQUARES, reading_loss: Loss = SQUARES, out: System | None = None
+    ) -> tuple[System, float]:
+        """H = J^T J and g = J^T r in blocks, and the cost: half the sum of all losses.
+
+        Args:
+            state: where.
+            odometry_loss: of each motion.
+            reading_loss: of each tag reading.
+            out: blocks to write into.
+        """
+        system = out if out is not None else self.empty_system()
+        values = Values(state.poses, state.tags, state.calibration)
+        linearise_kernels.clear(system)
+        total = linearise_odometry.add_odometry(self.odometry, odometry_loss, values, self.free, system)
+        total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
+        total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
+        if self.measured is not None:
+            total += self.measured.add(state, system)
+        linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
+        return system, 0.5 * total
+
+    def moved(self, state: State, step: FloatArray, anchor: IntArray) -> State:
+        """The state after a step in the arrowhead's order; tags move along with their anchor poses (T,)."""
+        tree = self.tree
+        values = Values(state.poses, state.tags, state.calibration)
+        out = Values(np.empty_like(state.poses), np.empty_like(state.tags), state.calibration.copy())
+        linearise_kernels.moved(values, step, anchor, out)
+        is_free = self.free.calibration >= 0
+        out.calibration[is_free] += step[len(step) - tree.n_calibration :]
+        return State(*out)
+
+    def rolled(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
+        """The state after the same step as `moved`, taken motion by motion along each chain."""
+        values = Values(before.poses, before.tags, before.calibration)
+        by_pose = Values(moved.poses, moved.tags, moved.calibration)
+        out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
+        rolled(values, step, anchor, self.tree.chain_start, by_pose, out)
+        return State(*out)
+
+    @cached_property
+    def scratch(self) -> tuple[System, System, Rows]:
+        """Room for a solve, kept for the next: new memory costs as much as filling it. For one at a time."""
+        return self.empty_system(), self.empty_system(), self.empty_rows()
+
+    def without_scratch(self) -> None:
+        """Lets go of that room, for who keeps the problem but solves it no more."""
+        vars(self).pop("scratch", None)
+
+    def empty_system(self) -> System:
+        """Blocks without values."""
+        tree = self.tree
+        return System(
+            pose=np.empty((tree.n_poses, 3, 3)),
+            pose_next=np.empty((tree.n_poses, 3, 3)),
+            pose_calibration=np.empty((tree.n_poses, 3, tree.n_slots)),
+            pose_tag=np.empty((len(tree.reading_tag), 3, 2)),
+            tag=np.empty((tree.n_tags, 2, 2)),
+            tag_calibration=np.empty((tree.n_tags, 2, tree.n_calibration)),
+            calibration=np.empty((tree.n_calibration, tree.n_calibration)),
+            gradient=np.empty(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration),
+            distance=np.empty((0 if self.measured is None else len(self.measured.ends), 2, 5)),
+        )
+
+    def empty_rows(self) -> Rows:
+        """Room for a factorisation."""
+        tree = self.tree
+        return Rows(
+            pose=np.zeros((tree.n_poses, 3, 3)),
+            pose_next=np.zeros((tree.n_poses, 3, 3)),
+            inner=np.empty(int(tree.rows_start[-1])),
+            workspace=np.empty(int(tree.workspace_start[-1])),
+            border=np.empty((2, 3, int(np.diff(tree.front_start)[tree.level == 0].max(initial=0)))),
+            blocks=np.empty((2, 3, 3)),
+            inside=np.empty((int((tree.end - tree.first)[tree.level == 0].max(initial=0)), 3)),
+        )
+
+    def factorise(
+        self, system: System, damping: float = 0.0, out: Rows | None = None, threads: int = 1
+    ) -> "Factorisation":
+        """R with R^T R = H + damping diag(H).
+
+        Args:
+            system: the blocks; they are used again by the factorisation.
+            damping: Levenberg-Marquardt's, as a share of the diagonal.
+            out: room to write into; a factorisation that used it before is lost.
+            threads: on how many cores to eliminate chains. What the chains leave for the top is then added up in
+                another order, which changes the result by rounding.
+
+        Raises:
+            UnderDeterminedError: something is not tied down.
+        """
+        tree = self.tree
+        rows = out if out is not None else self.empty_rows()
+        failed = eliminate_chains(tree, system, damping, rows, threads)
+        if failed >= 0:
+            raise UnderDeterminedError(self._tangent_column(failed))
+        columns = tree.front[tree.front_start[-2] :]
+        front = rows.workspace[int(tree.workspace_start[-2]) :].reshape(len(columns), len(columns))
+        if not len(columns):
+            return Factorisation(self, system, rows, front)
+        if self.measured is not None:
+            self.measured.add_to_top(system, front)
+        top, info = linalg.lapack.dpotrf(front.T, lower=1, clean=0, overwrite_a=1)
+        if info:
+            raise UnderDeterminedError(self._tangent_column(int(columns[info - 1])))
+        return Factorisation(self, system, rows, top)
+
+    def in_order(self, tangent: FloatArray) -> FloatArray:
+        """Vectors (n, ...) of the tangent space by the arrowhead's columns, zero where held."""
+        out = np.zeros((3 * self.tree.n_poses + 2 * self.tree.n_tags + self.tree.n_calibration, *tangent.shape[1:]))
+        out[self.tangent] = tangent
+        return out
+
+    def product(self, system: System, x: FloatArray) -> FloatArray:
+        """H x, in the arrowhead's order."""
+        y = arrowhead_substitution.product(self.tree, system, x)
+        if self.measured is not None:
+            self.measured.add_product(system, x, y)
+        return y
+
+    def _tangent_column(self, column: int) -> int:
+        return int(np.flatnonzero(self.tangent == column)[0])
+
+
+@dataclass(frozen=True)
+class Factorisation:
+    """R with R^T R = H.
+
+    Attributes:
+        top: lower triangular R^T of what meets in the top; entries above the diagonal mean nothing.
+    """
+
+    arrowhead: Arrowhead
+    system: System = field(repr=False)
+    rows: Rows = field(repr=False)
+    top: FloatArray = field(repr=False)
+
+    def solve_in_order(self, vector: FloatArray) -> FloatArray:
+        """H^-1 vector (3P + 2T + C,), in the arrowhead's own order."""
+        tree = self.arrowhead.tree
+        solution = vector.copy()
+        arrowhead_substitution.forward(tree, self.system, self.rows, solution)
+        columns = tree.front[tree.front_start[-2] :]
+        if len(columns):
+            solution[columns], _ = linalg.lapack.dpotrs(self.top, solution[columns], lower=1)
+        arrowhead_substitution.backward(tree, self.system, self.rows, solution)
+        return solution
+
+    def solve(self, vector: FloatArray) -> FloatArray:
+        """H^-1 vector (n,), in the order of the tangent vector."""
+        return self.solve_in_order(self.arrowhead.in_order(vector))[self.arrowhead.tangent]
+
+    def solve_many(self, vectors: FloatArray) -> FloatArray:
+        """H^-1 vectors (n, k), in the order of the tangent vector; as `solve`, but quicker for several."""
+        tree, k = self.arrowhead.tree, vectors.shape[1]
+        solutions = self.arrowhead.in_order(vectors)
+        pieces = arrowhead_many.pieces_of(tree, self.system, self.rows)
+        room = np.empty((3 * len(self.rows.inside), k)), np.empty((self.rows.border.shape[2], k))
+        arrowhead_many.substitute(pieces, solutions, True, *room)
+        columns = tree.front[tree.front_start[-2] :]
+        if len(columns):
+            solutions[columns], _ = linalg.lapack.dpotrs(self.top, solutions[columns], lower=1)
+        arrowhead_many.substitute(pieces, solutions, False, *room)
+        return np.asarray(solutions[self.arrowhead.tangent])
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Joint covariance (k, k) of k columns of the tangent vector: their block of H^-1; 0 where held (-1)."""
+        free = np.flatnonzero(columns >= 0)
+        wanted = self.arrowhead.tangent[columns[free]]
+        covariance = np.zeros((len(columns), len(columns)))
+        covariance[np.ix_(free, free)] = joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
+        return covariance
+
+    def square_root_of_tags(self, tags: IntArray) -> SquareRoot:
+        """Of the joint covariance (2 k, 2 k) of k tags."""
+        wanted = (3 * self.arrowhead.tree.n_poses + 2 * tags[:, None] + np.arange(2)).reshape(-1)
+        return square_root(self.arrowhead.tree, self.rows, self.top, wanted)
+
+    def pose_covariances(self, poses: IntArray) -> FloatArray:
+        """(k, 3, 3) of k poses, by their right perturbation; all at once, and 0 where held."""
+        wanted = np.zeros(self.arrowhead.tree.n_poses, dtype=np.bool_)
+        wanted[poses] = True
+        marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, self.top, wanted)[poses]
+        free = self.arrowhead.free.poses[poses]
+        return marginals * (free[:, :, None] * free[:, None, :])
+
+    def condition(self) -> float:
+        """Estimate, from below, of the ratio of H's largest and smallest eigenvalue: power iteration on both ends."""
+        rng = np.random.default_rng(0)
+        held = np.ones(len(self.system.gradient))
+        held[self.arrowhead.tangent] = 0.0
+        largest = smallest = rng.standard_normal(len(held)) * (1.0 - held)
+        up = down = 1.0
+        for _ in range(_CONDITION_STEPS):
+            largest = self.arrowhead.product(self.system, largest)
+            smallest = self.solve_in_order(smallest)
+            up, down = float(np.linalg.norm(largest)), float(np.linalg.norm(smallest))
+            largest, smallest = largest / up, smallest / down
+        return up * down
+
+    def relative_error(self) -> float:
+        """What rounding does to solutions, as a share: the length of one step of iterative refinement.
+
+        Higham, "Accuracy and stability of numerical algorithms" (2002), chapter 12. Unlike the condition number this
+        does not mind units. The right-hand side is random, so that the directions known least weigh most.
+        """
+        vector = self.arrowhead.in_order(np.random.default_rng(0).standard_normal(len(self.arrowhead.tangent)))
+        solution = self.solve_in_order(vector)
+        rest = vector - self.arrowhead.product(self.system, solution)
+        length = float(np.linalg.norm(solution))
+        return float(np.linalg.norm(self.solve_in_order(rest))) / length if length else 0.0
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """The poses that read tags: a smaller problem to start with, nearly linear because readings count as places.
+
+    Range and bearing are far from linear where a start is metres off; places (x, y) are not.
+
+    Attributes:
+        arrowhead: of these poses, the motions between them composed; `whole` of all poses.
+        index: (P,) of each pose in the skeleton, -1 where it is not kept.
+    """
+
+    arrowhead: Arrowhead
+    whole: Arrowhead
+    index: IntArray
+
+    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
+        """Poses and tags from one pass in order of time.
+
+        Args:
+            state: its calibration counts, and the pose at the start of each chain.
+            start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
+        """
+        own, start = self.arrowhead, self._kept(state)
+        values = Values(start.poses, start.tags, start.calibration)
+        out = Values(np.empty_like(start.poses), np.empty_like(start.tags), np.empty_like(start.calibration))
+        starting_pass(own.tree, own.odometry, own.readings, values, np.square(start_sigma), out)
+        return self._expanded(State(*out))
+
+    def relaxed(self, state: State, anchor: IntArray, steps: int) -> State:
+        """The state after some Gauss-Newton steps.
+
+        Raises:
+            UnderDeterminedError: something is not tied down; the column is the skeleton's.
+        """
+        kept, own = self._kept(state), self.arrowhead
+        system, _, rows = own.scratch
+        for _ in range(steps):
+            own.linearise(kept, out=system)
+            kept = own.moved(kept, -own.factorise(system, out=rows).solve_in_order(system.gradient), self.index[anchor])
+        return self._expanded(kept)
+
+    def _kept(self, state: State) -> State:
+        return State(state.poses[self.index >= 0], state.tags, state.calibration)
+
+    def _expanded(self, kept: State) -> State:
+        poses = np.empty((len(self.index), 3))
+        expand(self.whole.odometry, self.index, self.arrowhead.odometry, kept.poses, kept.calibration, poses)
+        return State(poses, kept.tags, kept.calibration)

@@ -1,0 +1,179 @@
+"""In which order the arrowhead system is eliminated: chains cut into nested pieces, tags where their last reading is.
+
+A chain of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
+what is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators
+inside of it and the tags that are read nowhere else; its front holds them, then what they are coupled to: the
+separators at both ends, the calibration of the chain, tags that others read too.
+
+A chain's first pose can be a separator too, and a tag can be made the top's, so that what a tape measured between them
+couples columns of the top alone.
+
+Columns are numbered 3 for each pose, 2 for each tag, then the calibration that is free.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.foundation import inner
+from groundsbot.offline.sam.arrowhead.dissection import LEVELS, cut, nodes_of_poses
+from groundsbot.offline.sam.arrowhead.fronts import Fronts, Lists, fronts_of, homes_of_tags, places_of, tags_in_nodes
+
+
+class Tree(NamedTuple):
+    """Nodes, children first; lists of several nodes lie one after the other with the start of each in `*_start`.
+
+    Attributes:
+        level: (N,) 0 for a leaf, LEVELS - 1 for the top, which is the last node.
+        parent: (N,) node; the top's own index for the top.
+        chain: (N,) whose calibration it is coupled to; -1 for the top.
+        first, end: (N,) poses first to end - 1 lie in the node; in a leaf all of them are eliminated there.
+        left, right: (N,) separator poses at both ends; -1 at a chain's ends.
+        n_eliminated: (N,) columns, the first ones of the front; 0 for a leaf, whose own poses are not in its front.
+        front_start, front: columns of each node's front.
+        up: place of each of `front` in the parent's front; -1 where eliminated.
+        calibration_at: (N,) place of the first calibration column in the front.
+        separator_start, separators: poses that a node above the leaves eliminates, in the front's order;
+            separator_chain: the chain of each.
+        tag_start, tags: tags that a node eliminates, in the front's order after the separators.
+        rows_start: (N,) where a node's eliminated rows are kept.
+        workspace_start: (LEVELS,) where the front of each level is built up.
+        reading_start: (P+1,) readings of each pose; reading_tag: (M,) tag of each; reading_at: (M,) its place in the
+            front of the node that eliminates the pose.
+        slot_start, slots: calibration that each chain is coupled to, as indices among what is free.
+        chain_start: first pose of each chain, then the number of poses.
+        n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest chain list.
+    """
+
+    level: IntArray
+    parent: IntArray
+    chain: IntArray
+    first: IntArray
+    end: IntArray
+    left: IntArray
+    right: IntArray
+    n_eliminated: IntArray
+    front_start: IntArray
+    front: IntArray
+    calibration_at: IntArray
+    up: IntArray
+    separator_start: IntArray
+    separators: IntArray
+    separator_chain: IntArray
+    tag_start: IntArray
+    tags: IntArray
+    rows_start: IntArray
+    workspace_start: IntArray
+    reading_start: IntArray
+    reading_tag: IntArray
+    reading_at: IntArray
+    slot_start: IntArray
+    slots: IntArray
+    chain_start: IntArray
+    n_poses: int
+    n_tags: int
+    n_calibration: int
+    n_slots: int
+
+
+@inner
+def n_slots_of(tree: Tree, node: int) -> int:
+    """How much calibration the chain of a node is coupled to."""
+    chain = tree.chain[node]
+    return int(tree.slot_start[chain + 1] - tree.slot_start[chain])
+
+
+class Couplings(NamedTuple):
+    """Who is coupled to whom.
+
+    Attributes:
+        chain_start: (number of chains + 1,) first pose of each, then the number of poses.
+        reading_pose: (M,) rising; reading_tag: (M,).
+        slot_start: (number of chains + 1,) where each chain's slots begin; slots: the free calibration that each is
+            coupled to.
+        n_tags, n_free: how many tags there are, and how much calibration is free.
+        top_chains: whose first pose is eliminated in the top; top_tags: likewise.
+    """
+
+    chain_start: IntArray
+    reading_pose: IntArray
+    reading_tag: IntArray
+    slot_start: IntArray
+    slots: IntArray
+    n_tags: int
+    n_free: int
+    top_chains: IntArray
+    top_tags: IntArray
+
+
+def build_tree(couplings: Couplings) -> Tree:
+    """The tree of a problem."""
+    chain_start, reading_pose, reading_tag = couplings[:3]
+    pieces = cut(chain_start, couplings.top_chains)
+    n_nodes = len(pieces.level)
+    node_of = nodes_of_poses(pieces.level, pieces.first, pieces.end, pieces.pose_level)
+    home = homes_of_tags(node_of, n_nodes - 1, reading_pose, reading_tag, couplings.n_tags)
+    home[couplings.top_tags] = n_nodes - 1
+    inner_poses = np.flatnonzero(pieces.pose_level > 0)
+    separators = _grouped(node_of[inner_poses, pieces.pose_level[inner_poses]], inner_poses, n_nodes)
+    tags = _grouped(home, np.arange(couplings.n_tags), n_nodes)
+    shared_tags = _grouped(*tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
+    slots = Lists(couplings.slot_start, couplings.slots)
+    n_poses = int(chain_start[-1])
+    fronts = fronts_of(pieces, separators, tags, shared_tags, slots, n_poses, couplings.n_tags, couplings.n_free)
+    up, reading_at = _places(pieces.parent, fronts, node_of[reading_pose, pieces.pose_level[reading_pose]], couplings)
+    size = np.diff(fronts.front_start)
+    widest = [int(size[pieces.level == level].max(initial=0)) for level in range(LEVELS)]
+    return Tree(
+        *pieces[:7],
+        *fronts,
+        up=up,
+        separator_start=separators.start,
+        separators=separators.values,
+        separator_chain=np.searchsorted(chain_start, separators.values, side="right") - 1,
+        tag_start=tags.start,
+        tags=tags.values,
+        rows_start=np.concatenate([[0], np.cumsum((fronts.n_eliminated * size)[:-1])]),
+        workspace_start=np.concatenate([[0], np.cumsum(np.square(widest))]),
+        reading_start=np.searchsorted(reading_pose, np.arange(n_poses + 1)),
+        reading_tag=reading_tag,
+        reading_at=reading_at,
+        slot_start=couplings.slot_start,
+        slots=couplings.slots,
+        chain_start=chain_start,
+        n_poses=n_poses,
+        n_tags=couplings.n_tags,
+        n_calibration=couplings.n_free,
+        n_slots=int(np.diff(couplings.slot_start).max(initial=0)),
+    )
+
+
+def _places(
+    parent: IntArray, fronts: Fronts, home_of_reading: IntArray, couplings: Couplings
+) -> tuple[IntArray, IntArray]:
+    """Of each front's columns in the parent's front, and of each reading's tag in the front of its pose's node."""
+    first_tag = 3 * int(couplings.chain_start[-1])
+    up, reading_at = places_of(
+        parent,
+        np.argsort(parent[:-1], kind="stable"),
+        fronts.front_start,
+        fronts.front,
+        home_of_reading,
+        np.argsort(home_of_reading, kind="stable"),
+        first_tag + 2 * couplings.reading_tag,
+        first_tag + 2 * couplings.n_tags + couplings.n_free,
+    )
+    up[_within(fronts.front_start, fronts.n_eliminated)] = -1
+    return up, reading_at
+
+
+def _grouped(node: IntArray, values: IntArray, n_nodes: int) -> Lists:
+    """Values by node, order kept."""
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
+    return Lists(start, values[np.argsort(node, kind="stable")])
+
+
+def _within(start: IntArray, length: IntArray) -> IntArray:
+    """Indices of the first `length` members of each list."""
+    return np.repeat(start[:-1] - np.cumsum(length) + length, length) + np.arange(int(length.sum()))

@@ -1,0 +1,1 @@
+"""Residuals and Jacobians of each kind of measurement, robust losses, and priors."""

@@ -1,0 +1,276 @@
+"""Residuals and Jacobians, one class a measurement kind, all of a kind at once.
+
+Each class gives whitened residuals (M, n) and Jacobian blocks: pairs of columns (M, k) of the tangent vector and
+derivatives (M, n, k). A column of -1 marks something that is held and has no column.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all variables.
+
+    Attributes:
+        poses: (P, 3) T_map_base of all chains, one after the other.
+        tags: (T, 2) in map.
+        calibration: (C,) corrections to nominal values.
+    """
+
+    poses: FloatArray
+    tags: FloatArray
+    calibration: FloatArray
+
+
+class Linearised(NamedTuple):
+    """Whitened residuals (M, n), and blocks of (columns (M, k), derivatives (M, n, k))."""
+
+    residual: FloatArray
+    blocks: tuple[tuple[IntArray, FloatArray], ...]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where each variable sits in the tangent vector; -1 where it is held.
+
+    Attributes:
+        poses: (P, 3); perturbed on the right.
+        tags: (T, 2); added.
+        calibration: (C,); added.
+        n: length of the tangent vector.
+    """
+
+    poses: IntArray
+    tags: IntArray
+    calibration: IntArray
+    n: int
+
+
+@dataclass(frozen=True)
+class OdometryFactors:
+    """Motion between neighbouring keyframes against the wheels: r = W S(c) log(M(c)^-1 o T_i^-1 o T_j).
+
+    M(c) = motion o exp(jacobian c) with c the wheel parameters of the robot. S divides lengths by (1 + wheel_scale):
+    the residual is in metres as the wheels count them. In true metres a map that shrinks, wheels and tags with it,
+    would shrink its residuals too, and thousands of small gains would outvote the prior that holds the scale.
+
+    Attributes:
+        first: (M,) index of T_i; T_j is the next pose.
+        motion: (M, 3) by nominal calibration.
+        whitening: (M, 3, 3) W with W^T W the information of the motion's right tangent.
+        jacobian: (M, 3, 3) by the wheel parameters.
+        parameters: (M, 3) indices into the calibration, wheel_scale first.
+    """
+
+    first: IntArray
+    motion: FloatArray
+    whitening: FloatArray
+    jacobian: FloatArray
+    parameters: IntArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(M, 3), whitened."""
+        error, _, _ = self._error(state)
+        return _times(self.scaled_whitening(state), error)
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (M, 3) and blocks for both poses and the wheel parameters."""
+        error, moved, twist = self._error(state)
+        outer = self.scaled_whitening(state)
+        by_second = outer @ se2.right_jacobian_inverse(error)
+        by_first = -by_second @ se2.adjoint(se2.inverse(moved))
+        # log(exp(-(t + dt)) o G) with t = jacobian c: the change enters on the left.
+        by_twist = -outer @ se2.right_jacobian_inverse(-error) @ se2.right_jacobian(twist)
+        by_parameters = by_twist @ self.jacobian
+        scale = 1.0 + state.calibration[self.parameters[:, 0]]
+        by_parameters[..., 0] -= _times(outer[..., :2], error[:, :2] / scale[:, None])
+        return Linearised(
+            _times(outer, error),
+            (
+                (columns.poses[self.first], by_first),
+                (columns.poses[self.first + 1], by_second),
+                (columns.calibration[self.parameters], by_parameters),
+            ),
+        )
+
+    def expected(self, state: State) -> FloatArray:
+        """M(c), (M, 3): the motions by the wheels as the calibration has them."""
+        return se2.compose(self.motion, se2.exp(self._twist(state)))
+
+    def scaled_whitening(self, state: State) -> FloatArray:
+        """W S(c), (M, 3, 3)."""
+        scaled = self.whitening.copy()
+        scaled[..., :2] /= (1.0 + state.calibration[self.parameters[:, 0]])[:, None, None]
+        return scaled
+
+    def _error(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        moved = se2.between(state.poses[self.first], state.poses[self.first + 1])
+        return se2.log(se2.between(self.expected(state), moved)), moved, self._twist(state)
+
+    def _twist(self, state: State) -> FloatArray:
+        return _times(self.jacobian, state.calibration[self.parameters])
+
+
+@dataclass(frozen=True)
+class ReadingFactors:
+    """A tag's place seen from a pose, as (range, bearing) or (x, y) about a sensor on the base.
+
+    With l the tag in map: l_base = R^T (l - t), l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale); the reading is
+    l_sensor or its polar coordinates. What else is wrong with the camera shifts the reading itself, to first order.
+
+    Attributes:
+        pose: (M,) index of the pose; tag: (M,) of the tag.
+        value: (M, 2); polar: (M,) which form.
+        whitening: (M, 2, 2).
+        mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
+        mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
+        by_camera: (M, 2, 4) derivative of the value by four more calibration numbers, camera_parameters: (M, 4).
+    """
+
+    pose: IntArray
+    tag: IntArray
+    value: FloatArray
+    polar: BoolArray
+    whitening: FloatArray
+    mount: FloatArray
+    mount_parameters: IntArray
+    scale_parameter: IntArray
+    by_camera: FloatArray
+    camera_parameters: IntArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(M, 2), whitened, predicted minus read."""
+        _, in_sensor, _ = self._places(state)
+        return _times(self.whitening, self._difference(in_sensor, state))
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (M, 2) and blocks for pose, tag, mount, tag scale and what else is wrong with the camera."""
+        in_base, in_sensor, mount = self._places(state)
+        theta, yaw = state.poses[self.pose, 2], mount[:, 2]
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        outer = self.whitening @ self._form_jacobian(in_sensor)
+        by_base = outer @ (_rotation(-yaw) / scale[:, None, None])
+        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
+        by_pose = np.zeros((len(self.pose), 2, 3))
+        by_pose[..., :2] = -by_base
+        by_pose[..., 2] = _times(by_base, _turned_right(in_base))
+        by_mount = np.zeros((len(self.pose), 2, 3))
+        by_mount[..., :2] = -by_base
+        by_mount[..., 2] = _times(outer, _turned_right(in_sensor))
+        by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
+        return Linearised(
+            _times(self.whitening, self._difference(in_sensor, state)),
+            (
+                (columns.poses[self.pose], by_pose),
+                (columns.tags[self.tag], by_base @ _rotation(-theta)),
+                (columns.calibration[self.mount_parameters], by_mount),
+                (columns.calibration[self.scale_parameter][:, None], by_scale),
+                (columns.calibration[self.camera_parameters], -self.whitening @ self.by_camera),
+            ),
+        )
+
+    def places_in_map(self, state: State) -> FloatArray:
+        """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""
+        value = self._corrected(state)
+        first, second = value.T
+        in_sensor = np.where(
+            self.polar[:, None], np.stack([first * np.cos(second), first * np.sin(second)], axis=-1), value
+        )
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        mount = self.mount + state.calibration[self.mount_parameters]
+        return se2.apply(se2.compose(state.poses[self.pose], mount), in_sensor * scale[:, None])
+
+    def _places(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The tags in base, in the sensor by the tags' stated size, and the sensor's mount."""
+        mount = self.mount + state.calibration[self.mount_parameters]
+        in_base = se2.apply(se2.inverse(state.poses[self.pose]), state.tags[self.tag])
+        scale = 1.0 + state.calibration[self.scale_parameter]
+        return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
+
+    def _corrected(self, state: State) -> FloatArray:
+        """(M, 2) what would have been read with the camera as the calibration has it."""
+        return self.value + _times(self.by_camera, state.calibration[self.camera_parameters])
+
+    def _difference(self, in_sensor: FloatArray, state: State) -> FloatArray:
+        x, y = in_sensor[:, 0], in_sensor[:, 1]
+        first, second = self._corrected(state).T
+        turned = se2.wrap_angle(np.arctan2(y, x) - second)
+        return np.stack(
+            [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
+        )
+
+    def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
+        """(M, 2, 2) derivative of the reading by the place in the sensor; the identity for (x, y)."""
+        x, y = in_sensor[:, 0], in_sensor[:, 1]
+        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
+        range_m = np.maximum(np.hypot(x, y), 1e-6)
+        jacobian = np.empty((len(x), 2, 2))
+        jacobian[:, 0, 0] = np.where(self.polar, x / range_m, 1.0)
+        jacobian[:, 0, 1] = np.where(self.polar, y / range_m, 0.0)
+        jacobian[:, 1, 0] = np.where(self.polar, -y / range_m**2, 0.0)
+        jacobian[:, 1, 1] = np.where(self.polar, x / range_m**2, 1.0)
+        return jacobian
+
+
+@dataclass(frozen=True)
+class CalibrationPrior:
+    """What robot.yaml says of each calibration number: r = c / sigma; where sigma is 0 it is held.
+
+    Attributes:
+        sigma: (C,)
+    """
+
+    sigma: FloatArray
+
+    def residual(self, state: State) -> FloatArray:
+        """(C, 1), whitened."""
+        return (state.calibration / np.where(self.sigma > 0.0, self.sigma, 1.0))[:, None]
+
+    def linearise(self, state: State, columns: Columns) -> Linearised:
+        """Residuals (C, 1) and one block."""
+        weight = 1.0 / np.where(self.sigma > 0.0, self.sigma, 1.0)
+        return Linearised(self.residual(state), ((columns.calibration[:, None], weight[:, None, None]),))
+
+
+def stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
+    """One sparse Jacobian (m, n), columns in no order within its rows, and its residuals (m,)."""
+    values, columns, counts, residuals = [], [], [np.zeros(1, dtype=np.int64)], []
+    for kind in kinds:
+        n = kind.residual.shape[1]
+        own = np.concatenate([each for each, _ in kind.blocks], axis=1)
+        free = np.repeat(own >= 0, n, axis=0)
+        values.append(np.concatenate([each for _, each in kind.blocks], axis=2).reshape(free.shape)[free])
+        columns.append(np.repeat(own, n, axis=0)[free])
+        counts.append(free.sum(axis=1))
+        residuals.append(kind.residual.reshape(-1))
+    ends = np.cumsum(np.concatenate(counts))
+    entries = (np.concatenate(values), np.concatenate(columns), ends)
+    return sparse.csr_array(entries, shape=(len(ends) - 1, n_columns)), np.concatenate(residuals)
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """W (..., n, n) with W^T W = covariance^-1."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Matrices (M, n, k) times vectors (M, k), one each."""
+    products: FloatArray = np.einsum("mij,mj->mi", matrices, vectors)
+    return products
+
+
+def _rotation(theta: FloatArray) -> FloatArray:
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+
+
+def _turned_right(vectors: FloatArray) -> FloatArray:
+    """(M, 2) turned by a quarter to the right: the derivative of R(a)^T v by a."""
+    return np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1)

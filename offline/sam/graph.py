@@ -1,0 +1,211 @@
+"""From chains to one problem: which variables there are, which factor touches which, what is held."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS, MOUNT_PARAMETERS, Mount
+from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.sam.factors.planar import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+    whitening,
+)
+from groundsbot.offline.sam.parameters import (
+    NO_PARAMETER,
+    Parameter,
+    camera_parameters_of,
+    mount_parameters_of,
+    parameters_of_wheels,
+    scale_parameter_of,
+)
+from groundsbot.offline.sam.solver import Problem
+
+_MOUNT: Final = "mount_"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A problem and what its variables mean.
+
+    Attributes:
+        chains: in order; the first one's start is held at its value: the frame.
+        first_pose: (number of chains,) index of each chain's start among the poses.
+        tags: in order.
+        parameters: in order; the first is a held zero.
+    """
+
+    problem: Problem
+    chains: tuple[Chain, ...]
+    first_pose: IntArray
+    tags: tuple[TagKey, ...]
+    parameters: tuple[Parameter, ...]
+
+    def poses_of(self, state: State, chain: int) -> FloatArray:
+        """(K, 3) of one chain."""
+        first = int(self.first_pose[chain])
+        return state.poses[first : first + len(self.chains[chain].stamps_ns)]
+
+    def wheel_calibration(self, state: State, chain: int) -> FloatArray:
+        """(3,) wheel parameters of one chain's robot."""
+        return state.calibration[self.wheel_parameters(chain)]
+
+    def wheel_parameters(self, chain: int) -> IntArray:
+        """(3,) indices of one chain's WHEEL_PARAMETERS."""
+        return _indices(self.parameters, parameters_of_wheels(self.chains[chain].run.robot))
+
+    def mount_of(self, state: State, chain: int) -> Mount | None:
+        """Where one chain's camera sits, as corrected; None for a log without a camera."""
+        run = self.chains[chain].run
+        if run.camera is None:
+            return None
+        parameters = [*mount_parameters_of(run.robot), *camera_parameters_of(self.chains[chain])]
+        found = state.calibration[_indices(self.parameters, parameters)].tolist()
+        corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
+        mount = run.robot.mount.model_dump()
+        for name, value in corrections:
+            if name.startswith(_MOUNT):
+                mount[name.removeprefix(_MOUNT)] += value
+        return Mount.model_validate(mount)
+
+    def tag_scales(self, chain: int) -> IntArray:
+        """Indices of the scales of all batches of tags that one chain read."""
+        owner = self.chains[chain]
+        scales = sorted({scale_parameter_of(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
+        return _indices(self.parameters, scales)
+
+    def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
+        """Starting values from poses (P, 3) and what is known; other tags start where their readings put them."""
+        values = np.array([calibration.get(p, 0.0) for p in self.parameters])
+        state = State(poses, np.zeros((len(self.tags), 2)), values)
+        places = self.problem.readings.places_in_map(state)
+        n = np.maximum(self.n_readings(), 1)
+        mean = np.stack(
+            [np.bincount(self.problem.readings.tag, places[:, i], len(self.tags)) / n for i in (0, 1)], axis=-1
+        )
+        start = [tags.get(tag, mean[i]) for i, tag in enumerate(self.tags)]
+        return State(poses, np.array(start).reshape(-1, 2), values)
+
+    def tags_of(self, state: State) -> dict[TagKey, FloatArray]:
+        """Places (2,) in map by tag."""
+        return dict(zip(self.tags, state.tags, strict=True))
+
+    def calibration_of(self, state: State) -> dict[Parameter, float]:
+        """Corrections by parameter."""
+        return dict(zip(self.parameters, state.calibration.tolist(), strict=True))
+
+    def n_readings(self) -> IntArray:
+        """(T,) readings of each tag."""
+        return np.bincount(self.problem.readings.tag, minlength=len(self.tags))
+
+
+def build_graph(chains: Sequence[Chain]) -> Graph:
+    """All chains in one problem. The first chain's start is held: it is the frame."""
+    tags = tuple(sorted({tag for chain in chains for tag in chain.tags}))
+    parameters = tuple(sorted({p for chain in chains for p in _parameters(chain)}, key=lambda p: p[:3]))
+    parameters = (NO_PARAMETER, *parameters)
+    lengths = np.array([len(chain.stamps_ns) for chain in chains])
+    first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    readings = _reading_factors(chains, first_pose, tags, parameters)
+    problem = Problem(
+        odometry=_odometry_factors(chains, first_pose, parameters),
+        readings=readings,
+        prior=CalibrationPrior(np.array([p.sigma for p in parameters])),
+        columns=_columns(int(lengths.sum()), len(tags), parameters),
+        anchor=_middle_readings(readings, len(tags)),
+    )
+    return Graph(problem, tuple(chains), first_pose, tags, parameters)
+
+
+def unheld(graph: Graph) -> Graph:
+    """The same with the first start free too, for what is held by something else."""
+    columns = graph.problem.columns
+    poses, tags, calibration = (
+        np.where(each >= 0, each + 3, -1) for each in (columns.poses, columns.tags, columns.calibration)
+    )
+    poses[0] = np.arange(3)
+    return replace(graph, problem=replace(graph.problem, columns=Columns(poses, tags, calibration, columns.n + 3)))
+
+
+def _middle_readings(readings: ReadingFactors, n_tags: int) -> IntArray:
+    """(T,) the pose of each tag's middle reading."""
+    order = np.argsort(readings.tag, kind="stable")
+    count = np.bincount(readings.tag, minlength=n_tags)
+    middle = order[np.cumsum(count) - count + count // 2]
+    return np.asarray(readings.pose[middle])
+
+
+def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:
+    """Poses in order of time, then tags, then calibration; the first pose and exact calibration are held."""
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    first_tag = 3 * n_poses - 3
+    tags = first_tag + np.arange(2 * n_tags).reshape(n_tags, 2)
+    free = np.array([p.sigma > 0.0 for p in parameters])
+    calibration = np.where(free, first_tag + 2 * n_tags + np.cumsum(free) - 1, -1)
+    return Columns(poses, tags, calibration, first_tag + 2 * n_tags + int(free.sum()))
+
+
+def _odometry_factors(
+    chains: Sequence[Chain], first_pose: IntArray, parameters: Sequence[Parameter]
+) -> OdometryFactors:
+    first, indices = [], []
+    for chain, start in zip(chains, first_pose, strict=True):
+        n = len(chain.odometry)
+        first.append(start + np.arange(n))
+        indices.append(np.tile(_indices(parameters, parameters_of_wheels(chain.run.robot)), (n, 1)))
+    return OdometryFactors(
+        first=np.concatenate(first),
+        motion=np.concatenate([chain.odometry.motion for chain in chains]),
+        whitening=whitening(np.concatenate([chain.odometry.covariance for chain in chains])),
+        jacobian=np.concatenate([chain.odometry.jacobian for chain in chains]),
+        parameters=np.concatenate(indices),
+    )
+
+
+def _reading_factors(
+    chains: Sequence[Chain], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
+) -> ReadingFactors:
+    tag_index = {tag: i for i, tag in enumerate(tags)}
+    pose, tag, mount, mount_parameters, scale_parameter, camera_parameters = [], [], [], [], [], []
+    for chain, start in zip(chains, first_pose, strict=True):
+        readings = chain.readings
+        own_tags = np.array([tag_index[t] for t in chain.tags], dtype=np.int64)
+        scales = np.array([parameters.index(scale_parameter_of(chain, t)) for t in chain.tags], dtype=np.int64)
+        pose.append(start + readings.keyframe)
+        tag.append(own_tags[readings.tag])
+        by_camera = readings.in_camera[:, None]
+        mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
+        mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(chain.run.robot)), 0))
+        camera_parameters.append(np.where(by_camera, _indices(parameters, camera_parameters_of(chain)), 0))
+        scale_parameter.append(scales[readings.tag])
+    return ReadingFactors(
+        pose=np.concatenate(pose),
+        tag=np.concatenate(tag),
+        value=np.concatenate([chain.readings.value for chain in chains]),
+        polar=np.concatenate([chain.readings.polar for chain in chains]),
+        whitening=whitening(np.concatenate([chain.readings.covariance for chain in chains])),
+        mount=np.concatenate(mount),
+        mount_parameters=np.concatenate(mount_parameters),
+        scale_parameter=np.concatenate(scale_parameter),
+        by_camera=np.concatenate([chain.readings.by_camera for chain in chains]),
+        camera_parameters=np.concatenate(camera_parameters),
+    )
+
+
+def _parameters(chain: Chain) -> list[Parameter]:
+    robot = chain.run.robot
+    found = parameters_of_wheels(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
+    if chain.readings.in_camera.any():
+        found += mount_parameters_of(robot) + camera_parameters_of(chain)
+    return [p for p in found if p != NO_PARAMETER]
+
+
+def _indices(parameters: Sequence[Parameter], wanted: Sequence[Parameter]) -> IntArray:
+    return np.array([parameters.index(p) if p in parameters else 0 for p in wanted], dtype=np.int64)

@@ -1,0 +1,216 @@
+"""Compiled linearisation: the residuals and Jacobians of `factors`, straight into the blocks of the arrowhead system.
+
+What `factors` writes as arrays over all factors is here a loop with the same names; the tests hold both to each other.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.foundation import inlined, inner, jitted
+from groundsbot.offline.sam.linearisation.blocks import System
+
+
+class Values(NamedTuple):
+    """Of all variables, as in `factors.State`, and what is free of them (1.0, or 0.0 where held)."""
+
+    poses: FloatArray
+    tags: FloatArray
+    calibration: FloatArray
+
+
+class Free(NamedTuple):
+    """1.0 where a tangent direction is free, 0.0 where it is held.
+
+    Attributes:
+        poses: (P, 3); tags: (T, 2).
+        calibration: (C,) index among what is free, -1 where held.
+        held_poses, held_tags, held_readings: of which, or of whose pose or tag, some direction is held.
+    """
+
+    poses: FloatArray
+    tags: FloatArray
+    calibration: IntArray
+    held_poses: IntArray
+    held_tags: IntArray
+    held_readings: IntArray
+
+
+class Odometry(NamedTuple):
+    """`factors.OdometryFactors` by rising pose.
+
+    Attributes:
+        motion: (M, 5) x, y, heading, and the heading's cosine and sine.
+        information, covariance: (M, 3, 3) of the motion's right tangent.
+        slots: (M, 3) of each parameter in its chain's calibration, -1 where held.
+    """
+
+    first: IntArray
+    motion: FloatArray
+    information: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+    parameters: IntArray
+    slots: IntArray
+
+
+class Readings(NamedTuple):
+    """`factors.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
+
+    pose: IntArray
+    tag: IntArray
+    value: FloatArray
+    polar: BoolArray
+    whitening: FloatArray
+    mount: FloatArray
+    by_camera: FloatArray
+    parameters: IntArray
+    slots: IntArray
+
+
+@jitted
+def clear(system: System) -> None:
+    """All zero, but for what is overwritten anyway."""
+    for blocks in (system.pose, system.pose_next, system.pose_calibration, system.tag, system.tag_calibration):
+        blocks[:] = 0.0
+    system.calibration[:] = 0.0
+    system.gradient[:] = 0.0
+
+
+@jitted
+def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: System) -> None:
+    """What is held gets a one on the diagonal and nothing else: its step is zero."""
+    n_poses = len(free.poses)
+    for pose in free.held_poses:
+        for i in range(3):
+            if free.poses[pose, i] == 0.0:
+                _hold_one(system.pose[pose], i)
+                system.pose_next[pose, i, :] = 0.0
+                if pose > 0:
+                    system.pose_next[pose - 1, :, i] = 0.0
+                system.pose_calibration[pose, i, :] = 0.0
+                system.gradient[3 * pose + i] = 0.0
+    for tag in free.held_tags:
+        for i in range(2):
+            if free.tags[tag, i] == 0.0:
+                _hold_one(system.tag[tag], i)
+                system.tag_calibration[tag, i, :] = 0.0
+                system.gradient[3 * n_poses + 2 * tag + i] = 0.0
+    for m in free.held_readings:
+        pose, tag = free.poses[reading_pose[m]], free.tags[reading_tag[m]]
+        for i in range(3):
+            system.pose_tag[m, i, 0] *= pose[i] * tag[0]
+            system.pose_tag[m, i, 1] *= pose[i] * tag[1]
+
+
+@inner
+def _hold_one(block: FloatArray, i: int) -> None:
+    block[i, :] = 0.0
+    block[:, i] = 0.0
+    block[i, i] = 1.0
+
+
+@inner
+def wrapped(angle: float) -> float:
+    """In [-pi, pi]."""
+    return float(angle - 2.0 * np.pi * np.rint(angle * (0.5 / np.pi)))
+
+
+# Series are written with reciprocals: a division takes as long as the whole rest of a term.
+
+
+@inner
+def half_angle_cotangent(omega: float) -> float:
+    """(w/2) cot(w/2)."""
+    if abs(omega) < 0.2:
+        s = omega * omega
+        return 1.0 - s * (1 / 12) * (
+            1.0 + s * (1 / 60) * (1.0 + s * (1 / 42) * (1.0 + s * (1 / 40) * (1.0 + s * (5 / 198))))
+        )
+    return float(0.5 * omega * np.cos(0.5 * omega) / np.sin(0.5 * omega))
+
+
+@inner
+def series(omega: float) -> tuple[float, float, float]:
+    """sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^2."""
+    s = omega * omega
+    if abs(omega) < 0.5:
+        rest = 1.0 - s * (1 / 42) * (1.0 - s * (1 / 72) * (1.0 - s * (1 / 110) * (1.0 - s * (1 / 156))))
+        sixth = (1 / 6) * (1.0 - s * (1 / 20) * rest)
+        rest = 1.0 - s * (1 / 56) * (1.0 - s * (1 / 90) * (1.0 - s * (1 / 132) * (1.0 - s * (1 / 182))))
+        return 1.0 - s * sixth, 0.5 - s * (1 / 24) * (1.0 - s * (1 / 30) * rest), omega * sixth
+    return np.sin(omega) / omega, (1.0 - np.cos(omega)) / s, (omega - np.sin(omega)) / s
+
+
+@inner
+def multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """Out <- A B, all (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@inlined
+def advance(pose: FloatArray, d0: float, d1: float, omega: float, out: FloatArray) -> None:
+    """Out <- T o exp(d) of a pose (3,)."""
+    along, even, _ = series(omega)
+    across = omega * even
+    x, y = along * d0 - across * d1, across * d0 + along * d1
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    out[0], out[1], out[2] = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrapped(pose[2] + omega)
+
+
+@inlined
+def go_along(
+    tag: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    d0: float,
+    d1: float,
+    omega: float,
+    own_0: float,
+    own_1: float,
+    out: FloatArray,
+) -> None:
+    """Sets the place (2,) of a tag that goes with its anchor, which a step d takes from one pose (3,) to the next.
+
+    As seen from the anchor it moves by its own step, in map, but for what the anchor's makes of it.
+    """
+    cos, sin = np.cos(before[2]), np.sin(before[2])
+    dx, dy = tag[0] - before[0], tag[1] - before[1]
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    x, y = x + (cos * own_0 + sin * own_1 - (d0 - omega * y)), y + (cos * own_1 - sin * own_0 - (d1 + omega * x))
+    cos, sin = np.cos(after[2]), np.sin(after[2])
+    out[0], out[1] = after[0] + cos * x - sin * y, after[1] + sin * x + cos * y
+
+
+@jitted
+def moved(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
+    """`solver.Problem.moved` with a step in the arrowhead's order; calibration apart."""
+    n_poses = len(values.poses)
+    for pose in range(n_poses):
+        at = 3 * pose
+        advance(values.poses[pose], step[at], step[at + 1], step[at + 2], out.poses[pose])
+    for tag in range(len(values.tags)):
+        at, column, before = 3 * anchor[tag], 3 * n_poses + 2 * tag, values.poses[anchor[tag]]
+        go_along(
+            values.tags[tag], before, out.poses[anchor[tag]], step[at], step[at + 1], step[at + 2], step[column],
+            step[column + 1], out.tags[tag],
+        )  # fmt: skip
+
+
+@jitted
+def diagonal_square(system: System, step: FloatArray) -> float:
+    """step^T diag(H) step."""
+    total = 0.0
+    n_poses, n_tags = len(system.pose), len(system.tag)
+    for pose in range(n_poses):
+        for i in range(3):
+            total += system.pose[pose, i, i] * step[3 * pose + i] ** 2
+    for tag in range(n_tags):
+        for i in range(2):
+            total += system.tag[tag, i, i] * step[3 * n_poses + 2 * tag + i] ** 2
+    for a in range(len(system.calibration)):
+        total += system.calibration[a, a] * step[3 * n_poses + 2 * n_tags + a] ** 2
+    return total

@@ -1,0 +1,266 @@
+"""Compiled linearisation of odometry; see `linearise_kernels`.
+
+With e = log(M(c)^-1 o T_i^-1 o T_j) and L its information: J_j = Jr^-1(e) and J_i = -J_j A with A the adjoint of
+T_j^-1 o T_i, so that H_jj = J_j^T L J_j, H_ij = -A^T H_jj, H_ii = A^T H_jj A, g_j = J_j^T L e, g_i = -A^T g_j.
+Small matrices travel as tuples, row by row; of symmetric ones the upper triangle.
+"""
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.sam.factors.losses import Loss, loss_and_weight
+from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
+
+_Three = tuple[float, float, float]
+_Four = tuple[float, float, float, float]
+_Upper = tuple[float, float, float, float, float, float]
+_Square = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@jitted
+def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, system: System) -> float:
+    """Adds all odometry factors to the blocks; returns the sum of their losses."""
+    odometry, values, free, system = borrowed(odometry), borrowed(values), borrowed(free), borrowed(system)
+    scratch = np.empty((6, 3, 3))
+    total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
+    for m in range(len(odometry.first)):
+        i = odometry.first[m]
+        cos_i, sin_i = cos_j, sin_j
+        if i != last:
+            cos_i, sin_i = np.cos(values.poses[i, 2]), np.sin(values.poses[i, 2])
+        last = i + 1
+        cos_j, sin_j = np.cos(values.poses[last, 2]), np.sin(values.poses[last, 2])
+        cos, sin = cos_i * cos_j + sin_i * sin_j, cos_i * sin_j - sin_i * cos_j
+        apart_x, apart_y = values.poses[last, 0] - values.poses[i, 0], values.poses[last, 1] - values.poses[i, 1]
+        x, y = cos_i * apart_x + sin_i * apart_y, cos_i * apart_y - sin_i * apart_x
+        t = wheel_correction(odometry, m, values.calibration)
+        e, J = error_of(motion_at(odometry, m, t), x, y, values.poses[last, 2] - values.poses[i, 2])
+        s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
+        L = scaled_information(odometry.information[m], s)
+        f = _times_vector(L, e)
+        rho, w = loss_and_weight(loss, e[0] * f[0] + e[1] * f[1] + e[2] * f[2])
+        total += rho
+        L, f = (w * L[0], w * L[1], w * L[2], w * L[3], w * L[4], w * L[5]), (w * f[0], w * f[1], w * f[2])
+        M = _transposed_times(J, L)
+        H = _times_jacobian(M, J)
+        A = (cos, sin, sin * x - cos * y, cos * x + sin * y)
+        _add_blocks(system, i, H, A)
+        _add_gradient(system.gradient, 3 * i, f, J, A)
+        if odometry.slots[m, 0] >= 0 or odometry.slots[m, 1] >= 0 or odometry.slots[m, 2] >= 0:
+            error_by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
+            _unpacked(M, L, A, f, scratch)
+            _add_wheels(odometry, m, free, scratch, system)
+    return total
+
+
+@inner
+def wheel_correction(odometry: Odometry, m: int, calibration: FloatArray) -> _Three:
+    """T = K c, what calibration c puts at the end of a motion."""
+    c0 = calibration[odometry.parameters[m, 0]]
+    c1 = calibration[odometry.parameters[m, 1]]
+    c2 = calibration[odometry.parameters[m, 2]]
+    if c0 == 0.0 and c1 == 0.0 and c2 == 0.0:
+        return 0.0, 0.0, 0.0
+    K = odometry.jacobian[m]
+    return (
+        K[0, 0] * c0 + K[0, 1] * c1 + K[0, 2] * c2,
+        K[1, 0] * c0 + K[1, 1] * c1 + K[1, 2] * c2,
+        K[2, 0] * c0 + K[2, 1] * c1 + K[2, 2] * c2,
+    )
+
+
+@inner
+def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, float, float, float]:
+    """X, y, heading of motion o exp(t), and the heading's cosine and sine."""
+    motion = odometry.motion[m]
+    x, y, theta, cos, sin = motion[0], motion[1], motion[2], motion[3], motion[4]
+    if t[0] == 0.0 and t[1] == 0.0 and t[2] == 0.0:
+        return x, y, theta, cos, sin
+    along, even, _ = series(t[2])
+    across = t[2] * even
+    step_x, step_y = along * t[0] - across * t[1], across * t[0] + along * t[1]
+    x, y, theta = x + cos * step_x - sin * step_y, y + sin * step_x + cos * step_y, theta + t[2]
+    return x, y, theta, np.cos(theta), np.sin(theta)
+
+
+@inner
+def error_of(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
+    """log(motion^-1 o moved), and (a, b, p, q) of Jr^-1 with the rows (a, -b, p), (b, a, q), (0, 0, 1)."""
+    dx, dy, omega = x - motion[0], y - motion[1], wrapped(turn - motion[2])
+    cos, sin = motion[3], motion[4]
+    away_x, away_y = cos * dx + sin * dy, cos * dy - sin * dx
+    half, cotangent = 0.5 * omega, half_angle_cotangent(omega)
+    e = (cotangent * away_x + half * away_y, cotangent * away_y - half * away_x, omega)
+    return e, _right_jacobian_inverse(e, cotangent)
+
+
+@inner
+def _right_jacobian_inverse(e: _Three, cotangent: float) -> _Four:
+    half = 0.5 * e[2]
+    _, even, odd = series(e[2])
+    moved_x, moved_y = odd * e[0] - even * e[1], even * e[0] + odd * e[1]
+    return cotangent, half, half * moved_y - cotangent * moved_x, -half * moved_x - cotangent * moved_y
+
+
+@inner
+def scaled_information(L: FloatArray, s: float) -> _Upper:
+    """S L S: lengths are divided by 1 + wheel_scale."""
+    return s * s * L[0, 0], s * s * L[0, 1], s * L[0, 2], s * s * L[1, 1], s * L[1, 2], L[2, 2]
+
+
+@inner
+def _times_vector(L: _Upper, e: _Three) -> _Three:
+    return (
+        L[0] * e[0] + L[1] * e[1] + L[2] * e[2],
+        L[1] * e[0] + L[3] * e[1] + L[4] * e[2],
+        L[2] * e[0] + L[4] * e[1] + L[5] * e[2],
+    )
+
+
+@inner
+def _transposed_times(J: _Four, L: _Upper) -> _Square:
+    """J^T L."""
+    a, b, p, q = J
+    return (
+        a * L[0] + b * L[1],
+        a * L[1] + b * L[3],
+        a * L[2] + b * L[4],
+        a * L[1] - b * L[0],
+        a * L[3] - b * L[1],
+        a * L[4] - b * L[2],
+        p * L[0] + q * L[1] + L[2],
+        p * L[1] + q * L[3] + L[4],
+        p * L[2] + q * L[4] + L[5],
+    )
+
+
+@inner
+def _times_jacobian(M: _Square, J: _Four) -> _Upper:
+    """M J, which is symmetric."""
+    a, b, p, q = J
+    return (
+        M[0] * a + M[1] * b,
+        M[1] * a - M[0] * b,
+        M[0] * p + M[1] * q + M[2],
+        M[4] * a - M[3] * b,
+        M[3] * p + M[4] * q + M[5],
+        M[6] * p + M[7] * q + M[8],
+    )
+
+
+@inner
+def _add_blocks(system: System, i: int, H: _Upper, A: _Four) -> None:
+    """Adds H to pose j = i + 1, sets -A^T H between, and adds A^T H A to pose i.
+
+    A has the rows (cos, sin, u), (-sin, cos, v), (0, 0, 1).
+    """
+    cos, sin, u, v = A
+    b00, b01, b02 = H[0] * cos - H[1] * sin, H[0] * sin + H[1] * cos, H[0] * u + H[1] * v + H[2]
+    b10, b11, b12 = H[1] * cos - H[3] * sin, H[1] * sin + H[3] * cos, H[1] * u + H[3] * v + H[4]
+    b20, b21, b22 = H[2] * cos - H[4] * sin, H[2] * sin + H[4] * cos, H[2] * u + H[4] * v + H[5]
+    N = system.pose_next[i]
+    N[0, 0], N[0, 1], N[0, 2] = -b00, -b10, -b20
+    N[1, 0], N[1, 1], N[1, 2] = -b01, -b11, -b21
+    N[2, 0], N[2, 1], N[2, 2] = -b02, -b12, -b22
+    before = (
+        cos * b00 - sin * b10,
+        cos * b01 - sin * b11,
+        cos * b02 - sin * b12,
+        sin * b01 + cos * b11,
+        sin * b02 + cos * b12,
+        u * b02 + v * b12 + b22,
+    )
+    add_symmetric(system.pose[i], before)
+    add_symmetric(system.pose[i + 1], H)
+
+
+@inner
+def add_symmetric(block: FloatArray, upper: _Upper) -> None:
+    """Block (3, 3) += the matrix with this upper triangle."""
+    block[0, 0] += upper[0]
+    block[0, 1] += upper[1]
+    block[0, 2] += upper[2]
+    block[1, 0] += upper[1]
+    block[1, 1] += upper[3]
+    block[1, 2] += upper[4]
+    block[2, 0] += upper[2]
+    block[2, 1] += upper[4]
+    block[2, 2] += upper[5]
+
+
+@inner
+def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) -> None:
+    """Adds J^T f to pose j, and -A^T J^T f to pose i, whose three entries begin at `at`."""
+    a, b, p, q = J
+    cos, sin, u, v = A
+    g0, g1, g2 = a * f[0] + b * f[1], a * f[1] - b * f[0], p * f[0] + q * f[1] + f[2]
+    gradient[at] -= cos * g0 - sin * g1
+    gradient[at + 1] -= sin * g0 + cos * g1
+    gradient[at + 2] -= u * g0 + v * g1 + g2
+    gradient[at + 3] += g0
+    gradient[at + 4] += g1
+    gradient[at + 5] += g2
+
+
+@inner
+def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
+    """C <- S^-1 d(S e)/dc: log(exp(-(t + dt)) o G) with t = K c, the change enters on the left."""
+    along, even, odd = series(t[2])
+    across = t[2] * even
+    p, q = odd * t[0] - even * t[1], even * t[0] + odd * t[1]
+    for j in range(3):
+        product[0, j] = along * K[0, j] + across * K[1, j] + p * K[2, j]
+        product[1, j] = along * K[1, j] - across * K[0, j] + q * K[2, j]
+        product[2, j] = K[2, j]
+    a, b, p, q = _right_jacobian_inverse((-e[0], -e[1], -e[2]), half_angle_cotangent(e[2]))
+    for j in range(3):
+        C[0, j] = -(a * product[0, j] - b * product[1, j] + p * product[2, j])
+        C[1, j] = -(b * product[0, j] + a * product[1, j] + q * product[2, j])
+        C[2, j] = -product[2, j]
+    C[0, 0] -= e[0] * s
+    C[1, 0] -= e[1] * s
+
+
+@inner
+def _unpacked(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
+    """Into arrays: M, L, A and, in the first row of the fourth, f."""
+    for k in range(3):
+        scratch[0, 0, k], scratch[0, 1, k], scratch[0, 2, k] = M[k], M[3 + k], M[6 + k]
+        scratch[3, 0, k] = f[k]
+    out = scratch[1]
+    out[0, 0], out[0, 1], out[0, 2], out[1, 1], out[1, 2], out[2, 2] = L
+    out[1, 0], out[2, 0], out[2, 1] = L[1], L[2], L[4]
+    cos, sin, u, v = A
+    out = scratch[2]
+    out[0, 0], out[0, 1], out[0, 2] = cos, sin, u
+    out[1, 0], out[1, 1], out[1, 2] = -sin, cos, v
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
+
+
+@inner
+def _add_wheels(odometry: Odometry, m: int, free: Free, scratch: FloatArray, system: System) -> None:
+    """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for what is free of the wheel parameters."""
+    M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
+    first, base = odometry.first[m], len(system.gradient) - len(system.calibration)
+    for k in range(3):
+        slot, column = odometry.slots[m, k], free.calibration[odometry.parameters[m, k]]
+        if slot < 0:
+            continue
+        v0 = M[0, 0] * C[0, k] + M[0, 1] * C[1, k] + M[0, 2] * C[2, k]
+        v1 = M[1, 0] * C[0, k] + M[1, 1] * C[1, k] + M[1, 2] * C[2, k]
+        v2 = M[2, 0] * C[0, k] + M[2, 1] * C[1, k] + M[2, 2] * C[2, k]
+        system.pose_calibration[first + 1, 0, slot] += v0
+        system.pose_calibration[first + 1, 1, slot] += v1
+        system.pose_calibration[first + 1, 2, slot] += v2
+        for i in range(3):
+            system.pose_calibration[first, i, slot] -= A[0, i] * v0 + A[1, i] * v1 + A[2, i] * v2
+        u0 = L[0, 0] * C[0, k] + L[0, 1] * C[1, k] + L[0, 2] * C[2, k]
+        u1 = L[1, 0] * C[0, k] + L[1, 1] * C[1, k] + L[1, 2] * C[2, k]
+        u2 = L[2, 0] * C[0, k] + L[2, 1] * C[1, k] + L[2, 2] * C[2, k]
+        for other in range(3):
+            row = free.calibration[odometry.parameters[m, other]]
+            if row >= 0:
+                system.calibration[row, column] += C[0, other] * u0 + C[1, other] * u1 + C[2, other] * u2
+        system.gradient[base + column] += C[0, k] * f[0] + C[1, k] * f[1] + C[2, k] * f[2]

@@ -1,0 +1,161 @@
+"""Compiled linearisation of tag readings and calibration priors; see `linearise_kernels`."""
+
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS
+from groundsbot.offline.foundation import borrowed, inlined, inner, jitted
+from groundsbot.offline.sam.factors.losses import Loss, loss_and_weight
+from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.linearisation.kernels import Free, Readings, Values
+
+_N_CAMERA: Final = len(CAMERA_PARAMETERS)
+_N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
+N_READING: Final = 5 + _N_PARAMETERS  # what a reading depends on: pose and tag before them
+
+
+@jitted
+def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, system: System) -> float:
+    """Adds all tag readings to the blocks; returns the sum of their losses.
+
+    The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
+    whitened derivative of the reading by the tag's place in the sensor.
+    """
+    readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
+    r, J = np.empty(2), np.empty((2, N_READING))
+    total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
+    for m in range(len(readings.pose)):
+        pose, tag = readings.pose[m], readings.tag[m]
+        reading_factor(readings, m, values, by_calibration, r, J)
+        rho, w = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
+        total += rho
+        a0, a1, a2, b0, b1, b2 = J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2]
+        c0, c1, d0, d1 = J[0, 3], J[0, 4], J[1, 3], J[1, 4]
+        r0, r1 = w * r[0], w * r[1]
+        H, N, T = system.pose[pose], system.pose_tag[m], system.tag[tag]
+        h01, h02, h12 = w * (a0 * a1 + b0 * b1), w * (a0 * a2 + b0 * b2), w * (a1 * a2 + b1 * b2)
+        H[0, 0] += w * (a0 * a0 + b0 * b0)
+        H[0, 1] += h01
+        H[0, 2] += h02
+        H[1, 0] += h01
+        H[1, 1] += w * (a1 * a1 + b1 * b1)
+        H[1, 2] += h12
+        H[2, 0] += h02
+        H[2, 1] += h12
+        H[2, 2] += w * (a2 * a2 + b2 * b2)
+        N[0, 0], N[0, 1] = w * (a0 * c0 + b0 * d0), w * (a0 * c1 + b0 * d1)
+        N[1, 0], N[1, 1] = w * (a1 * c0 + b1 * d0), w * (a1 * c1 + b1 * d1)
+        N[2, 0], N[2, 1] = w * (a2 * c0 + b2 * d0), w * (a2 * c1 + b2 * d1)
+        t01 = w * (c0 * c1 + d0 * d1)
+        T[0, 0] += w * (c0 * c0 + d0 * d0)
+        T[0, 1] += t01
+        T[1, 0] += t01
+        T[1, 1] += w * (c1 * c1 + d1 * d1)
+        g[3 * pose] += a0 * r0 + b0 * r1
+        g[3 * pose + 1] += a1 * r0 + b1 * r1
+        g[3 * pose + 2] += a2 * r0 + b2 * r1
+        first_tag = 3 * len(values.poses) + 2 * tag
+        g[first_tag] += c0 * r0 + d0 * r1
+        g[first_tag + 1] += c1 * r0 + d1 * r1
+        if by_calibration:
+            _add_calibration(readings, m, w, free, r, J, system)
+    return total
+
+
+@inner
+def _add_calibration(
+    readings: Readings, m: int, weight: float, free: Free, r: FloatArray, J: FloatArray, system: System
+) -> None:
+    pose, tag = readings.pose[m], readings.tag[m]
+    base = len(system.gradient) - len(system.calibration)
+    for a in range(_N_PARAMETERS):
+        slot, column = readings.slots[m, a], free.calibration[readings.parameters[m, a]]
+        if slot < 0:
+            continue
+        j0, j1 = weight * J[0, 5 + a], weight * J[1, 5 + a]
+        for i in range(3):
+            system.pose_calibration[pose, i, slot] += J[0, i] * j0 + J[1, i] * j1
+        for i in range(2):
+            system.tag_calibration[tag, i, column] += J[0, 3 + i] * j0 + J[1, 3 + i] * j1
+        for b in range(_N_PARAMETERS):
+            other = free.calibration[readings.parameters[m, b]]
+            if other >= 0:
+                system.calibration[column, other] += j0 * J[0, 5 + b] + j1 * J[1, 5 + b]
+        system.gradient[base + column] += j0 * r[0] + j1 * r[1]
+
+
+@inlined
+def reading_factor(
+    readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
+) -> None:
+    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `factors.ReadingFactors`."""
+    pose, tag = readings.pose[m], readings.tag[m]
+    theta = values.poses[pose, 2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    dx, dy = values.tags[tag, 0] - values.poses[pose, 0], values.tags[tag, 1] - values.poses[pose, 1]
+    base_x, base_y = cos * dx + sin * dy, cos * dy - sin * dx
+    yaw = readings.mount[m, 2] + values.calibration[readings.parameters[m, 2]]
+    mount_x = readings.mount[m, 0] + values.calibration[readings.parameters[m, 0]]
+    mount_y = readings.mount[m, 1] + values.calibration[readings.parameters[m, 1]]
+    scale = 1.0 + values.calibration[readings.parameters[m, 3]]
+    c, s = np.cos(yaw), np.sin(yaw)
+    x = (c * (base_x - mount_x) + s * (base_y - mount_y)) / scale
+    y = (c * (base_y - mount_y) - s * (base_x - mount_x)) / scale
+    first, second = _corrected(readings, m, values)
+    W = readings.whitening[m]
+    o00, o01, o10, o11 = W[0, 0], W[0, 1], W[1, 0], W[1, 1]
+    if readings.polar[m]:
+        range_m = np.sqrt(x * x + y * y)
+        d0 = range_m - first
+        d1 = np.arctan2(y, x) - second
+        d1 -= 2.0 * np.pi * np.rint(d1 / (2.0 * np.pi))
+        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
+        range_m = max(range_m, 1e-6)
+        ux, uy = x / range_m, y / range_m
+        vx, vy = -uy / range_m, ux / range_m
+        o00, o01 = W[0, 0] * ux + W[0, 1] * vx, W[0, 0] * uy + W[0, 1] * vy
+        o10, o11 = W[1, 0] * ux + W[1, 1] * vx, W[1, 0] * uy + W[1, 1] * vy
+    else:
+        d0, d1 = x - first, y - second
+    r[0], r[1] = W[0, 0] * d0 + W[0, 1] * d1, W[1, 0] * d0 + W[1, 1] * d1
+    for i in range(2):
+        a, b = (o00, o01) if i == 0 else (o10, o11)
+        # By the place in base: outer R(-yaw) / scale.
+        bx, by = (a * c - b * s) / scale, (a * s + b * c) / scale
+        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
+        J[i, 0], J[i, 1], J[i, 2] = -bx, -by, bx * base_y - by * base_x
+        J[i, 3], J[i, 4] = bx * cos - by * sin, bx * sin + by * cos
+        if by_calibration:
+            J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
+            J[i, 8] = -(a * x + b * y) / scale
+            for k in range(_N_CAMERA):
+                J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
+
+
+@inlined
+def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
+    """What would have been read with the camera as the calibration has it."""
+    first, second = readings.value[m, 0], readings.value[m, 1]
+    for k in range(_N_CAMERA):
+        c = values.calibration[readings.parameters[m, 4 + k]]
+        if c != 0.0:
+            first += readings.by_camera[m, 0, k] * c
+            second += readings.by_camera[m, 1, k] * c
+    return first, second
+
+
+@jitted
+def add_priors(sigma: FloatArray, values: Values, free: Free, system: System) -> float:
+    """Adds r = c / sigma for all free calibration; returns the sum of squares, held ones included."""
+    base = len(system.gradient) - len(system.calibration)
+    total = 0.0
+    for c in range(len(sigma)):
+        column = free.calibration[c]
+        r = values.calibration[c] / (sigma[c] if sigma[c] > 0.0 else 1.0)
+        total += r * r
+        if column >= 0:
+            system.calibration[column, column] += 1.0 / (sigma[c] * sigma[c])
+            system.gradient[base + column] += r / sigma[c]
+    return total

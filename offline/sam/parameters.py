@@ -1,0 +1,87 @@
+"""The calibration parameters of a graph: which there are, whose they are, and their priors."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.robot import (
+    CAMERA_PARAMETERS,
+    IMPORTED_BATCH,
+    MOUNT_PARAMETERS,
+    TAG_SCALE,
+    WHEEL_PARAMETERS,
+    Robot,
+)
+from groundsbot.offline.measurements import Chain, TagKey
+
+
+class Parameter(NamedTuple):
+    """One calibration number: a correction to what a robot.yaml says."""
+
+    owner: str  # robot id or printed batch
+    name: str
+    nominal: tuple[float, ...]  # logs of one robot share a correction as long as they share what it corrects
+    sigma: float
+
+
+# Takes the place of a calibration number where a reading depends on none; held at zero.
+NO_PARAMETER: Final = Parameter("", "", (), 0.0)
+
+
+def parameters_of_wheels(robot: Robot) -> list[Parameter]:
+    """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent where the file says nothing else."""
+    wheels = robot.wheels
+    nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
+    relative_left = wheels.radius_left_m_sigma / wheels.radius_left_m
+    relative_right = wheels.radius_right_m_sigma / wheels.radius_right_m
+    ratio_sigma = float(np.hypot(relative_left, relative_right))
+    sigmas = (
+        wheels.radii_scale_sigma or 0.5 * ratio_sigma,
+        wheels.radii_ratio_sigma or ratio_sigma,
+        wheels.track_m_sigma / wheels.track_m,
+    )
+    return [
+        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(WHEEL_PARAMETERS, sigmas, strict=True)
+    ]
+
+
+def mount_parameters_of(robot: Robot) -> list[Parameter]:
+    """In the order of MOUNT_PARAMETERS."""
+    mount = robot.mount
+    nominal = (mount.x_m, mount.y_m, mount.yaw_rad)
+    sigmas = (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma)
+    return [
+        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(MOUNT_PARAMETERS, sigmas, strict=True)
+    ]
+
+
+def camera_parameters_of(chain: Chain) -> list[Parameter]:
+    """In the order of CAMERA_PARAMETERS; none of them is known to positions that somebody else worked out."""
+    if not chain.readings.by_camera.any():
+        return [NO_PARAMETER] * len(CAMERA_PARAMETERS)
+    return parameters_of_camera(chain.run.robot)
+
+
+def parameters_of_camera(robot: Robot) -> list[Parameter]:
+    """In the order of CAMERA_PARAMETERS, for readings of corners."""
+    mount = robot.mount
+    nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
+    sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
+    *of_mount_and_time, of_edges = CAMERA_PARAMETERS
+    return [
+        *(Parameter(robot.robot_id, *each) for each in zip(of_mount_and_time, [nominal] * 3, sigmas, strict=True)),
+        Parameter(robot.robot_id, of_edges, (robot.edge_shift_px,), robot.edge_shift_px_sigma),
+    ]
+
+
+def scale_parameter_of(chain: Chain, tag: TagKey) -> Parameter:
+    """Of the batch of a tag that a chain read."""
+    return parameter_of_scale(chain.run.robot, tag)
+
+
+def parameter_of_scale(robot: Robot, tag: TagKey) -> Parameter:
+    """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
+    if not any(batch.family == tag.family for batch in robot.tags):
+        return Parameter(f"{IMPORTED_BATCH}{tag.family}", TAG_SCALE, (), robot.imported_tag_scale_sigma)
+    size_m, sigma_m, batch = robot.tag_size_m(tag.family, tag.tag_id)
+    return Parameter(f"{batch} {tag.family}", TAG_SCALE, (), sigma_m / size_m)

@@ -1,0 +1,325 @@
+"""Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
+
+Linearise all factors, eliminate the chains, meet in the border, substitute back: see `arrowhead`. Dellaert and Kaess,
+"Square Root SAM" (2006). How a step is taken stands in `step_taken`, what comes of it in `damping`. Readings carry
+Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweighed
+from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from groundsbot.offline.sam.damping import Damping
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, huber, losses_and_weights
+from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
+from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.kernels import diagonal_square
+from groundsbot.offline.sam.observability import Untied, untied_parts
+from groundsbot.offline.sam.step import Before, take_step
+
+# Rounding that changes a covariance by a hundredth is a tenth of what the sigma of a good noise model is off.
+MAX_RELATIVE_ERROR: Final = 0.01
+
+
+# Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
+HUBER_THRESHOLD: Final = 3.0
+
+MAX_STEPS: Final = 100
+# A step linearises once where it goes down as it should, and seven times at most (`take_step`).
+MAX_TRIES: Final = 7 * MAX_STEPS
+# The cost is in squared sigmas: a step that would lower it by this much less is some 1e-5 sigma long.
+COST_TOLERANCE: Final = 1e-10
+_COST_ROUNDING: Final = 1e-14  # relative
+# Where rounding leaves a matrix without a square root, its diagonal is raised by this share, then by ten times as much
+# until it has one.
+_LEAST_FLOOR: Final = 1e-16
+_MOST_FLOOR: Final = 1e-3
+_SURE: Final = 10.0
+
+
+class Losses(NamedTuple):
+    """Of each kind of factor."""
+
+    odometry: Loss
+    readings: Loss
+
+
+# Readings carry Huber's loss: a tag that moved, or a phantom, bends the map with bounded force only.
+DEFAULT_LOSSES: Final = Losses(SQUARES, huber(HUBER_THRESHOLD))
+PLAIN_SQUARES: Final = Losses(SQUARES, SQUARES)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All factors of one estimate, and where the variables sit.
+
+    Attributes:
+        anchor: (T,) a pose from which each tag was read.
+        measured: what somebody measured with a tape, if anything.
+    """
+
+    odometry: OdometryFactors
+    readings: ReadingFactors
+    prior: CalibrationPrior
+    columns: Columns
+    anchor: IntArray
+    measured: Measured = NOTHING_MEASURED
+
+    def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
+        """Half the sum of all losses: rho(|r|^2) of odometry and readings, |r|^2 of priors and what was measured."""
+        odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
+        readings, _ = losses_and_weights(losses.readings, self.readings.residual(state))
+        prior = (self.prior.residual(state) ** 2).sum()
+        return 0.5 * float(odometry.sum() + readings.sum() + prior + self.measured.sum_of_squares(state))
+
+    @cached_property
+    def arrowhead(self) -> Arrowhead:
+        """The order of elimination, settled once."""
+        return build_arrowhead(self.odometry, self.readings, self.prior, self.columns, self.measured)
+
+    @cached_property
+    def skeleton(self) -> Skeleton:
+        """The smaller problem for starting values."""
+        return build_skeleton(self.arrowhead)
+
+    def reweighed(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
+        """The same factors with other whitenings, (M, 3, 3) and (N, 2, 2); the order of elimination is kept."""
+        other = replace(
+            self,
+            odometry=replace(self.odometry, whitening=odometry),
+            readings=replace(self.readings, whitening=readings),
+        )
+        vars(other)["arrowhead"] = reweighed(
+            self.arrowhead, other.odometry, other.readings
+        )  # where the property has it
+        return other
+
+    @property
+    def n_residuals(self) -> int:
+        """How many measured numbers there are, priors apart."""
+        return self.odometry.motion.size + self.readings.value.size + self.measured.n_residuals
+
+    def moved(self, state: State, step: FloatArray) -> State:
+        """The state after a step (n,) in the tangent space.
+
+        A tag moves along with its anchor as on a rigid body, and by the rest of its step in the anchor's frame. To
+        first order that is adding the step. But where a whole region turns, poses go round on arcs (T o exp(delta)),
+        and so tags stay with them instead of leaving on the tangent: full steps work from farther away.
+        """
+        padded = np.append(step, 0.0)  # column -1: held
+        by_pose = padded[self.columns.poses]
+        poses = se2.compose(state.poses, se2.exp(by_pose))
+        before, turned = state.poses[self.anchor], by_pose[self.anchor]
+        from_anchor = se2.apply(se2.inverse(before), state.tags)
+        moved_along = turned[:, :2] + turned[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
+        to_anchor_axes = np.column_stack([np.zeros((len(before), 2)), -before[:, 2]])
+        own = se2.apply(to_anchor_axes, padded[self.columns.tags]) - moved_along
+        return State(
+            poses=poses,
+            tags=se2.apply(poses[self.anchor], from_anchor + own),
+            calibration=state.calibration + padded[self.columns.calibration],
+        )
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the solve ended and why.
+
+    Attributes:
+        costs: one an accepted step, the first before all of them but after relaxed ones.
+        n_linearised: how often all factors were linearised, rejected and relaxed steps included.
+    """
+
+    state: State
+    costs: tuple[float, ...]
+    reason: str
+    converged: bool
+    problem: Problem = field(repr=False)
+    losses: Losses = field(repr=False, default_factory=lambda: DEFAULT_LOSSES)
+    n_linearised: int = 0
+
+    @property
+    def cost(self) -> float:
+        """At the end."""
+        return self.costs[-1]
+
+    @cached_property
+    def factorisation(self) -> Factorisation:
+        """Of H at the end; with the floor added where H has no square root of its own.
+
+        Raises:
+            UnderDeterminedError: a variable is in no factor at all, or measurements are no numbers.
+        """
+        return self._factorised[0]
+
+    @property
+    def floor(self) -> float:
+        """Share of H's diagonal that had to be added for a square root in double precision; 0 where all is well."""
+        return self._factorised[1]
+
+    @cached_property
+    def _factorised(self) -> tuple[Factorisation, float]:
+        system, _ = self.problem.arrowhead.linearise(self.state, *self.losses)
+        return factorised(self.problem.arrowhead, system, 0.0)
+
+    @cached_property
+    def untied(self) -> Untied:
+        """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
+        problem = self.problem
+        return untied_parts(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
+
+    @property
+    def rank(self) -> int:
+        """How many of the `problem.columns.n` directions are tied down."""
+        return self.problem.columns.n - self.untied.n_directions
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Joint covariance (k, k) of k columns of the tangent vector, exact to first order; 0 where held (-1)."""
+        return self.factorisation.covariance(columns)
+
+    def pose_covariances(self, poses: IntArray) -> FloatArray:
+        """Covariance (k, 3, 3) of each of k poses, in its own axes; as `covariance`, but quick for many."""
+        return self.factorisation.pose_covariances(poses)
+
+    def condition(self) -> float:
+        """Estimate of H's condition number at the end."""
+        return self.factorisation.condition()
+
+    def relative_error(self) -> float:
+        """Estimate of what rounding, and the floor, do to covariances, as a share."""
+        return self.factorisation.relative_error()
+
+
+def solve(
+    problem: Problem,
+    start: State,
+    cost_tolerance: float = COST_TOLERANCE,
+    losses: Losses = DEFAULT_LOSSES,
+    relative_tolerance: float = _COST_ROUNDING,
+    relaxed_steps: int = 0,
+    threads: int = 1,
+    most_steps: int = MAX_STEPS,
+    most_tries: int = MAX_TRIES,
+) -> Solution:
+    """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
+
+    It stops, and `Solution.reason` says which of these it was:
+
+    - "converged": by its linear model the next step, Gauss-Newton's unless damping was needed up to here, would lower
+      the cost by no more than the tolerance. At an optimum that is before the first step.
+    - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
+    - "stopped after N steps", where `most_steps` or `most_tries` says so.
+    - "a variable is in no factor", "the cost is no number at the start".
+
+    What nothing ties down stays where it was: damping holds it.
+
+    Args:
+        problem: the factors.
+        start: values to begin from.
+        cost_tolerance: stop where the next step would lower the cost by less.
+        losses: of each kind of factor.
+        relative_tolerance: or by less than this share.
+        relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
+            that a start lies in.
+        threads: on how many cores chains are eliminated.
+        most_steps: how many to try, relaxed ones aside.
+        most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
+    """
+    arrowhead = problem.arrowhead
+    system, spare, rows = arrowhead.scratch
+    state, n_linearised = _relaxed(problem, start, relaxed_steps)
+    _, cost = arrowhead.linearise(state, *losses, out=system)
+    costs, n_linearised = [cost], n_linearised + 1
+    last, n_steps, damping, rolled = n_linearised + most_tries, 0, Damping(), False
+
+    def ended(reason: str, *, converged: bool) -> Solution:
+        return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
+
+    if not np.isfinite(cost):
+        return ended("the cost is no number at the start", converged=False)
+    while n_steps < most_steps and n_linearised < last:
+        n_steps += 1
+        try:
+            step, expected = _step(arrowhead, system, damping, rows, threads)
+        except UnderDeterminedError:
+            return ended("a variable is in no factor", converged=False)
+        if expected <= cost_tolerance + relative_tolerance * cost:
+            return ended("converged", converged=True)
+        taken = take_step(arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
+        n_linearised += taken.n_linearised
+        if not taken.cost < cost:
+            damping.step_rejected()
+            if damping.exhausted:
+                return ended("no step lowers the cost", converged=False)
+            continue
+        expected *= taken.share * (2.0 - taken.share)
+        gain = (cost - taken.cost) / expected
+        state, cost, rolled = taken.state, taken.cost, taken.rolled
+        system, spare = spare, system
+        costs.append(cost)
+        if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
+            return ended("converged", converged=True)
+        damping.step_taken(gain)
+    return ended(f"stopped after {n_steps} steps", converged=False)
+
+
+def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows, threads: int) -> tuple[FloatArray, float]:
+    """The next step, damped as it has to be, and by how much the linear model says that the cost falls.
+
+    Raises:
+        UnderDeterminedError: no damping helps.
+    """
+    factorisation, used = factorised(arrowhead, system, damping.share, rows, threads)
+    damping.needed(used)
+    step = -factorisation.solve_in_order(system.gradient)
+    return step, _expected_decrease(system, step, damping.share)
+
+
+def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cost: float) -> bool:
+    """Whether what a step leaves over is less than the tolerance, for who does not want the last digit.
+
+    Where the model is off by a share, the next gradient is that share of this one, what another step could bring its
+    square. By chance a model is right too early: not for who wants all.
+    """
+    left = _SURE * expected * (1.0 - gain) ** 2
+    return relative_tolerance > _COST_ROUNDING and left <= relative_tolerance * cost
+
+
+def factorised(
+    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None, threads: int = 1
+) -> tuple[Factorisation, float]:
+    """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
+
+    Raises:
+        UnderDeterminedError: no damping helps.
+    """
+    while True:
+        try:
+            return arrowhead.factorise(system, damping, out, threads), damping
+        except UnderDeterminedError:
+            if damping > _MOST_FLOOR:
+                raise
+            damping = max(10.0 * damping, _LEAST_FLOOR)
+
+
+def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
+    """After some relaxed steps, and how many there were: none where something is not tied down."""
+    if not steps:
+        return start, 0
+    try:
+        return problem.skeleton.relaxed(start, problem.anchor, steps), steps
+    except UnderDeterminedError:
+        return start, 0
+
+
+def _expected_decrease(system: System, step: FloatArray, damping: float) -> float:
+    """-g s - s H s / 2 of a step with (H + damping D) s = -g."""
+    along = -float(system.gradient @ step)
+    return 0.5 * (along + damping * diagonal_square(system, step)) if damping else 0.5 * along

@@ -1,0 +1,141 @@
+"""What stretches of drives tell of the calibration, each on its own.
+
+A drive is cut into a few stretches. Each is solved with a start and a place for each tag of its own, and with every
+number that might be freed open as far as it could be off at all. What it tells of the calibration is the information of
+that estimate less what it was given: no map is needed, no alignment, and a tag moved in between spoils nothing.
+The noise is the one that windows of the drive leave over (`goodness`), so that it matters little what was told of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.robot import FOCAL_SCALE, NoiseParameters, Robot
+from groundsbot.offline.corners import CornerSolution, corner_graph, has_corners, solve_corners
+from groundsbot.offline.local_map import WINDOW_M, LocalMap, fitted_windows
+from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
+from groundsbot.offline.noise import in_cell, spread_of_corners
+from groundsbot.offline.sam import Effort, Parameter, Solution, build_graph, solve
+from groundsbot.offline.self_calibration.robot import all_open
+from groundsbot.offline.self_calibration.selection import Told
+
+# Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
+_STRETCHES: Final = 5
+_FEWEST: Final = 2  # of a short one
+# Of what a drive is worth: for its windows, and for each stretch, which are smaller by as much.
+_WINDOWS_SHARE: Final = 0.2
+_SOLVING_SHARE: Final = 0.2
+
+# What a calibration of the camera with a board is good for, where robot.yaml does not say how good its focal length is.
+_FOCAL_SIGMA: Final = 1e-3
+
+
+class _Stretch(NamedTuple):
+    """What one stretch tells: information (C, C) and vector (C,) of parameters, which have the sigmas it was given."""
+
+    parameters: tuple[Parameter, ...]
+    information: FloatArray
+    vector: FloatArray
+
+
+def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Sequence[Effort], *, corners: bool) -> Told:
+    """What all stretches of some runs tell.
+
+    Args:
+        maps: of the runs, solved alone, with what robot.yaml says of the calibration.
+        noise: under which.
+        efforts: what is left of what each of them is worth.
+        corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
+    """
+    stretches: list[_Stretch] = []
+    priors: dict[tuple[object, ...], Parameter] = {}
+    for each, effort in zip(maps, efforts, strict=True):
+        priors |= {parameter[:3]: parameter for parameter in each.graph.parameters}
+        chain = _under_own_noise(each, noise, effort)
+        for first, end in _cuts(chain):
+            stretch = _told_by_stretch(chain, each, first, end, effort, corners=corners)
+            if stretch is not None:
+                stretches.append(stretch)
+                priors = {
+                    parameter[:3]: _as_given(parameter, chain.run.robot) for parameter in stretch.parameters
+                } | priors
+    parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
+    index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
+    n = len(parameters)
+    information, vector = np.zeros((len(stretches), n, n)), np.zeros((len(stretches), n))
+    for k, stretch in enumerate(stretches):
+        at = [index[parameter[:3]] for parameter in stretch.parameters]
+        information[k][np.ix_(at, at)], vector[k, at] = stretch.information, stretch.vector
+    return Told(parameters, information, vector)
+
+
+def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
+    """One that only corners depend on, with the sigma that the robot's file gives it: here a focal length is open."""
+    if parameter.name != FOCAL_SCALE:
+        return parameter
+    return parameter._replace(sigma=robot.focal_scale_sigma or _FOCAL_SIGMA)
+
+
+def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:
+    """The chain under the noise that its windows leave over, errors that neighbouring readings share included."""
+    least = least_shared(local_map.chain.readings)
+    windows = fitted_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
+    of_wheels, of_readings = windows.factors.tolist()
+    times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
+    own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
+    chain = local_map.chain.weighed(own)
+    if not len(chain.readings):
+        return chain
+    of_corners = spread_of_corners(chain, in_cell(chain), own.sigma_corner_px)
+    of_corners = np.maximum(windows.sharing.max(axis=-1), of_corners)
+    return replace(chain, readings=chain.readings.spread(windows.sharing, of_corners))
+
+
+def _cuts(chain: Chain) -> list[tuple[int, int]]:
+    """First keyframe and end of each stretch; they are equally long."""
+    along_m = chain.along_m
+    n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _STRETCHES))
+    ends = np.searchsorted(along_m, along_m[-1] * np.arange(1, n) / n, side="right").tolist()
+    return list(zip([0, *ends], [*ends, len(along_m)], strict=True))
+
+
+def _told_by_stretch(
+    chain: Chain, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
+) -> _Stretch | None:
+    """None where a stretch reads no tag or cannot be solved alone."""
+    part = chain.part(first, end)
+    if not len(part.readings):
+        return None
+    part = replace(part, run=replace(part.run, robot=all_open(part.run.robot)))
+    graph = build_graph([part])
+    calibration = {parameter[:3]: value for parameter, value in whole.calibration.items()}
+    start = graph.start(
+        whole.T_start_base[first:end], whole.tags_m, {p: calibration.get(p[:3], 0.0) for p in graph.parameters}
+    )
+    on_floor = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    effort.spend(on_floor)
+    solution: Solution | CornerSolution = on_floor
+    parameters = graph.parameters
+    if corners and has_corners(graph):
+        on_corners, spatial = corner_graph(graph, on_floor.state)
+        solution, parameters = solve_corners(on_corners.problem, spatial), on_corners.parameters
+    if not solution.converged:
+        return None
+    columns = solution.problem.columns.calibration
+    free = np.flatnonzero(columns >= 0)
+    return _without_prior(
+        tuple(parameters[i] for i in free), solution.covariance(columns[free]), solution.state.calibration[free]
+    )
+
+
+def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _Stretch:
+    """What an estimate (C,) with its covariance says beyond the sigmas about zero that its parameters were given."""
+    sigma = np.array([each.sigma for each in parameters])
+    information = np.linalg.inv(covariance / np.outer(sigma, sigma))  # in these sigmas
+    vector = information @ (value / sigma)
+    values, vectors = np.linalg.eigh(information - np.eye(len(sigma)))
+    own = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding may leave less than nothing
+    return _Stretch(parameters, own / np.outer(sigma, sigma), vector / sigma)

@@ -1,0 +1,161 @@
+"""What self-calibration does to a robot's file: sigmas of what is freed opened, and what was learnt written in."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from groundsbot.calib.robot import (
+    CAMERA_PARAMETERS,
+    EDGE_SHIFT,
+    FOCAL_SCALE,
+    IMPORTED_BATCH,
+    MOUNT_PARAMETERS,
+    TAG_SCALE,
+    TIME_OFFSET,
+    WHEEL_PARAMETERS,
+    Mount,
+    Robot,
+    TagBatch,
+    Wheels,
+)
+
+_WHEEL_SCALE, _WHEEL_RATIO, _TRACK_SCALE = WHEEL_PARAMETERS
+_MOUNT: Final = "mount_"
+
+# What may be freed, and how far off a robot can be at all: what lies beyond is no error of calibration but the file of
+# another robot, or a tag measured along another edge than its black border's. A freed number has this for its sigma,
+# beside which what drives tell is everything. Camera height is not among them: a floor shows only differences of it.
+LIMITS: Final[Mapping[str, float]] = MappingProxyType(
+    {
+        **dict.fromkeys(WHEEL_PARAMETERS, 0.1),
+        **dict.fromkeys((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), 0.2),  # rad; 11 degrees
+        "mount_x_m": 0.2,
+        "mount_y_m": 0.2,
+        TIME_OFFSET: 0.2,
+        EDGE_SHIFT: 1.0,
+        TAG_SCALE: 0.3,
+        FOCAL_SCALE: 0.1,
+    }
+)
+
+
+class Learnt(NamedTuple):
+    """A correction to what a robot.yaml says, and how well it is known."""
+
+    value: float
+    sigma: float
+
+
+class Owned(NamedTuple):
+    """A calibration number by name, and whose it is: a robot id, or a batch of tags with its family."""
+
+    owner: str
+    name: str
+
+
+def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
+    """The robot whose file leaves open what is freed, with these sigmas; its values stay."""
+
+    def sigma(name: str) -> float | None:
+        return freed.get(Owned(robot.robot_id, name))
+
+    wheels, mount = robot.wheels, robot.mount
+    track = sigma(_TRACK_SCALE)
+    changed: dict[str, object] = {
+        "radii_scale_sigma": sigma(_WHEEL_SCALE) or wheels.radii_scale_sigma,
+        "radii_ratio_sigma": sigma(_WHEEL_RATIO) or wheels.radii_ratio_sigma,
+        "track_m_sigma": track * wheels.track_m if track else wheels.track_m_sigma,
+    }
+    of_mount = {f"{field}_sigma": found for field in _mount_fields() if (found := sigma(_MOUNT + field))}
+    return robot.model_copy(
+        update={
+            "wheels": wheels.model_copy(update=changed),
+            "mount": mount.model_copy(update=of_mount),
+            "time_offset_s_sigma": sigma(TIME_OFFSET) or robot.time_offset_s_sigma,
+            "edge_shift_px_sigma": sigma(EDGE_SHIFT) or robot.edge_shift_px_sigma,
+            "focal_scale_sigma": sigma(FOCAL_SCALE) or robot.focal_scale_sigma,
+            "tags": [_opened_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
+            "imported_tag_scale_sigma": next(
+                (value for each, value in freed.items() if each.owner.startswith(IMPORTED_BATCH)),
+                robot.imported_tag_scale_sigma,
+            ),
+        }
+    )
+
+
+def all_open(robot: Robot) -> Robot:
+    """The robot with everything open that may ever be freed, as far as it can be off."""
+    own = {Owned(robot.robot_id, name): limit for name, limit in LIMITS.items()}
+    batches = [*(_of_batch(batch) for batch in robot.tags), Owned(IMPORTED_BATCH, TAG_SCALE)]
+    return opened(robot, own | dict.fromkeys(batches, LIMITS[TAG_SCALE]))
+
+
+def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
+    """The robot with what was learnt for its values and sigmas; what was not learnt stays. Its camera is not in it."""
+
+    def of(name: str) -> Learnt | None:
+        return learnt.get(Owned(robot.robot_id, name))
+
+    changed: dict[str, object] = {
+        "wheels": _corrected_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(_TRACK_SCALE)),
+        "mount": _corrected_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
+        "tags": [_corrected_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
+    }
+    if late := of(TIME_OFFSET):
+        changed |= {"time_offset_s": robot.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
+    if shift := of(EDGE_SHIFT):
+        changed |= {"edge_shift_px": robot.edge_shift_px + shift.value, "edge_shift_px_sigma": shift.sigma}
+    if focal := of(FOCAL_SCALE):
+        changed |= {"focal_scale_sigma": focal.sigma}
+    return robot.model_copy(update=changed)
+
+
+def _mount_fields() -> list[str]:
+    """Those of a mount that can be freed, without their `mount_`."""
+    return [name.removeprefix(_MOUNT) for name in LIMITS if name.startswith(_MOUNT)]
+
+
+def _of_batch(batch: TagBatch) -> Owned:
+    return Owned(f"{batch.batch} {batch.family}", TAG_SCALE)
+
+
+def _opened_batch(batch: TagBatch, sigma: float | None) -> TagBatch:
+    if sigma is None:
+        return batch
+    return batch.model_copy(update={"sigma_size_m": sigma * batch.sigma_size_m / batch.relative_sigma})
+
+
+def _corrected_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None, track: Learnt | None) -> Wheels:
+    changed: dict[str, float] = {}
+    if scale and ratio:
+        of_one = (scale.sigma**2 + 0.25 * ratio.sigma**2) ** 0.5  # as a share, of one radius
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            radius_m = getattr(wheels, f"radius_{side}_m") * (1.0 + scale.value) * (1.0 + sign * 0.5 * ratio.value)
+            changed |= {f"radius_{side}_m": radius_m, f"radius_{side}_m_sigma": radius_m * of_one}
+        changed |= {"radii_scale_sigma": scale.sigma, "radii_ratio_sigma": ratio.sigma}
+    if track:
+        track_m = wheels.track_m * (1.0 + track.value)
+        changed |= {"track_m": track_m, "track_m_sigma": track_m * track.sigma}
+    return wheels.model_copy(update=changed)
+
+
+def _corrected_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount:
+    changed: dict[str, float] = {}
+    for field, found in learnt.items():
+        if found:
+            changed |= {field: getattr(mount, field) + found.value, f"{field}_sigma": found.sigma}
+    return mount.model_copy(update=changed)
+
+
+def _corrected_batch(batch: TagBatch, scale: Learnt | None) -> TagBatch:
+    if scale is None:
+        return batch
+    larger = 1.0 + scale.value
+    reference_m = batch.sigma_size_m / batch.relative_sigma
+    return batch.model_copy(
+        update={
+            "default_size_m": None if batch.default_size_m is None else batch.default_size_m * larger,
+            "sizes_m": {tag_id: size_m * larger for tag_id, size_m in batch.sizes_m.items()},
+            "sigma_size_m": reference_m * larger * scale.sigma,
+        }
+    )

@@ -1,0 +1,128 @@
+"""A camera of Video4Linux, read through OpenCV: its own JPEG as it comes, its own stamps where they are sane."""
+
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.onboard.camera.camera import Camera, CameraLostError, CameraSettings, Frame
+from groundsbot.onboard.log import Picture, StampSource, without_padding
+from groundsbot.onboard.process import RunClock
+
+_NS_PER_S: Final = 1_000_000_000
+_NS_PER_MS: Final = 1_000_000
+_OLDEST_STAMP_NS: Final = _NS_PER_S  # a driver's stamp further in the past is of another clock
+_EXPOSURE_UNIT_S: Final = 1e-4
+_MANUAL_EXPOSURE: Final = 1
+_MJPG: Final = cv2.VideoWriter.fourcc(*"MJPG")
+_GREY_FIRST: Final = tuple(cv2.VideoWriter.fourcc(*name) for name in ("YUYV", "YUY2"))
+_GREY_SECOND: Final = (cv2.VideoWriter.fourcc(*"UYVY"),)
+
+
+class V4l2Camera(Camera):
+    """A camera of Video4Linux.
+
+    The camera's own JPEG is taken as it is; of YUV only the grey. A camera that gives neither has OpenCV convert.
+
+    The driver's stamp is taken for the start of the exposure; half of `exposure_s`, where set, leads to its middle.
+    What remains is the constant `time_offset_s` of robot.yaml. A stamp that is not of the last second of the monotonic
+    clock, or not later than the one before, is not believed: the picture's arrival stands in for it.
+    """
+
+    def __init__(self, settings: CameraSettings, clock: RunClock) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._capture: cv2.VideoCapture | None = None
+        self._format = 0
+        self._sequence = 0
+        self._last_driver_ns = 0
+
+    def open(self) -> list[str]:
+        """See Camera."""
+        device = self._settings.device
+        if not Path(device).exists():
+            raise CameraLostError(f"camera {device} is absent")
+        capture = cv2.VideoCapture(device, cv2.CAP_V4L2)
+        if not capture.isOpened():
+            capture.release()
+            raise CameraLostError(f"camera {device} cannot be opened: in use by another program, or no permission")
+        self._capture = capture
+        capture.set(cv2.CAP_PROP_FOURCC, float(_MJPG))  # first: the sizes to be had depend on it
+        refused = [
+            f"{name} is {actual:g}, asked for {wanted:g}"
+            for name, setting, wanted in self._wanted()
+            if not _is_set(actual := _set(capture, setting, wanted), wanted)
+        ]
+        self._format = int(capture.get(cv2.CAP_PROP_FOURCC))
+        as_it_comes = self._format in (_MJPG, *_GREY_FIRST, *_GREY_SECOND)
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0.0 if as_it_comes else 1.0)
+        if self._format != _MJPG:
+            refused.insert(0, f"format is {_name(self._format)}, asked for MJPG: kept pictures are encoded here")
+        return refused
+
+    def read(self, timeout_s: float) -> list[Frame]:
+        """See Camera. OpenCV waits as long as `OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT` says, whatever `timeout_s`."""
+        if self._capture is None:
+            raise CameraLostError(f"camera {self._settings.device} is not open")
+        done, picture = self._capture.read()
+        receive_ns = self._clock.now_ns()
+        if not done:
+            raise CameraLostError(f"camera {self._settings.device} gives no pictures")
+        stamp_ns, source = self._stamp(receive_ns)
+        self._sequence += 1
+        return [Frame(self._picture(np.asarray(picture, np.uint8)), stamp_ns, receive_ns, source, self._sequence - 1)]
+
+    def close(self) -> None:
+        """See Camera."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def _stamp(self, receive_ns: int) -> tuple[int, "StampSource | int"]:
+        """The middle of the exposure as well as it is known, and from where."""
+        if self._capture is None:
+            return receive_ns, StampSource.STAMP_SOURCE_ARRIVAL
+        driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * _NS_PER_MS)
+        is_later, self._last_driver_ns = driver_ns > self._last_driver_ns, driver_ns
+        stamp_ns = self._clock.from_monotonic(driver_ns)
+        if not (is_later and 0 <= receive_ns - stamp_ns < _OLDEST_STAMP_NS):
+            return receive_ns, StampSource.STAMP_SOURCE_ARRIVAL
+        return stamp_ns + round((self._settings.exposure_s or 0.0) / 2 * _NS_PER_S), StampSource.STAMP_SOURCE_CAMERA
+
+    def _picture(self, picture: NDArray[np.uint8]) -> Picture:
+        if self._format == _MJPG and 1 in picture.shape[:2]:  # one row of bytes
+            return without_padding(picture.tobytes())
+        if picture.ndim == 3 and picture.shape[2] == 2:
+            return np.ascontiguousarray(picture[:, :, 0 if self._format in _GREY_FIRST else 1])
+        return picture
+
+    def _wanted(self) -> list[tuple[str, int, float]]:
+        settings = self._settings
+        wanted = [
+            ("width_px", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
+            ("height_px", cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
+            ("camera_fps", cv2.CAP_PROP_FPS, settings.fps),
+        ]
+        if settings.exposure_s is not None:
+            wanted.append(("manual exposure", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE))
+            wanted.append(
+                ("camera_exposure_s / 0.1 ms", cv2.CAP_PROP_EXPOSURE, round(settings.exposure_s / _EXPOSURE_UNIT_S))
+            )
+        if settings.gain is not None:
+            wanted.append(("camera_gain", cv2.CAP_PROP_GAIN, settings.gain))
+        return wanted
+
+
+def _set(capture: cv2.VideoCapture, setting: int, wanted: float) -> float:
+    capture.set(setting, wanted)
+    return capture.get(setting)
+
+
+def _is_set(actual: float, wanted: float) -> bool:
+    return abs(actual - wanted) <= 0.01 * abs(wanted)
+
+
+def _name(fourcc: int) -> str:
+    return fourcc.to_bytes(4, "little", signed=fourcc < 0).decode("ascii", "replace")

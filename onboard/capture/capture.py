@@ -1,0 +1,193 @@
+"""Takes pictures of a calibration board with the robot's camera: a thin loop around `CaptureGuide`."""
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.calib.board import DEFAULT_BOARD
+from groundsbot.calib.foundation import counted, is_jpeg, written_whole
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
+from groundsbot.onboard.capture.guide import Advice, CaptureGuide
+from groundsbot.onboard.detection import save_board
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import Picture, decode_grey, to_grey
+from groundsbot.onboard.process import RunClock
+
+_NS_PER_S: Final = 1_000_000_000
+_READ_S: Final = 0.1
+_SILENT_NS: Final = 5 * _NS_PER_S
+_LOOK_NS: Final = _NS_PER_S  # between two pictures to look at
+_PICTURE_NAME: Final = re.compile(r"(\d{4,9})\.(?:png|jpg)")
+
+Show = Callable[[Advice, CaptureGuide], None]
+
+
+class Capture:
+    """Pictures of one board from one camera into one folder, which may hold some of an earlier time.
+
+    Attributes:
+        guide: which pictures to keep.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        clock: RunClock,
+        guide: CaptureGuide,
+        output: Path,
+        looked_at: Path,
+        show: Show,
+        say: Callable[[str], None],
+    ) -> None:
+        """Reads the pictures that are there already.
+
+        Args:
+            camera: to take pictures with.
+            clock: the camera's.
+            guide: of the board.
+            output: folder for the pictures, 0001.jpg or .png and so on.
+            looked_at: where to save what the camera sees, as a JPEG, with the corners found.
+            show: told what to do next, after each picture.
+            say: told once what is worth knowing besides.
+
+        Raises:
+            OnboardError: the folder holds something else.
+        """
+        self.guide = guide
+        self._camera = camera
+        self._output = output
+        self._looked_at: Path | None = looked_at
+        self._show = show
+        self._say = say
+        self._clock = clock
+        self._size_px: tuple[int, int] | None = None
+        self._next_number = 1
+        self._next_look_ns = 0
+        if output.exists():
+            self._remember()
+
+    def run(self, stop: threading.Event) -> None:
+        """Takes pictures until there are enough, `stop` is set, or a video is over.
+
+        Raises:
+            OnboardError: the camera is absent or fell silent, or a picture cannot be written; those taken are kept.
+        """
+        try:
+            for refused in self._camera.open():
+                self._say(refused)
+            try:
+                self._take_pictures(stop)
+            except CameraEndedError as error:
+                self._say(str(error))
+        finally:
+            self._camera.close()
+
+    def _take_pictures(self, stop: threading.Event) -> None:
+        last_ns = self._clock.now_ns()
+        while not stop.is_set() and not self.guide.enough:
+            frames = self._camera.read(_READ_S)
+            now_ns = self._clock.now_ns()
+            if not frames and now_ns - last_ns > _SILENT_NS:
+                raise CameraLostError(
+                    f"the camera gave no picture for {_SILENT_NS // _NS_PER_S} s; check devices.camera"
+                )
+            last_ns = now_ns if frames else last_ns
+            if frames:  # the newest: what a person holds now
+                self.handle_frame(frames[-1])
+
+    def handle_frame(self, frame: Frame) -> None:
+        """Looks at one picture, and keeps it if it is of use.
+
+        Raises:
+            OnboardError: it is of another size than those before, or cannot be written.
+        """
+        try:
+            grey = decode_grey(frame.picture) if isinstance(frame.picture, bytes) else to_grey(frame.picture)
+        except OnboardError as error:  # a cable that loses bytes; the next one may be whole
+            self._show(Advice(False, str(error), None), self.guide)
+            return
+        self._check_size(grey, "the camera gives")
+        advice = self.guide.handle_frame(grey, frame.stamp_ns)
+        if advice.keep:
+            self._write(frame.picture)
+        if advice.keep or frame.receive_ns >= self._next_look_ns:
+            self._next_look_ns = frame.receive_ns + _LOOK_NS
+            self._save_to_look_at(frame.picture, advice)
+        self._show(advice, self.guide)
+
+    def _save_to_look_at(self, picture: Picture, advice: Advice) -> None:
+        if self._looked_at is None:
+            return
+        try:
+            save_board(picture, advice.seen, self.guide.spread, self._looked_at)
+        except OSError as error:  # robot.yaml may lie where only an administrator writes
+            self._say(
+                f"{self._looked_at}: cannot be written ({error.strerror}); --picture names another file to look at"
+            )
+            self._looked_at = None
+
+    def _write(self, picture: Picture) -> None:
+        """As it came, or as PNG: nothing is lost."""
+        is_file = isinstance(picture, bytes)
+        data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1].tobytes()
+        path = self._output / f"{self._next_number:04}.{'jpg' if is_file and is_jpeg(data) else 'png'}"
+        with _told(path):
+            self._output.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as temporary:
+                temporary.write_bytes(data)
+        self._next_number += 1
+
+    def _remember(self) -> None:
+        if not self._output.is_dir():
+            raise OnboardError(f"{self._output}: is no folder; name one for the pictures")
+        for path in sorted(self._output.glob("[!.]*")):  # a file half written when the power went begins with a dot
+            named = _PICTURE_NAME.fullmatch(path.name)
+            if named is None:
+                raise OnboardError(f"{path}: is no picture of an earlier capture; name a new folder")
+            try:
+                grey = decode_grey(path.read_bytes())
+            except (OSError, OnboardError) as error:
+                raise OnboardError(f"{path}: cannot be used ({error}); remove it, or name a new folder") from error
+            self._check_size(grey, f"{path.name} in it has")
+            self.guide.remember(grey)
+            self._next_number = int(named[1]) + 1
+
+    def _check_size(self, grey: NDArray[np.uint8], whose: str) -> None:
+        size_px = (grey.shape[1], grey.shape[0])
+        if self._size_px is None:
+            self._size_px = size_px
+        if self._size_px != size_px:
+            before, now = ("{}x{} px".format(*each) for each in (self._size_px, size_px))
+            raise OnboardError(f"{self._output}: is for pictures of {before} but {whose} {now}; name a new folder")
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OnboardError(
+            f"{path}: cannot be written ({error.strerror}); make room, or name a place you may write to"
+        ) from error
+
+
+def summary(guide: CaptureGuide, output: Path) -> list[str]:
+    """How it ended, and what comes next, in words."""
+    if not guide.kept:
+        return [f"{output}: no picture was taken"]
+    lines = [f"{output}: {counted(guide.kept, 'picture')}"]
+    if guide.missing:
+        lines.append(f"still missing: {'; '.join(guide.missing)}")
+    elif not guide.enough:
+        lines.append(f"{guide.wanted} are wanted")
+    else:
+        told = "" if guide.board == DEFAULT_BOARD else f" --board {guide.board.specification}"
+        lines.append(f"next: groundsbot-calib camera {output} -o camera.yaml{told}")
+    return lines

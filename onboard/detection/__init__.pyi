@@ -1,0 +1,17 @@
+from .child_process import ChildDetector, DetectionResult, DetectorSettings
+from .drawing import save_board, save_drawn
+from .messages import detections_message, tag_message
+from .tag_detector import REFINED_CORNERS, Detection, TagDetector
+
+__all__ = [
+    "REFINED_CORNERS",
+    "ChildDetector",
+    "Detection",
+    "DetectionResult",
+    "DetectorSettings",
+    "TagDetector",
+    "detections_message",
+    "save_board",
+    "save_drawn",
+    "tag_message",
+]

@@ -1,0 +1,68 @@
+"""What was found, drawn into the picture it was found in, for people."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.calib.board import SeenBoard, Spread, region_shares
+from groundsbot.calib.foundation import written_whole
+from groundsbot.onboard.detection.tag_detector import Detection
+from groundsbot.onboard.log import Picture, decode, encode_jpeg
+
+_GREEN: Final = (60, 220, 60)
+_RED: Final = (40, 40, 255)
+_WIDTH_PX: Final = 2
+_FRACTION_BITS: Final = 3
+_QUALITY: Final = 90
+
+
+def save_drawn(picture: Picture, detections: Sequence[Detection], path: Path) -> None:
+    """Writes a JPEG: tags outlined, their ids in them, their first corners (top left) marked.
+
+    Raises:
+        OnboardError: it is no picture.
+        OSError: it cannot be written.
+    """
+    drawn = _in_colour(picture)
+    for each in detections:
+        corners = np.rint(each.corners_px * (1 << _FRACTION_BITS)).astype(np.int32)
+        cv2.polylines(drawn, [corners], True, _GREEN, _WIDTH_PX, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.circle(drawn, np.rint(each.corners_px[0]).astype(int).tolist(), 2 * _WIDTH_PX, _RED, -1, cv2.LINE_AA)
+        middle = np.rint(each.corners_px.mean(axis=0)).astype(int).tolist()
+        cv2.putText(drawn, str(each.tag_id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.7, _RED, _WIDTH_PX, cv2.LINE_AA)
+    _save(drawn, path)
+
+
+def save_board(picture: Picture, seen: SeenBoard | None, spread: Spread, path: Path) -> None:
+    """Writes a JPEG: the board's corners found, and a frame around each region that the views so far do not cover.
+
+    Raises:
+        OnboardError: it is no picture.
+        OSError: it cannot be written.
+    """
+    drawn = _in_colour(picture)
+    size_px = np.array([drawn.shape[1], drawn.shape[0]])
+    for row in range(3):
+        for column in range(3):
+            if not spread.covered(row, column):
+                first, last = (np.rint(size_px * share).astype(int) for share in region_shares(row, column))
+                cv2.rectangle(drawn, (first + 4).tolist(), (last - 5).tolist(), _RED, _WIDTH_PX, cv2.LINE_AA)
+    for corner in seen.pixels if seen is not None else ():
+        at = np.rint(corner * (1 << _FRACTION_BITS)).astype(int).tolist()
+        cv2.circle(drawn, at, (2 * _WIDTH_PX) << _FRACTION_BITS, _GREEN, -1, cv2.LINE_AA, _FRACTION_BITS)
+    _save(drawn, path)
+
+
+def _in_colour(picture: Picture) -> NDArray[np.uint8]:
+    seen = decode(picture) if isinstance(picture, bytes) else picture
+    return np.asarray(cv2.cvtColor(seen, cv2.COLOR_GRAY2BGR) if seen.ndim == 2 else seen.copy(), np.uint8)
+
+
+def _save(drawn: NDArray[np.uint8], path: Path) -> None:
+    data = encode_jpeg(drawn, _QUALITY)
+    with written_whole(path) as temporary, temporary.open("xb") as file:  # never through a link
+        file.write(data)

@@ -1,0 +1,96 @@
+"""What stands at the head of every file of a log, so that each opens alone."""
+
+import importlib.metadata
+from typing import Final
+
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+
+from groundsbot.calib.camera import CameraModel
+from groundsbot.calib.robot import Mount, Robot
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log.messages import CameraCalibration, FrameTransform, RunInfo, timestamp
+
+BASE_FRAME: Final = "base"
+CAMERA_FRAME: Final = "camera"
+
+
+def log_head(
+    robot: Robot, robot_yaml: str, camera: CameraModel | None, run_id: str, start_ns: int, run_epoch_ns: int
+) -> dict[str, Message]:
+    """The messages at the head of a file, by topic.
+
+    Args:
+        robot: the robot.
+        robot_yaml: the text that it was read from, kept whole in the log.
+        camera: its camera; None for a run of wheels only.
+        run_id: names the run among all runs of this robot.
+        start_ns: start of the run on its clock.
+        run_epoch_ns: realtime minus monotonic, frozen at the start.
+    """
+    run = RunInfo(
+        run_id=run_id,
+        robot_id=robot.robot_id,
+        software_version=importlib.metadata.version("groundsbot"),
+        robot_yaml=robot_yaml,
+        run_epoch_ns=run_epoch_ns,
+    )
+    head: dict[str, Message] = {"/run": run}
+    if camera is not None:
+        head["/camera/calibration"] = calibration_message(camera, start_ns)
+        head["/tf"] = mount_message(robot.mount, start_ns)
+    return head
+
+
+def calibration_message(camera: CameraModel, stamp_ns: int) -> CameraCalibration:
+    """A camera as Foxglove's schema has it; distortion models under ROS's names."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    return CameraCalibration(
+        timestamp=timestamp(stamp_ns),
+        frame_id=CAMERA_FRAME,
+        width=camera.width_px,
+        height=camera.height_px,
+        distortion_model=camera.distortion_model,
+        D=[float(value) for value in camera.distortion],
+        K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def camera_from_message(message: CameraCalibration) -> CameraModel:
+    """The camera that a log was recorded with.
+
+    Raises:
+        LogError: the calibration is incomplete.
+        CalibError: or its values are of no camera.
+    """
+    if len(message.K) != 9:
+        raise LogError(f"/camera/calibration: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
+    fx, _, cx, _, fy, cy, *_ = message.K
+    return CameraModel(
+        name=message.frame_id,
+        width_px=message.width,
+        height_px=message.height,
+        fx_px=fx,
+        fy_px=fy,
+        cx_px=cx,
+        cy_px=cy,
+        distortion_model=message.distortion_model,
+        distortion=tuple(message.D),
+    )
+
+
+def mount_message(mount: Mount, stamp_ns: int) -> FrameTransform:
+    """Where the camera sits: points in camera to points in base."""
+    translation, rotation = mount.T_base_camera.as_components()
+    x, y, z = translation.tolist()
+    qx, qy, qz, qw = rotation.as_quat(canonical=True).tolist()
+    return FrameTransform(
+        timestamp=timestamp(stamp_ns),
+        parent_frame_id=BASE_FRAME,
+        child_frame_id=CAMERA_FRAME,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )

@@ -1,0 +1,73 @@
+"""Pictures as bytes and as arrays."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.calib.foundation import JPEG_END, MOST_PIXELS, claimed_size, is_complete
+from groundsbot.onboard.errors import OnboardError
+
+Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
+
+
+def decode_grey(encoded: bytes) -> NDArray[np.uint8]:
+    """A PNG or JPEG file's bytes as a grey picture [height, width].
+
+    Raises:
+        OnboardError: no picture, or not a whole one.
+    """
+    return _decode(encoded, cv2.IMREAD_GRAYSCALE)
+
+
+def decode(encoded: bytes) -> NDArray[np.uint8]:
+    """A PNG or JPEG file's bytes as it was taken: grey [height, width] or BGR [height, width, 3].
+
+    Raises:
+        OnboardError: no picture, or not a whole one.
+    """
+    return _decode(encoded, cv2.IMREAD_ANYCOLOR)
+
+
+def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
+    if not is_complete(encoded):
+        raise OnboardError(f"picture of {len(encoded)} bytes is cut short or neither PNG nor JPEG")
+    width_px, height_px = claimed_size(encoded)
+    if not 0 < width_px * height_px <= MOST_PIXELS:
+        raise OnboardError(f"picture claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all")
+    picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), mode)
+    if picture is None:
+        raise OnboardError(f"picture of {len(encoded)} bytes cannot be decoded")
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
+    """A grey or BGR picture as JPEG.
+
+    Raises:
+        OnboardError: it cannot be encoded.
+    """
+    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise OnboardError(f"picture of shape {picture.shape} cannot be encoded as JPEG")
+    return data.tobytes()
+
+
+def without_padding(encoded: bytes) -> bytes:
+    """A JPEG without what a camera's driver leaves behind its end mark."""
+    end = encoded.rfind(JPEG_END)
+    return encoded[: end + len(JPEG_END)] if end >= 0 else encoded
+
+
+def to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey [height, width] or BGR [height, width, 3] picture as grey.
+
+    Raises:
+        OnboardError: it is empty or of another kind.
+    """
+    if picture.size == 0 or picture.dtype != np.uint8:
+        raise OnboardError(f"picture of shape {picture.shape} and type {picture.dtype} is empty or not of bytes")
+    if picture.ndim == 2:
+        return picture
+    if picture.ndim != 3 or picture.shape[2] != 3:
+        raise OnboardError(f"picture of shape {picture.shape} is neither grey nor BGR")
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -1,0 +1,309 @@
+"""The chunks of an MCAP file, however damaged: each with its checksum checked, one in memory at a time."""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log.losses import Damage
+from groundsbot.onboard.log.reading.allowance import Allowance
+from groundsbot.onboard.log.reading.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_text
+from groundsbot.onboard.log.reading.summary import Summary, read_summary
+
+# A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
+RECORD_LIMIT_BYTES: Final = 64 << 20
+# Our chunks shrink to an eighth at best; a bomb's to a thousandth.
+_UNFOLDED_SHARE: Final = 24
+_SEARCH_SHARE: Final = 4  # of false beginnings of chunks that a search may check
+_WINDOW_BYTES: Final = 1 << 20
+_LOOK_BYTES: Final = 4 << 20  # how far to look for a chunk in what does not begin as MCAP
+_DATA_END_BYTES: Final = 4
+_TIME_LIMIT_NS: Final = 1 << 63
+_CHUNK_OPCODE: Final = bytes([Opcode.CHUNK])
+_SMALLEST_CHUNK_BYTES: Final = CHUNK_HEAD.size + U32.size + U64.size
+
+
+class _BadRecordError(Exception):
+    """What stands here cannot be read; `foreign`: it is whole, but nothing of ours."""
+
+    def __init__(self, reason: str, foreign: bool = False) -> None:
+        super().__init__(reason)
+        self.foreign = foreign
+
+
+class _Record(NamedTuple):
+    opcode: int
+    content: bytes
+    following: int
+
+
+class ChunkReader:
+    """Iterates over the uncompressed contents of a file's chunks.
+
+    After damage it goes on with the next whole chunk, found by its form and its checksum.
+
+    Attributes:
+        summary: of a finished file whose index is whole.
+        n_chunks: yielded so far.
+        is_finished: whether the end mark was met.
+        end_offset: where reading ended, if it was not.
+        offset: behind the chunk yielded last.
+    """
+
+    def __init__(
+        self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None], allowance: Allowance | None = None
+    ) -> None:
+        """Looks at the file's beginning and end.
+
+        Args:
+            stream: the file.
+            path: what to call it.
+            on_damage: told of each place that cannot be read; may raise to end the reading.
+            allowance: for what the file's size is not worth; one of its own where None.
+
+        Raises:
+            LogError: empty, or not MCAP.
+        """
+        self.n_chunks = 0
+        self.is_finished = False
+        self.end_offset = self.offset = 0
+        self._stream = stream
+        self._path = path
+        self._on_damage = on_damage
+        self._size = stream.seek(0, 2)
+        self._crc: int | None = zlib.crc32(MCAP0_MAGIC)
+        self._allowance = allowance or Allowance()
+        self._unfolded = self._unfolded_drawn = 0  # drawn: from the allowance
+        self._searched = self._searched_drawn = 0
+        stream.seek(0)
+        magic = stream.read(len(MCAP0_MAGIC))
+        if not magic:
+            raise LogError(f"{path}: is empty (0 bytes); choose another log")
+        self._starts_well = magic == MCAP0_MAGIC
+        self.summary: Summary | None = read_summary(stream, self._size, RECORD_LIMIT_BYTES)
+        self._end = self._size if self.summary is None else self.summary.data_end
+        if not self._starts_well and self.summary is None and self._next_chunk(0, _LOOK_BYTES) is None:
+            raise LogError(
+                f"{path}: is not an MCAP file; a log ends in .mcap and is written by record, simulate or import"
+            )
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yields each whole chunk's records."""
+        offset = trusted = len(MCAP0_MAGIC)  # trusted: up to here the form has been proved by checksums
+        if not self._starts_well:
+            self._tell(0, len(MCAP0_MAGIC), "the file's first bytes are not MCAP's")
+        while True:
+            try:
+                record = self._record_at(offset)
+                if record is None:
+                    return
+                if record.opcode == Opcode.CHUNK:
+                    chunk = self._uncompressed(record.content)
+                    self.n_chunks += 1
+                    self.offset = record.following
+                    yield chunk
+                    trusted = record.following
+                offset = record.following
+            except _BadRecordError as bad:
+                found = self._next_chunk(trusted + 1 if offset == trusted else trusted)
+                self._report(offset, trusted, found, bad)
+                if found is None:
+                    self.end_offset = self._end
+                    return
+                offset = trusted = found
+
+    def _report(self, offset: int, trusted: int, found: int | None, bad: _BadRecordError) -> None:
+        self._crc = None
+        start = offset if found is None or found > offset else trusted
+        until = self._end if found is None else found
+        self._tell(start, until - start, str(bad))
+
+    def _tell(self, offset: int, n_bytes: int, reason: str) -> None:
+        self._on_damage(Damage(self._path, offset, n_bytes, reason))
+
+    def _record_at(self, offset: int) -> _Record | None:
+        """The record there; None at the end of the data. What is no chunk has no content."""
+        self._stream.seek(offset)
+        head = self._stream.read(RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            if head:
+                self._tell(offset, len(head), "torn")
+            self.end_offset = offset
+            return None
+        opcode, length = RECORD_HEAD.unpack(head)
+        following = offset + RECORD_HEAD.size + length
+        if opcode == Opcode.DATA_END:
+            self._check_end(offset, length)
+            return None
+        if following > self._size:
+            raise _BadRecordError(f"a record of {length} bytes does not fit in the file")
+        content = b""
+        if opcode in _READ_WHOLE:
+            if length > RECORD_LIMIT_BYTES:
+                raise _BadRecordError(f"a record of {length} bytes, limit {RECORD_LIMIT_BYTES}")
+            content = self._stream.read(length)
+            self._add_to_crc(head, content)
+            _check_form(opcode, content)
+        elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):  # somebody else's: passed by
+            self._add_to_crc(head)
+            for start in range(0, length, _WINDOW_BYTES):
+                self._add_to_crc(self._stream.read(min(_WINDOW_BYTES, length - start)))
+        elif opcode == Opcode.MESSAGE:
+            raise _BadRecordError("a message outside a chunk carries no checksum; rewrite the log in chunks")
+        else:
+            raise _BadRecordError(f"no record begins here (code {opcode})")
+        return _Record(opcode, content, following)
+
+    def _add_to_crc(self, *pieces: bytes) -> None:
+        for piece in pieces:
+            if self._crc is not None:
+                self._crc = zlib.crc32(piece, self._crc)
+
+    def _check_end(self, offset: int, length: int) -> None:
+        """Makes sure that this is the end: one flipped bit makes an end mark of another record."""
+        if length != _DATA_END_BYTES or offset + RECORD_HEAD.size + length > self._size:
+            raise _BadRecordError("the end mark is damaged")
+        if self.summary is not None and offset != self.summary.data_end:
+            raise _BadRecordError("an end mark where the data do not end")
+        if self.summary is None:
+            if self._next_chunk(offset + RECORD_HEAD.size) is not None:
+                raise _BadRecordError("an end mark where the data do not end")
+            self._tell(offset, 0, "the index at the end is missing or damaged; no message is lost by that")
+        self.is_finished = True
+        (crc,) = U32.unpack(self._stream_at(offset + RECORD_HEAD.size, U32.size))
+        if crc and self._crc is not None and crc != self._crc:
+            self._tell(offset, 0, "the checksum over the whole data does not fit, though each chunk's own does")
+
+    def _stream_at(self, offset: int, n_bytes: int) -> bytes:
+        self._stream.seek(offset)
+        return self._stream.read(n_bytes)
+
+    def _next_chunk(self, start: int, end: int | None = None) -> int | None:
+        """Where the next whole chunk begins, from `start` on."""
+        for offset in self._candidates(start, self._end if end is None else min(end, self._end)):
+            head = self._stream_at(offset, RECORD_HEAD.size)
+            content = self._stream.read(RECORD_HEAD.unpack(head)[1])
+            self._searched += len(content)
+            if not self._may_search():
+                return None
+            before = self._unfolded, self._unfolded_drawn, self._allowance.unfolded_bytes
+            try:
+                self._uncompressed(content)
+            except _BadRecordError as bad:
+                if bad.foreign:
+                    return offset
+                continue
+            finally:
+                self._searched += self._unfolded - before[0]
+                self._unfolded, self._unfolded_drawn, self._allowance.unfolded_bytes = before
+            return offset
+        return None
+
+    def _candidates(self, start: int, end: int) -> Iterator[int]:
+        """Offsets at which the bytes have a chunk's form."""
+        needed = RECORD_HEAD.size + _SMALLEST_CHUNK_BYTES + len("zstd")
+        while start + RECORD_HEAD.size + _SMALLEST_CHUNK_BYTES <= end:
+            window = self._stream_at(start, _WINDOW_BYTES)
+            if len(window) <= needed:
+                window += b"\0" * needed  # so that forms can be looked at up to the end
+            last = len(window) - needed
+            at = window.find(_CHUNK_OPCODE, 0, last)
+            while at >= 0:
+                if self._has_chunk_form(window, at, start + at):
+                    yield start + at
+                at = window.find(_CHUNK_OPCODE, at + 1, last)
+            start += last
+
+    def _has_chunk_form(self, window: bytes, at: int, offset: int) -> bool:
+        _, length = RECORD_HEAD.unpack_from(window, at)
+        if not _SMALLEST_CHUNK_BYTES <= length <= min(RECORD_LIMIT_BYTES, self._end - offset - RECORD_HEAD.size):
+            return False
+        first_ns, last_ns, _, _ = CHUNK_HEAD.unpack_from(window, at + RECORD_HEAD.size)
+        position = at + RECORD_HEAD.size + CHUNK_HEAD.size
+        (name_bytes,) = U32.unpack_from(window, position)
+        if name_bytes > len("zstd") or not first_ns <= last_ns < _TIME_LIMIT_NS:
+            return False
+        (data_bytes,) = U64.unpack_from(window, position + U32.size + name_bytes)
+        return bool(data_bytes == length - _SMALLEST_CHUNK_BYTES - name_bytes)
+
+    def _uncompressed(self, content: bytes) -> bytes:
+        """A chunk's records; the stream stands at its end."""
+        try:
+            _, _, size, crc = CHUNK_HEAD.unpack_from(content)
+            compression, position = read_text(content, CHUNK_HEAD.size)
+            (length,) = U64.unpack_from(content, position)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise _BadRecordError(f"a chunk is damaged: {error}") from error
+        data = content[position + U64.size :]
+        if len(data) != length:  # more would hide what follows
+            raise _BadRecordError(f"a chunk is damaged: holds {len(data)} bytes, not the {length} it claims")
+        self._take_unfolded(size)
+        data = _decompressed(data, compression, size)
+        if len(data) != size or crc == 0 or zlib.crc32(data) != crc:
+            raise _BadRecordError("a chunk is damaged: its checksum does not fit")
+        return data
+
+    def _take_unfolded(self, size: int) -> None:
+        """Refuses a chunk that unfolds to more than the file is worth up to here and the allowance still gives."""
+        worth = _UNFOLDED_SHARE * self._stream.tell()
+        limit = min(RECORD_LIMIT_BYTES, worth + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
+        if size > limit:
+            raise _BadRecordError(f"a chunk claims to unfold to {size} bytes, limit {limit}")
+        self._unfolded += size
+        drawn = max(self._unfolded_drawn, self._unfolded - worth)
+        self._allowance.unfolded_bytes -= drawn - self._unfolded_drawn
+        self._unfolded_drawn = drawn
+
+    def _may_search(self) -> bool:
+        """Whether what has been searched is still worth it."""
+        drawn = max(self._searched_drawn, self._searched - _SEARCH_SHARE * self._size)
+        if drawn - self._searched_drawn > self._allowance.searched_bytes:
+            return False
+        self._allowance.searched_bytes -= drawn - self._searched_drawn
+        self._searched_drawn = drawn
+        return True
+
+
+_READ_WHOLE: Final = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
+
+
+def _decompressed(data: bytes, compression: str, size: int) -> bytes:
+    if not compression:
+        return data
+    if compression != "zstd":
+        raise _BadRecordError(f"a chunk is compressed by {compression!r}; rewrite the log with zstd", foreign=True)
+    try:
+        if zstandard.frame_content_size(data) not in (size, -1):  # else a small chunk could unfold to anything
+            raise _BadRecordError(f"a chunk is damaged: its length is not the {size} bytes it claims")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise _BadRecordError(f"a chunk is damaged: {error}") from error
+
+
+def _check_form(opcode: int, content: bytes) -> None:
+    """Small records carry no checksum, so their own lengths must fit: a flipped bit must not skip what follows."""
+    if opcode == Opcode.CHUNK:
+        return
+    try:
+        if opcode == Opcode.MESSAGE_INDEX:
+            end = _counted(content, U16.size)
+        elif opcode == Opcode.HEADER:
+            end = read_text(content, read_text(content, 0)[1])[1]
+        else:  # a schema or a channel outside a chunk is somebody else's
+            start = U16.size if opcode == Opcode.SCHEMA else 2 * U16.size
+            end = _counted(content, read_text(content, read_text(content, start)[1])[1])
+    except (struct.error, UnicodeDecodeError):
+        end = -1
+    if end != len(content):
+        raise _BadRecordError("a record's length does not fit its content")
+
+
+def _counted(content: bytes, position: int) -> int:
+    """Where the bytes end that have their number before them."""
+    return int(position + U32.size + U32.unpack_from(content, position)[0])

@@ -1,0 +1,280 @@
+"""Reads run logs: one chunk in memory at a time, every checksum checked, each message of its topic's own class."""
+
+import heapq
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from operator import attrgetter
+from pathlib import Path
+from typing import Final
+
+from google.protobuf.message import Message
+
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log.losses import LogLosses, NoLosses
+from groundsbot.onboard.log.messages import TOPICS, RunInfo
+from groundsbot.onboard.log.reading.allowance import Allowance
+from groundsbot.onboard.log.reading.chunks import ChunkReader
+from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
+from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX
+from groundsbot.onboard.log.writing.segments import PICTURE_TOPIC, of_pictures
+
+_SMALLEST_RECORD_BYTES: Final = 4  # ours shrink to 14 bytes at best; a hostile file may hold millions in a few kB
+_HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
+
+
+def find_logs(paths: Iterable[Path]) -> list[Path]:
+    """The logs that some LOG arguments mean: files as they are, and every run folder in or below a folder.
+
+    Args:
+        paths: each one file, one run folder, or a folder of runs at any depth.
+
+    Returns:
+        Files and run folders, for each argument sorted by name. Runs whose recording was cut short are among them.
+
+    Raises:
+        LogError: a path is missing, or a folder holds no log.
+    """
+    logs: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            logs += _logs_below(path)
+        elif path.exists():
+            logs.append(path)
+        else:
+            raise LogError(f"{path}: no such log; give a .mcap file, a run folder or a folder of runs")
+    return logs
+
+
+def read_log(
+    path: Path,
+    topics: Collection[str] | None = None,
+    losses: LogLosses | None = None,
+    allowance: Allowance | None = None,
+) -> Iterator[LogMessage]:
+    """Iterates over one run's messages.
+
+    Args:
+        path: one file, or one run folder, whose files are joined.
+        topics: only these; files of pictures are not opened unless `/camera/image` is among them. None: all.
+        losses: takes what cannot be read, and reading goes on behind it. None: that is an error.
+        allowance: what the log may take beyond what its size is worth, shared with others; one of its own where None.
+
+    Yields:
+        Messages in order of log time. What every file repeats at its head (`/run` and so on) comes once.
+
+    Raises:
+        LogError: (while iterating) the log is missing, empty, of another kind, or its files belong to different runs;
+            without `losses` also that it is damaged or unfinished.
+    """
+    core, pictures = _files_of(path)
+    if topics is not None and PICTURE_TOPIC not in topics and core:
+        pictures = []
+    allowance = allowance or Allowance()
+    core, pictures = _usable(core, losses, allowance), _usable(pictures, losses, allowance)
+    if not core and not pictures:
+        raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
+    _check_same_run([*core[:1], *pictures[:1]], allowance)
+    streams = [_joined(files, topics, losses, allowance) for files in (core, pictures) if files]
+    yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
+
+
+def read_run_info(path: Path) -> RunInfo:
+    """The `/run` message of a log file or run folder, damaged or not.
+
+    Raises:
+        LogError: it is missing, or not to be found in any file.
+    """
+    core, pictures = _files_of(path)
+    files, allowance = [*core, *pictures], Allowance()
+    for file in files:
+        try:
+            found = _run_info(file, allowance)
+        except LogError:
+            if len(files) == 1:
+                raise
+            continue
+        if found is not None:
+            return found
+    raise LogError(f"{path}: the beginning, which says whose run it is, is damaged; choose another log")
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files of a log, a file itself or those of a run folder, finished or not.
+
+    Raises:
+        LogError: there are none.
+    """
+    core, pictures = _files_of(path)
+    return sorted([*core, *pictures])
+
+
+def read_head(path: Path) -> dict[str, Message]:
+    """What stands at the head of a log's files, from the first file in which each topic of it is to be found.
+
+    Raises:
+        LogError: `path` is missing or its files belong to different runs.
+    """
+    head: dict[str, Message] = {}
+    allowance = Allowance()
+    for file in files_of(path):
+        for each in _beginning(file, allowance):
+            if each.topic in _HEADS:
+                head.setdefault(each.topic, each.message)
+    return head
+
+
+def _logs_below(folder: Path) -> list[Path]:
+    if _files_in(folder):
+        return [folder]
+    patterns = ("*.mcap", f"*.mcap{ACTIVE_SUFFIX}")
+    logs = sorted({file.parent for pattern in patterns for file in folder.rglob(pattern)})
+    if not logs:
+        raise LogError(f"{folder}: holds no .mcap file; give a log, a run folder or a folder of runs")
+    return logs
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("*.mcap"), *folder.glob(f"*.mcap{ACTIVE_SUFFIX}")])
+
+
+def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
+    """The files of one run: those with the measurements and those with the pictures."""
+    if not path.is_dir():
+        if not path.exists():
+            raise LogError(f"{path}: no such log; give a .mcap file or a run folder")
+        return [path], []
+    files = _files_in(path)
+    if not files:
+        raise LogError(f"{path}: holds no .mcap file; give a .mcap file or a run folder")
+    pictures = of_pictures(files)
+    return [file for file in files if file not in pictures], pictures
+
+
+def _usable(files: list[Path], losses: LogLosses | None, allowance: Allowance) -> list[Path]:
+    """Those that hold something; a run that was killed may leave an empty one."""
+    if losses is None:
+        return files
+    usable = []
+    for file in files:
+        try:
+            with file.open("rb") as stream:
+                ChunkReader(stream, file, lambda _: None, allowance)
+        except LogError as error:
+            losses.unusable[file] = str(error).removeprefix(f"{file}: ")
+        except OSError as error:
+            losses.unusable[file] = f"cannot be read: {error.strerror or error}"
+        else:
+            usable.append(file)
+    return usable
+
+
+def _reasons(losses: LogLosses | None) -> str:
+    return "; ".join((losses or LogLosses()).lines())
+
+
+def _joined(
+    files: list[Path], topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
+) -> Iterator[LogMessage]:
+    """The messages of files in their order. A disk that failed may leave the same ones at a seam twice."""
+    _check_same_run(files, allowance)
+    seam: set[bytes] = set()
+    for index, file in enumerate(files):
+        following_ns = _first_time_ns(files[index + 1], allowance) if index + 1 < len(files) else None
+        before, seam = seam, set()
+        for each in _read_file(file, topics, losses, allowance):
+            if each.topic not in _HEADS:
+                if before and _identity(each) in before:
+                    continue
+                if following_ns is not None and each.log_time_ns >= following_ns:
+                    seam.add(_identity(each))
+            yield each
+
+
+def _heads_once(messages: Iterator[LogMessage]) -> Iterator[LogMessage]:
+    seen: set[str] = set()
+    for each in messages:
+        if each.topic in _HEADS:
+            if each.topic in seen:
+                continue
+            seen.add(each.topic)
+        yield each
+
+
+def _identity(each: LogMessage) -> bytes:
+    return b"%s %d %d " % (each.topic.encode(), each.log_time_ns, each.publish_time_ns) + (
+        each.message.SerializeToString(deterministic=True)
+    )
+
+
+def _first_time_ns(file: Path, allowance: Allowance) -> int | None:
+    """Log time of the first message behind a file's head, which has the time of the file's beginning."""
+    return next((each.log_time_ns for each in _beginning(file, allowance)), None)
+
+
+def _beginning(file: Path, allowance: Allowance) -> list[LogMessage]:
+    """The messages of a file's first whole chunk, which holds its head unless that is lost."""
+    losses = LogLosses()
+    found: list[LogMessage] = []
+    with suppress(LogError, OSError), file.open("rb") as stream:
+        reader = ChunkReader(stream, file, losses.add, allowance)
+        found += _messages(reader, file, None, losses, allowance, only_first=True)
+    return found
+
+
+def _check_same_run(files: list[Path], allowance: Allowance) -> None:
+    if len(files) < 2:
+        return
+    found = {file: _run_info(file, allowance) for file in files}
+    run_ids = {info.run_id: file for file, info in found.items() if info is not None}
+    if len(run_ids) > 1:
+        (run_a, file_a), (run_b, file_b) = sorted(run_ids.items())[:2]
+        raise LogError(
+            f"{file_a.parent}: {file_a.name} belongs to run {run_a}, {file_b.name} to {run_b}; "
+            "keep each run in a folder of its own"
+        )
+
+
+def _run_info(file: Path, allowance: Allowance) -> RunInfo | None:
+    """The `/run` at a file's head; None: the head is damaged."""
+    return next((each.message for each in _beginning(file, allowance) if isinstance(each.message, RunInfo)), None)
+
+
+def _read_file(
+    path: Path, topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
+) -> Iterator[LogMessage]:
+    """One file's messages; the first must be `/run`, unless it was lost."""
+    found = NoLosses() if losses is None else losses
+    try:
+        with path.open("rb") as stream:
+            reader = ChunkReader(stream, path, found.add, allowance)
+            yield from _messages(reader, path, topics, found, allowance)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _messages(
+    reader: ChunkReader,
+    path: Path,
+    topics: Collection[str] | None,
+    losses: LogLosses,
+    allowance: Allowance,
+    only_first: bool = False,
+) -> Iterator[LogMessage]:
+    decoder = MessageDecoder(path, topics, lambda reason: losses.add_undecodable(path, reason))
+    n_damaged, drawn = losses.n_places, 0
+    for chunk in reader:
+        if reader.n_chunks == 1 and losses.n_places > n_damaged:
+            decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
+        worth = reader.offset // _SMALLEST_RECORD_BYTES
+        decoder.allow(worth + drawn + allowance.records)
+        yield from decoder.messages(chunk)
+        more = max(0, decoder.n_records - worth - drawn)
+        allowance.records, drawn = allowance.records - more, drawn + more
+        if only_first:
+            return
+    if not reader.is_finished:
+        losses.add_unfinished(path, reader.end_offset)
+    elif reader.summary is not None and reader.summary.n_chunks is not None:
+        losses.add_lost_chunks(path, reader.summary.n_chunks - reader.n_chunks)
+    if reader.n_chunks == 0:
+        losses.add_nothing_found(path)

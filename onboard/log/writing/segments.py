@@ -1,0 +1,209 @@
+"""A run's files in order: a new pair after some time or size, each with the run's head, so that it opens alone.
+
+Measurements and pictures lie in files of their own, so that pictures can go first where room is short.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from operator import attrgetter
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from groundsbot.calib.robot import Robot
+from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX, LogFile, Record
+from groundsbot.onboard.log.writing.storage import Storage
+
+PICTURE_TOPIC: Final = "/camera/image"
+CORE_SUFFIX: Final = ".core.mcap"
+CAMERA_SUFFIX: Final = ".camera.mcap"
+
+_NS_PER_S: Final = 1_000_000_000
+_HEADS: Final = tuple(name for name, topic in TOPICS.items() if topic.every_file)
+_CORE_TOPICS: Final = tuple(name for name in TOPICS if name != PICTURE_TOPIC)
+
+
+class SegmentLimits(NamedTuple):
+    """When new files are begun."""
+
+    duration_ns: int = 600 * _NS_PER_S  # of log time
+    size_bytes: int = 512 << 20  # of one file
+
+
+def segment_limits(robot: Robot) -> SegmentLimits:
+    """What a robot's robot.yaml says about it."""
+    return SegmentLimits(round(robot.recorder.segment_s * _NS_PER_S), robot.recorder.segment_mb * 1_000_000)
+
+
+class LogSegments:
+    """Writes records into files; raises OSError, and can go on in new files then.
+
+    Attributes:
+        names: the files being written, for a person; replaced as a whole, so that other threads may read it.
+    """
+
+    def __init__(
+        self,
+        storage: Storage,
+        files_of: Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]],
+        head: Sequence[Record],
+        limits: SegmentLimits | None,
+    ) -> None:
+        """Creates nothing yet.
+
+        Args:
+            storage: where.
+            files_of: the files of a segment, by its number, and each one's topics.
+            head: what stands at the head of every file.
+            limits: when a new segment begins; None: there is only one.
+        """
+        self.names = ""
+        self._storage = storage
+        self._files_of = files_of
+        self._head = head
+        self._limits = limits
+        self._next = 0
+        self._start_ns = 0
+        self._files: dict[Path, LogFile] = {}
+        self._by_topic: dict[str, LogFile] = {}
+        self._full: list[LogFile] = []  # of earlier segments: complete, but not finished yet
+        self._new_in: set[Path] = set()  # folders whose newest names are not on the disk yet
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there are files to write into."""
+        return bool(self._files)
+
+    @property
+    def has_full(self) -> bool:
+        """Whether files of earlier segments are to be finished."""
+        return bool(self._full)
+
+    def open(self, start_ns: int) -> None:
+        """Begins the next segment: creates its files and writes their heads; `sync` sees to it that they stay."""
+        self._start_ns = start_ns
+        try:
+            for path, topics in self._files_of(self._next):
+                file = LogFile(self._storage, path, topics, compressed=not path.name.endswith(CAMERA_SUFFIX))
+                self._files[path] = file
+                self._by_topic |= dict.fromkeys(topics, file)
+                for record in self._head:
+                    file.append(record._replace(log_time_ns=start_ns))
+                file.unsafe.clear()  # every file has them anyway
+                file.commit()
+                self._new_in.add(path.parent)
+        except OSError as error:
+            self._close(LogFile.discard, self._files.values())
+            self._replace_files({})
+            if isinstance(error, FileExistsError):  # what failed before may have been left there
+                self._next += 1
+            raise
+        self._replace_files(self._files)
+        self._next += 1
+
+    def append(self, record: Record) -> None:
+        """Takes a record; begins a new segment before it where that is due."""
+        if self._limits is not None and self._is_full(record.log_time_ns, self._limits):
+            # Finishing takes a disk's time, which the readings that come meanwhile do not have.
+            self._full += self._files.values()
+            self._replace_files({})
+            self.open(record.log_time_ns)
+        self._by_topic[record.topic].append(record)
+
+    def commit(self) -> None:
+        """Writes all that was appended, in whole chunks."""
+        for file in self._unfinished():
+            file.commit()
+
+    def sync(self) -> None:
+        """Returns once all that is committed is on the disk, and the names of the files too."""
+        while self._new_in:
+            self._storage.sync_folder(next(iter(self._new_in)))
+            self._new_in.pop()
+        for file in self._unfinished():
+            file.sync()
+
+    def finish_a_full_one(self) -> None:
+        """Finishes one file of an earlier segment. Call it again if it raises."""
+        self._full[0].finish()
+        del self._full[0]
+
+    def finish(self) -> None:
+        """Finishes all files and gives them their names. Call it again if it raises."""
+        self._full += self._files.values()
+        self._replace_files({})
+        while self._full:
+            self.finish_a_full_one()
+
+    def abandon(self) -> list[Record]:
+        """Leaves the files as they stand, called `.active`; returns the records that are not safe in them."""
+        unsafe = list(heapq.merge(*(file.unsafe for file in self._unfinished()), key=attrgetter("log_time_ns")))
+        self._close_all(LogFile.abandon)
+        return unsafe
+
+    def discard(self) -> None:
+        """Removes the files that are not finished."""
+        self._close_all(LogFile.discard)
+
+    def _close_all(self, close: Callable[[LogFile], None]) -> None:
+        self._close(close, self._unfinished())
+        self._full, self._new_in = [], set()
+        self._replace_files({})
+
+    def _close(self, close: Callable[[LogFile], None], files: Iterable[LogFile]) -> None:
+        for file in files:
+            with suppress(OSError):
+                close(file)
+
+    def _unfinished(self) -> list[LogFile]:
+        return [*self._full, *self._files.values()]
+
+    def _replace_files(self, files: dict[Path, LogFile]) -> None:
+        self._files = files
+        self.names = ", ".join(path.name for path in files)
+        if not files:
+            self._by_topic = {}
+
+    def _is_full(self, log_time_ns: int, limits: SegmentLimits) -> bool:
+        return log_time_ns - self._start_ns >= limits.duration_ns or any(
+            file.size_bytes >= limits.size_bytes for file in self._files.values()
+        )
+
+
+def files_of_run(
+    storage: Storage, folder: Path, keep_pictures: bool
+) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
+    """Names `0000.core.mcap` and, with pictures, `0000.camera.mcap` and so on in a run's folder."""
+
+    def of(number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
+        storage.make_folder(folder)
+        core = folder / f"{number:04d}{CORE_SUFFIX}", _CORE_TOPICS
+        return [core, (folder / f"{number:04d}{CAMERA_SUFFIX}", (*_HEADS, PICTURE_TOPIC))] if keep_pictures else [core]
+
+    return of
+
+
+def single_file(storage: Storage, path: Path) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
+    """Names one file for all topics."""
+
+    def of(_number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
+        storage.make_folder(path.parent)
+        return [(path, tuple(TOPICS))]
+
+    return of
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether the file is one under way, or one whose writing was cut short."""
+    return path.name.endswith(ACTIVE_SUFFIX)
+
+
+def of_pictures(files: Iterable[Path]) -> list[Path]:
+    """Those that hold pictures."""
+    return [path for path in files if finished_name(path).endswith(CAMERA_SUFFIX)]
+
+
+def finished_name(path: Path) -> str:
+    """What a file is called once it is finished."""
+    return path.name.removesuffix(ACTIVE_SUFFIX)

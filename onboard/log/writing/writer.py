@@ -1,0 +1,218 @@
+"""Writes a run's log: MCAP files that each open alone, the same bytes for the same messages."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol
+
+from google.protobuf.message import Message
+
+from groundsbot.onboard.errors import LogError, MessageRefusedError
+from groundsbot.onboard.log.messages import TOPICS, EventKind, Severity
+from groundsbot.onboard.log.writing.file import Record
+from groundsbot.onboard.log.writing.segments import (
+    PICTURE_TOPIC,
+    LogSegments,
+    SegmentLimits,
+    files_of_run,
+    is_unfinished,
+    single_file,
+)
+from groundsbot.onboard.log.writing.storage import Disk, Storage
+
+_FLUSH_PERIOD_NS: Final = 500_000_000  # what is older than this on the log's own time is in the file
+_TIME_LIMIT_NS: Final = 1 << 63
+LARGEST_MESSAGE_BYTES: Final = 32 << 20  # readers refuse chunks of twice this
+
+
+class LogNote(NamedTuple):
+    """What a writer has to say for the log's `/events`."""
+
+    kind: EventKind
+    severity: "Severity | int"
+    text: str
+    lost: Mapping[str, int]  # how many of what the log will not have
+
+
+class RunLog(Protocol):
+    """Where a recorder's messages go."""
+
+    @property
+    def last_log_time_ns(self) -> int:
+        """The newest log time taken."""
+
+    def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
+        """Takes one message; False: there is no room for it, and a note will tell."""
+
+    def take_notes(self) -> Sequence[LogNote]:
+        """What happened since the last call."""
+
+    def close(self) -> None:
+        """Finishes the files. A second call does nothing."""
+
+
+class LogWriter:
+    """Writes the messages of one run, at once, in the caller's thread.
+
+    Log times never run backwards; what is written is in the file (and, if `durable`, on the disk) once the log time
+    has moved on by half a second.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        head: Mapping[str, Message],
+        start_ns: int,
+        *,
+        keep_pictures: bool = False,
+        durable: bool = True,
+        limits: SegmentLimits | None = None,
+        storage: Storage | None = None,
+    ) -> None:
+        """Opens the files and writes their heads.
+
+        Args:
+            path: a run folder, made if need be, which gets `0000.core.mcap` and, with `keep_pictures`,
+                `0000.camera.mcap`; or one file, whose name ends in `.mcap`, for all topics.
+            head: what stands at the head of every file, by topic: `/run`, and where known the calibration and mount.
+            start_ns: log time of the head, on the run's clock.
+            keep_pictures: whether pictures will be written.
+            durable: wait for the disk at every flush. A simulator that writes thousands of logs need not.
+            limits: when the next files, `0001.core.mcap` and so on, begin; None: never.
+            storage: instead of the disk.
+
+        Raises:
+            LogError: no `/run` in the head, a file exists already, or it cannot be written.
+        """
+        self._path = path
+        self._last_ns = self._flushed_ns = start_ns
+        self._keeps_pictures = keep_pictures or path.suffix == ".mcap"
+        store = storage or Disk(durable)
+        files = single_file(store, path) if path.suffix == ".mcap" else files_of_run(store, path, keep_pictures)
+        self._segments = LogSegments(store, files, head_records(path, head, start_ns), limits)
+        with self._told_errors():
+            try:
+                self._segments.open(start_ns)
+                self._segments.sync()
+            except OSError:
+                self._segments.discard()
+                raise
+
+    def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
+        """Appends one message.
+
+        Args:
+            topic: one of `groundsbot.onboard.log.messages.TOPICS`.
+            message: of that topic's schema.
+            log_time_ns: when the host received it, on the run's clock; not before the last one's.
+            publish_time_ns: best estimate of when it was measured, on the run's clock.
+
+        Returns:
+            True: it is taken.
+
+        Raises:
+            MessageRefusedError: a time out of range or a message too large. The log stays whole.
+            LogError: unknown topic, another schema, or log time backwards; or the disk takes no more.
+        """
+        record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
+        if topic == PICTURE_TOPIC and not self._keeps_pictures:
+            raise LogError(f"{topic}: this log keeps no pictures; open it with keep_pictures")
+        self._last_ns = log_time_ns
+        with self._told_errors():
+            self._segments.append(record)
+            if log_time_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
+                self._flush()
+        return True
+
+    @property
+    def last_log_time_ns(self) -> int:
+        """The newest log time written."""
+        return self._last_ns
+
+    def take_notes(self) -> Sequence[LogNote]:
+        """None: what goes wrong here is raised."""
+        return ()
+
+    def flush(self) -> None:
+        """Puts everything written so far into the files."""
+        with self._told_errors():
+            self._flush()
+
+    def close(self) -> None:
+        """Finishes the files and gives them their names. A second call does nothing."""
+        with self._told_errors():
+            self._segments.finish()
+
+    def discard(self) -> None:
+        """Removes the unfinished files of a log that shall not come to be."""
+        self._segments.discard()
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _flush(self) -> None:
+        self._flushed_ns = self._last_ns
+        self._segments.commit()
+        self._segments.sync()
+        while self._segments.has_full:
+            self._segments.finish_a_full_one()
+
+    @contextmanager
+    def _told_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise told(self._path, error) from error
+
+
+LogOpener = Callable[[Path, Mapping[str, Message], int, bool], RunLog]
+
+
+def head_records(path: Path, head: Mapping[str, Message], start_ns: int) -> list[Record]:
+    """What stands at the head of every file of a log.
+
+    Raises:
+        LogError: there is no `/run` in it, or another schema than its topic's.
+    """
+    if "/run" not in head:
+        raise LogError(f"{path}: a log cannot start without /run; give a RunInfo in its head")
+    return [
+        checked_record(name, head[name], start_ns, start_ns, start_ns) for name in sorted(head, key=list(TOPICS).index)
+    ]
+
+
+def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_ns: int, last_ns: int) -> Record:
+    """One message ready to be written: a refusal further on would spoil its chunk.
+
+    Raises:
+        MessageRefusedError: a time out of range or a message too large.
+        LogError: unknown topic, another schema, or a log time before `last_ns`.
+    """
+    known = TOPICS.get(topic)
+    if known is None:
+        raise LogError(f"{topic}: no such topic; a log holds {', '.join(TOPICS)}")
+    if not isinstance(message, known.schema):
+        raise LogError(f"{topic}: holds {known.schema.DESCRIPTOR.full_name}, not {message.DESCRIPTOR.full_name}")
+    for name, value in (("log_time_ns", log_time_ns), ("publish_time_ns", publish_time_ns)):
+        if not 0 <= value < _TIME_LIMIT_NS:
+            raise MessageRefusedError(f"{topic}: {name} is {value}, must lie in 0 to 2^63 - 1; message refused")
+    if log_time_ns < last_ns:
+        raise LogError(f"{topic}: log_time_ns {log_time_ns} lies before the last message's {last_ns}; sort first")
+    data = message.SerializeToString(deterministic=True)
+    if len(data) > LARGEST_MESSAGE_BYTES:
+        raise MessageRefusedError(f"{topic}: {len(data)} bytes, at most {LARGEST_MESSAGE_BYTES}; message refused")
+    return Record(topic, data, log_time_ns, publish_time_ns)
+
+
+def told(path: Path, error: OSError) -> LogError:
+    """A disk's failure as one line for a person."""
+    where = Path(error.filename or path)
+    exists = isinstance(error, FileExistsError)
+    if exists and is_unfinished(where):
+        return LogError(f"{where}: a recording is running here or was cut short; choose another place")
+    if exists and where.suffix == ".mcap":
+        return LogError(f"{where}: exists already; a log is never overwritten, choose another place or remove it")
+    return LogError(f"{where}: cannot write a log here: {error.strerror or error}; make room or choose another place")

@@ -1,0 +1,229 @@
+"""Before driving: does every device do what the robot's file says?"""
+
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
+from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_drawn
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import TOPICS
+from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
+from groundsbot.onboard.process import RunClock, wall_clock_synchronised
+from groundsbot.onboard.recorder import RobotFiles
+from groundsbot.onboard.wheels import EncoderParser, EncoderPort, PortLostError
+
+_NS_PER_S: Final = 1_000_000_000
+_LISTEN_NS: Final = 2 * _NS_PER_S
+_LOOK_NS: Final = 5 * _NS_PER_S
+_LOWEST_RATE_SHARE: Final = 0.5
+_BYTES_A_PIXEL: Final = 0.22  # of a JPEG, on the safe side, where there is no picture to tell
+_LEAST_HOURS: Final = 1.0
+_BYTES_A_MB: Final = 1_000_000
+_CHANGING_NAME: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
+_LINKS: Final = Path("/dev/serial/by-id")
+_OLDEST_WALL_CLOCK_NS: Final = 1_735_689_600 * _NS_PER_S  # 2025
+
+
+class CheckResult(NamedTuple):
+    """One check."""
+
+    name: str
+    passed: bool
+    text: str  # what was found, and what to do about it
+
+
+@dataclass
+class _Found:
+    """What the devices were found to give; None: not known."""
+
+    lines_hz: float | None = None
+    pictures_hz: float | None = None
+    kept_bytes: int | None = None  # of one picture as it would be kept
+
+
+class _Look(NamedTuple):
+    """What the camera gave."""
+
+    frame: Frame  # the newest
+    rate_hz: float | None  # None: too few came to tell
+    refused: list[str]  # what the camera would not be set to
+
+
+def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[CheckResult]:
+    """Runs every check that fits the robot, each result as soon as it is there.
+
+    Args:
+        files: the robot.
+        output: where recordings will go.
+        picture: where to save what the camera sees, with the tags found drawn into it.
+    """
+    clock, found = RunClock(), _Found()
+    if files.robot.devices.encoder_port is not None:
+        yield _check_wheels(files, clock, found)
+    if files.camera_settings is not None:
+        yield from _check_camera(files, clock, picture, found)
+    yield _check_clock(clock)
+    yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
+
+
+def _check_wheels(files: RobotFiles, clock: RunClock, seen: _Found) -> CheckResult:
+    devices = files.robot.devices
+    port = EncoderPort(str(files.path.parent / (devices.encoder_port or "")), devices.encoder_baud)
+    parser, n_bytes = EncoderParser(), 0
+    try:
+        port.open()
+        end_ns = clock.now_ns() + _LISTEN_NS
+        while clock.now_ns() < end_ns:
+            data = port.read(0.1)
+            n_bytes += len(data)
+            parser.feed(data)
+    except PortLostError as error:
+        return CheckResult("wheels", False, f"{error}; check the cable and devices.encoder_port")
+    finally:
+        port.close()
+    seconds = _LISTEN_NS / _NS_PER_S
+    rate_hz, expected_hz = parser.accepted / seconds, TOPICS["/wheels"].expected_rate_hz or 0.0
+    found = f"{port.path}: {rate_hz:.0f} lines/s, {parser.rejected} rejected"
+    if not n_bytes:
+        return CheckResult("wheels", False, f"{found}; it is silent: is the controller running, and is this its port?")
+    if rate_hz < _LOWEST_RATE_SHARE * expected_hz:
+        way_out = f"{expected_hz:.0f} lines/s expected; check devices.encoder_baud ({port.baud}) and the firmware"
+        return CheckResult("wheels", False, f"{found}; {way_out}")
+    seen.lines_hz = rate_hz
+    link = _stable_link(port.path)
+    hint = f"; {link} stays the same when it is plugged in again" if link else ""
+    return CheckResult("wheels", True, f"{found}{hint}")
+
+
+def _stable_link(path: str) -> Path | None:
+    """The name that udev gives a port for good, where robot.yaml has the other one."""
+    if not _CHANGING_NAME.fullmatch(path) or not _LINKS.is_dir():
+        return None
+    return next((link for link in sorted(_LINKS.iterdir()) if link.resolve() == Path(path)), None)
+
+
+def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Found) -> Iterator[CheckResult]:
+    if files.camera_settings is None or files.camera is None:
+        return
+    try:
+        look = _look(files.camera_settings, clock)
+    except CameraLostError as error:
+        yield CheckResult("camera", False, f"{error}; check devices.camera")
+        return
+    try:
+        result = _detect(files, look.frame)
+    except OnboardError as error:
+        yield CheckResult("detection", False, str(error))
+        return
+    if result.error is not None:
+        yield CheckResult("camera", False, f"{result.error}; check the camera")
+        return
+    width_px, height_px = files.camera.width_px, files.camera.height_px
+    seen.pictures_hz, seen.kept_bytes = look.rate_hz, len(result.jpeg or b"") or None
+    rate = f"{look.rate_hz:.1f} pictures/s" if look.rate_hz else "too few new pictures while it looked to tell a rate"
+    found = f"{files.camera_settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
+    if result.size_px != (width_px, height_px):
+        text = f"{found}, the calibration is for {width_px}x{height_px} px; calibrate at this size"
+        yield CheckResult("camera", False, text)
+    else:
+        yield CheckResult("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
+    tags = ", ".join(f"{each.family} {each.tag_id}" for each in result.detections)
+    saved = _saved(look.frame, result, picture)
+    yield CheckResult("detection", True, f"tags in view: {tags or 'none; hold one up to see it found'}; {saved}")
+
+
+def _saved(frame: Frame, result: DetectionResult, path: Path) -> str:
+    try:
+        save_drawn(frame.picture, result.detections, path)
+    except OSError as error:
+        return f"picture not saved to {path}: {error.strerror or error}"
+    return f"picture: {path}"
+
+
+def _look(settings: CameraSettings, clock: RunClock) -> _Look:
+    """What comes from now on; where nothing does, as of a folder that nobody fills yet, what was there before."""
+    begun_ns = clock.now_ns()
+    camera = camera_for(settings, clock, since_ns=begun_ns)
+    found = _read(camera, clock, begun_ns, _LISTEN_NS)
+    if found is None:
+        found = _read(camera_for(settings, clock, since_ns=0), clock, begun_ns, _LOOK_NS)
+    if found is None:
+        raise CameraEndedError(f"camera {settings.device} gave no picture for {_LOOK_NS // _NS_PER_S} s")
+    return found
+
+
+def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _Look | None:
+    """Pictures for some time from the first on; None: none came.
+
+    Those taken before `begun_ns` do not count for the rate, which would be the disk's that gives them.
+    """
+    refused = camera.open()
+    try:
+        end_ns, arrived_ns, newest = clock.now_ns() + patience_ns, list[int](), None
+        while clock.now_ns() < end_ns:
+            try:
+                frames = camera.read(0.1)
+            except CameraEndedError:  # a video may be short
+                if newest is None:
+                    raise
+                break
+            for frame in frames:
+                if newest is None:
+                    end_ns = frame.receive_ns + _LISTEN_NS
+                newest = frame
+                if frame.stamp_ns >= begun_ns:
+                    arrived_ns.append(frame.receive_ns)
+    finally:
+        camera.close()
+    if newest is None:
+        return None
+    elapsed_ns = arrived_ns[-1] - arrived_ns[0] if arrived_ns else 0
+    rate_hz = (len(arrived_ns) - 1) * _NS_PER_S / elapsed_ns if elapsed_ns > _NS_PER_S else None
+    return _Look(newest, rate_hz, refused)
+
+
+def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
+    detector = ChildDetector(files.detector_settings)  # a library that crashes must not take the check with it
+    try:
+        return detector.detect(frame.picture, want_jpeg=True)
+    finally:
+        detector.close()
+
+
+def _check_clock(clock: RunClock) -> CheckResult:
+    now_ns = clock.now_ns()
+    if now_ns < _OLDEST_WALL_CLOCK_NS:
+        return CheckResult("clock", False, "the wall clock lies before 2025; set it, or run names and times mislead")
+    if not wall_clock_synchronised():
+        return CheckResult("clock", True, "not synchronised: fine for a map, but times of day may be off")
+    return CheckResult("clock", True, "synchronised")
+
+
+def _load_of(files: RobotFiles, seen: _Found) -> Load:
+    """What will be recorded: as found, or by robot.yaml where a device did not tell."""
+    devices, camera = files.robot.devices, files.camera
+    wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or TOPICS["/wheels"].expected_rate_hz or 0.0
+    if camera is None:
+        return Load(wheels_hz, 0.0, 0.0, 0.0)
+    picture_bytes = seen.kept_bytes or _BYTES_A_PIXEL * camera.width_px * camera.height_px
+    pictures_hz = seen.pictures_hz or devices.camera_fps
+    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes)
+
+
+def _check_disk(output: Path, load: Load, keep_free_mb: int) -> CheckResult:
+    folder = output.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    free_bytes = shutil.disk_usage(folder).free
+    hours = hours_until_full(max(0, free_bytes - keep_free_mb * _BYTES_A_MB), load.bytes_per_s)
+    hours = math.inf if hours is None else hours
+    kept = f"{load.kept_pictures_hz:.3g} pictures/s of {load.picture_bytes / 1e3:.0f} kB" if load.kept_hz else "none"
+    found = f"{output}: {free_bytes / 1e9:.1f} GB free, enough for about {hours:.0f} h with pictures kept: {kept}"
+    if hours < _LEAST_HOURS:
+        return CheckResult("disk", False, f"{found}; {_LEAST_HOURS:g} h needed: make room or lower picture_rate_hz")
+    return CheckResult("disk", True, found)

@@ -1,0 +1,193 @@
+"""Beside the recording: writes its status each second and tells systemd that it is well, in a thread of its own.
+
+A thread of its own, so that a disk or a device that blocks the recording shows in the status. The watchdog is fed only
+while the log comes forward.
+"""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Literal
+
+from groundsbot.onboard.log import Event, Severity
+from groundsbot.onboard.monitoring.disk_hours import hours_until_full
+from groundsbot.onboard.monitoring.status import DiskStatus, Look, Rates, Status, write_status
+from groundsbot.onboard.process import Notifier, wall_clock_synchronised
+from groundsbot.onboard.recorder import LiveRecorder, LogStatus
+
+_NS_PER_S: Final = 1_000_000_000
+_PERIOD_S: Final = 1.0
+_EVENTS_SHOWN: Final = 6
+_SILENT_S: Final = 3.0
+_STALLED_S: Final = 5.0
+_NOTICES: Final = 8  # different ones at most: a recorder's computer may be up for weeks
+
+
+class Housekeeper(threading.Thread):
+    """Looks after one recording from its start to its end."""
+
+    def __init__(
+        self,
+        recorder: LiveRecorder,
+        path: Path,
+        notifier: Notifier,
+        on_notice: Callable[[str], None],
+        period_s: float = _PERIOD_S,
+    ) -> None:
+        """Starts nothing yet.
+
+        Args:
+            recorder: whose recording has begun.
+            path: of the status file.
+            notifier: for systemd.
+            on_notice: told, once for each, in words, of what is wrong with the status itself.
+            period_s: between two looks.
+        """
+        super().__init__(name="housekeeping", daemon=True)
+        self._recorder = recorder
+        self._path = path
+        self._notifier = notifier
+        self._on_notice = on_notice
+        watchdog_s = notifier.watchdog_s or _STALLED_S * 2.0
+        self._period_s = min(period_s, watchdog_s / 4.0)
+        self._stalled_s = watchdog_s / 2.0
+        self._over = threading.Event()
+        self._rates = Rates()
+        self._events: deque[str] = deque(maxlen=_EVENTS_SHOWN)
+        self._free_bytes = 0
+        self._told: set[str] = set()
+        self._said_stopping = False
+
+    def note(self, event: Event) -> None:
+        """Remembers an event for people; called by the recorder."""
+        if event.severity != Severity.SEVERITY_INFO:
+            self._events.append(f"{time.strftime('%H:%M:%S')} {event.kind}: {event.text}")
+
+    def run(self) -> None:
+        """Looks each second until told that it is over."""
+        while not self._recorder.begun.wait(self._period_s):
+            if self._over.is_set():
+                return
+        self._notifier.ready()
+        while not self._over.wait(self._period_s):
+            if self._recorder.is_stopping:
+                self._say_stopping()
+                self._write("stopping")
+            else:
+                self._tell_systemd(self._write("recording"))
+
+    def end(self) -> None:
+        """Writes the last status; the recording is closed, or never began."""
+        self._over.set()
+        self.join(2.0 * self._period_s)
+        self._say_stopping()
+        if self._recorder.begun.is_set() and not self.is_alive():  # else its disk blocks
+            self._write("stopped")
+
+    def _say_stopping(self) -> None:
+        """Once; systemd waits for no sign of life from then on."""
+        if not self._said_stopping:
+            self._said_stopping = True
+            self._notifier.stopping()
+
+    def _write(self, state: Literal["recording", "stopping", "stopped"]) -> Status | None:
+        """Looks and writes the status; None: that look failed, which is no reason to end a recording."""
+        try:
+            status = self._look(state)
+            reason = write_status(status, self._path)
+        except Exception as error:  # whatever it is, only the log's coming forward decides about the watchdog
+            self._tell(f"status: cannot be told ({type(error).__name__}: {error})")
+            return None
+        if reason is not None:
+            self._tell(f"status: {self._path} cannot be written ({reason})")
+        return status
+
+    def _tell(self, text: str) -> None:
+        if text not in self._told and len(self._told) < _NOTICES:
+            self._told.add(text)
+            self._on_notice(text)
+
+    def _tell_systemd(self, status: Status | None) -> None:
+        text = "the status cannot be told"
+        if status is not None:
+            rates = f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
+            text = "; ".join(status.problems) or rates
+        if self._log_stalled_s() < self._stalled_s:
+            self._notifier.alive(text)
+        else:
+            self._notifier.troubled(text)
+
+    def _log_stalled_s(self) -> float:
+        return max(self._recorder.stalled_s, self._recorder.log.stalled_s)
+
+    def _look(self, state: Literal["recording", "stopping", "stopped"]) -> Status:
+        recorder, core, log = self._recorder, self._recorder.core, self._recorder.log.status
+        devices = recorder.files.robot.devices
+        now_ns = recorder.now_ns()
+        counts = dict(core.counts)
+        self._rates.add(Look(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
+        wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
+        camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
+        stalled_s = self._log_stalled_s() if state == "recording" else 0.0
+        problems = [
+            f"no {what} for {_SILENT_S:g} s"
+            for device, what in ((wheels, "wheel readings"), (camera, "pictures"))
+            if device.expected
+            and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
+            > _SILENT_S * _NS_PER_S
+        ]
+        if stalled_s > _STALLED_S:
+            problems.insert(0, f"the log has not come forward for {stalled_s:.0f} s")
+        if log.problem is not None:
+            problems.insert(0, f"disk: {log.problem}")
+        return Status(
+            robot_id=recorder.files.robot.robot_id,
+            run_id=core.folder.name,
+            folder=_shown(core.folder),
+            pid=os.getpid(),
+            state=state,
+            updated_ns=time.time_ns(),
+            recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
+            wheels=wheels,
+            camera=camera,
+            tags_in_view=list(core.tags_in_view),
+            counts=counts,
+            losses=dict(core.losses),
+            disk=self._disk(log),
+            clock_synchronised=wall_clock_synchronised(),
+            stalled_s=round(stalled_s, 2),
+            problems=problems if state == "recording" else [],
+            last_events=list(self._events),
+        )
+
+    def _disk(self, log: LogStatus) -> DiskStatus:
+        try:
+            room = os.statvfs(self._recorder.output)
+            self._free_bytes = room.f_bavail * room.f_frsize
+        except OSError:
+            self._free_bytes = 0
+        per_s = self._rates.bytes_per_s()
+        hours = hours_until_full(self._free_bytes, per_s)
+        return DiskStatus(
+            free_bytes=self._free_bytes,
+            bytes_per_s=per_s,
+            hours_left=None if hours is None else round(hours, 1),
+            waiting_bytes=log.waiting_bytes,
+            problem=log.problem,
+        )
+
+
+def _shown(path: Path) -> str:
+    """As text; a name need not be UTF-8, but JSON is."""
+    return os.fsencode(path).decode(errors="backslashreplace")
+
+
+def _size_of(folder: Path) -> int:
+    """Of the run's files; those removed meanwhile, to make room, count no more."""
+    try:
+        return sum(each.stat().st_size for each in os.scandir(folder))
+    except OSError:
+        return 0

@@ -1,0 +1,145 @@
+"""How a recording does, as one small JSON file: written by the recorder each second, read by `status` and by anyone."""
+
+import time
+from collections import deque
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from groundsbot.calib.foundation import written_whole
+from groundsbot.onboard.errors import OnboardError
+
+STATUS_SUFFIX: Final = ".status.json"
+
+_NS_PER_S: Final = 1_000_000_000
+_RATE_NS: Final = 5 * _NS_PER_S
+_GROWTH_NS: Final = 120 * _NS_PER_S
+_LEAST_GROWTH_NS: Final = 5 * _NS_PER_S
+_STALE_S: Final = 5.0
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class DeviceStatus(_Part):
+    """One device."""
+
+    name: str
+    rate_hz: float  # readings or pictures, over the last five seconds
+    age_s: float | None  # since the newest one; None: none yet
+    expected: bool  # a device that robot.yaml names
+
+
+class DiskStatus(_Part):
+    """The recorder's disk."""
+
+    free_bytes: int
+    bytes_per_s: float | None  # of this recording; None: not known yet
+    hours_left: float | None
+    waiting_bytes: int  # in memory, not yet on the disk
+    problem: str | None
+
+
+class Status(_Part):
+    """How a recording does."""
+
+    format_version: Literal[1] = 1
+    robot_id: str
+    run_id: str
+    folder: str
+    pid: int
+    state: Literal["recording", "stopping", "stopped"]
+    updated_ns: int  # wall clock
+    recording_s: float
+    wheels: DeviceStatus
+    camera: DeviceStatus
+    tags_in_view: list[str]
+    counts: dict[str, int]  # messages by topic
+    losses: dict[str, int]
+    disk: DiskStatus
+    clock_synchronised: bool
+    stalled_s: float  # how long the log has not come forward
+    problems: list[str]  # what is wrong now, in words
+    last_events: list[str]
+
+
+class Look(NamedTuple):
+    """What a recording shows of itself at one moment."""
+
+    now_ns: int  # on the run's clock, like all times here
+    counts: dict[str, int]
+    newest_ns: dict[str, int]  # arrival of the newest message of a topic
+    written_bytes: int
+
+
+class Rates:
+    """Rates from looks at growing counts."""
+
+    def __init__(self) -> None:
+        self._looks: deque[Look] = deque()
+
+    def add(self, look: Look) -> None:
+        """Takes one look."""
+        self._looks.append(look)
+        while look.now_ns - self._looks[0].now_ns > _GROWTH_NS:
+            self._looks.popleft()
+
+    def device(self, topic: str, name: str, expected: bool) -> DeviceStatus:
+        """The device whose messages go to a topic."""
+        if not self._looks:
+            return DeviceStatus(name=name, rate_hz=0.0, age_s=None, expected=expected)
+        last = self._looks[-1]
+        first = next(look for look in self._looks if last.now_ns - look.now_ns <= _RATE_NS)
+        elapsed_s = (last.now_ns - first.now_ns) / _NS_PER_S
+        grown = last.counts.get(topic, 0) - first.counts.get(topic, 0)
+        newest_ns = last.newest_ns.get(topic)
+        age_s = None if newest_ns is None else round((last.now_ns - newest_ns) / _NS_PER_S, 3)
+        return DeviceStatus(
+            name=name, rate_hz=round(grown / elapsed_s, 2) if elapsed_s else 0.0, age_s=age_s, expected=expected
+        )
+
+    def bytes_per_s(self) -> float | None:
+        """How fast the files grow, over the last two minutes."""
+        if not self._looks:
+            return None
+        first, last = self._looks[0], self._looks[-1]
+        elapsed_ns = last.now_ns - first.now_ns
+        if elapsed_ns < _LEAST_GROWTH_NS:
+            return None
+        return max(0.0, (last.written_bytes - first.written_bytes) * _NS_PER_S / elapsed_ns)
+
+
+def write_status(status: Status, path: Path) -> str | None:
+    """Puts the file in place as a whole; returns why the disk will not have it, None where it has."""
+    try:
+        with written_whole(path, durable=False) as temporary, temporary.open("x", encoding="utf-8") as file:
+            file.write(status.model_dump_json(indent=1))  # "x": never through a link
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def read_status(place: Path) -> Status:
+    """The status in a file, or the newest one in a folder of recordings.
+
+    Raises:
+        OnboardError: there is none, or it is not one.
+    """
+    files = [place]
+    if place.is_dir():
+        there = [path for path in place.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # no link that leads nowhere
+        files = sorted(there, key=lambda path: path.stat().st_mtime_ns)
+    if not files or not files[-1].is_file():
+        raise OnboardError(f"{place}: no recorder has left a status here; give the --output or --status of `record`")
+    try:
+        return Status.model_validate_json(files[-1].read_bytes())
+    except (ValidationError, OSError) as error:
+        raise OnboardError(f"{files[-1]}: is no status of a recorder ({type(error).__name__}); remove it") from None
+
+
+def is_alive(status: Status) -> bool:
+    """Whether its recorder is still at work: it writes every second."""
+    age_s = (time.time_ns() - status.updated_ns) / _NS_PER_S
+    return status.state != "stopped" and abs(age_s) < _STALE_S

@@ -1,0 +1,280 @@
+"""Keeps a run's log on a disk that may be slow, full or failing: the recorder never waits, the disk's side retries.
+
+What is older than a second is on the disk while the disk works. While it does not, readings wait in memory, pictures go
+first, and whatever is lost in the end is counted and told of in the log.
+"""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from google.protobuf.message import Message
+
+from groundsbot.onboard.log import (
+    PICTURE_TOPIC,
+    EventKind,
+    LogNote,
+    LogSegments,
+    Record,
+    SegmentLimits,
+    Severity,
+    Storage,
+    checked_record,
+    files_of_run,
+    head_records,
+)
+from groundsbot.onboard.recorder.disk.room import NO_ROOM, DiskRoom
+
+_PICTURES_LIMIT_BYTES: Final = 16 << 20  # waiting in memory; beyond it new pictures are dropped
+_LIMIT_BYTES: Final = 64 << 20  # waiting in all; beyond it the oldest tenth goes
+_RECORD_BYTES: Final = 200  # what a waiting record takes beside its data
+_RETRY_S: Final = 2.0
+_LOOK_AT_ROOM_S: Final = 10.0
+_LAST_TRIES: Final = 3
+
+
+class LogStatus(NamedTuple):
+    """How the log does."""
+
+    problem: str | None  # None: all is well
+    waiting_bytes: int  # in memory, not yet on the disk
+    synced_s: float  # monotonic time at which everything taken before was last on the disk
+    lost: Mapping[str, int]  # messages by topic, since the start
+    files: str  # being written
+
+
+class LogKeeper:
+    """The log of one run. `write` and `take_notes` are the recorder's side, `step` and `finish` the disk's."""
+
+    def __init__(
+        self,
+        folder: Path,
+        head: Mapping[str, Message],
+        start_ns: int,
+        storage: Storage,
+        room: DiskRoom,
+        *,
+        keep_pictures: bool,
+        limits: SegmentLimits,
+    ) -> None:
+        """Opens nothing yet: a disk that is full now may have room later.
+
+        Args:
+            folder: the run's, made when the first file is.
+            head: what stands at the head of every file, by topic.
+            start_ns: log time of the head.
+            storage: the disk.
+            room: the room on it.
+            keep_pictures: whether pictures will be written.
+            limits: when new files begin.
+
+        Raises:
+            LogError: no `/run` in the head.
+        """
+        self._room = room
+        self._last_ns = start_ns
+        files = files_of_run(storage, folder, keep_pictures)
+        self._segments = LogSegments(storage, files, head_records(folder, head, start_ns), limits)
+        self._lock = threading.Lock()
+        self._waiting: deque[Record] = deque()
+        self._waiting_bytes = 0
+        self._lost: Counter[str] = Counter()
+        self._lost_told: Counter[str] = Counter()
+        self._notes: deque[LogNote] = deque()
+        self._pictures_pause = False
+        self._problem: str | None = None
+        self._problem_since_s = self._retry_at_s = self._synced_s = float("-inf")
+        self._next_look_s = float("-inf")
+
+    # --- the recorder's side
+
+    @property
+    def last_log_time_ns(self) -> int:
+        """The newest log time taken."""
+        return self._last_ns
+
+    def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
+        """Takes one message, without waiting for the disk. For one thread.
+
+        Returns:
+            False: a picture for which there is no room.
+
+        Raises:
+            MessageRefusedError: a time out of range or a message too large.
+            LogError: unknown topic, another schema, or log time backwards.
+        """
+        record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
+        self._last_ns = log_time_ns
+        with self._lock:
+            if topic == PICTURE_TOPIC and (self._pictures_pause or self._waiting_bytes > _PICTURES_LIMIT_BYTES):
+                self._lost[topic] += 1
+                return False
+            self._waiting.append(record)
+            self._waiting_bytes += _size(record)
+            self._forget_oldest()
+        return True
+
+    def take_notes(self) -> Sequence[LogNote]:
+        """What happened since the last call."""
+        return [self._notes.popleft() for _ in range(len(self._notes))]
+
+    @property
+    def status(self) -> LogStatus:
+        """How it does."""
+        with self._lock:
+            lost = dict(self._lost)
+        return LogStatus(self._problem, self._waiting_bytes, self._synced_s, lost, self._segments.names)
+
+    # --- the disk's side
+
+    def step(self, now_s: float) -> None:
+        """Puts on the disk what has come since the last step. Call it at least every half second.
+
+        Args:
+            now_s: monotonic time; the call itself may take long where the disk does.
+        """
+        self._look_at_room(now_s)
+        if self._problem is None or now_s >= self._retry_at_s:
+            with self._lock:
+                batch, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
+            self._put_on_disk(batch, now_s)
+        self._tell_losses()
+
+    def finish(self, now_s: float) -> None:
+        """Writes what waits and finishes the files; tells by a note what could not be."""
+        for _ in range(_LAST_TRIES):
+            self._retry_at_s = now_s
+            self.step(now_s)
+            try:
+                self._segments.finish()
+            except Exception as error:
+                self._fail(error, (), now_s)
+            if not self._waiting:
+                break
+        self.give_up()
+        self._room.drop_ballast()
+
+    def give_up(self) -> None:
+        """Counts what waits as lost, and tells of it."""
+        with self._lock:
+            self._lost.update(record.topic for record in self._waiting)
+            self._waiting, self._waiting_bytes = deque(), 0
+        self._tell_losses()
+
+    def _put_on_disk(self, batch: deque[Record], now_s: float) -> None:
+        try:
+            if not self._segments.is_open:
+                if self._problem is not None and not batch:
+                    return
+                self._open(batch[0].log_time_ns if batch else self._last_ns, now_s)
+            begun_before = self._segments.has_full
+            while batch:
+                self._append_first(batch)
+            self._segments.commit()
+            self._segments.sync()
+            if begun_before:  # one at a time, and not where a new segment has taken its time already
+                self._segments.finish_a_full_one()
+        except Exception as error:  # also a fault of ours or of a library's: a new file may do
+            self._fail(error, batch, now_s)
+        else:
+            self._synced_s = now_s
+
+    def _append_first(self, batch: deque[Record]) -> None:
+        try:
+            self._segments.append(batch[0])
+        except OSError:
+            raise
+        except Exception:  # no file will take it; it must not keep the others out for ever
+            with self._lock:
+                self._lost[batch.popleft().topic] += 1
+            raise
+        batch.popleft()
+
+    def _open(self, start_ns: int, now_s: float) -> None:
+        self._room.take_ballast()
+        self._segments.open(start_ns)
+        if self._problem is not None:
+            text = f"recording again, in {self._segments.names}, after {now_s - self._problem_since_s:.1f} s"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_INFO, text, {}))
+            self._problem = None
+
+    def _fail(self, error: Exception, batch: Iterable[Record], now_s: float) -> None:
+        """Keeps in memory what is not on the disk, and leaves files that readers can use."""
+        number, file, what = None, None, repr(error)
+        if isinstance(error, OSError):
+            number, file, what = error.errno, error.filename, error.strerror or str(error)
+        text = f"{self._segments.names or file or 'log'}: {what}"
+        if number in NO_ROOM:
+            self._remove_old_pictures()
+            self._room.drop_ballast()
+            with suppress(OSError):  # what has been appended is still in its memory
+                self._segments.finish()
+        unsafe = self._segments.abandon()
+        with self._lock:
+            self._waiting.extendleft(reversed([*unsafe, *batch]))
+            self._waiting_bytes = sum(map(_size, self._waiting))
+            self._forget_oldest()
+        if self._problem is None:
+            self._problem_since_s = now_s
+            self._retry_at_s = now_s  # another file may do at once
+            told = f"{text}; readings wait in memory, pictures go first, until a new file takes them"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, told, {}))
+        else:
+            self._retry_at_s = now_s + _RETRY_S
+        self._problem = text
+
+    def _look_at_room(self, now_s: float) -> None:
+        if now_s < self._next_look_s:
+            return
+        self._next_look_s = now_s + _LOOK_AT_ROOM_S
+        low = self._room.is_low()
+        if low and self._remove_old_pictures():
+            low = self._room.is_low()
+        if low != self._pictures_pause:
+            self._pictures_pause = low
+            text = "little space left: pictures are not kept" if low else "space again: pictures are kept"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
+
+    def _remove_old_pictures(self) -> int:
+        """Makes room where that is allowed; tells, and returns, how many files went."""
+        removed = self._room.remove_old_pictures()
+        if removed:
+            text = f"removed {len(removed)} old files of pictures for want of space, from {removed[0]} on"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
+        return len(removed)
+
+    def _tell_losses(self) -> None:
+        with self._lock:
+            new = self._lost - self._lost_told
+            self._lost_told.update(new)
+        if new:
+            text = ", ".join(f"{count} of {topic}" for topic, count in sorted(new.items()))
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, f"not in the log: {text}", new))
+
+    def _forget_oldest(self) -> None:
+        """Bounds the memory; with the lock held."""
+        if self._waiting_bytes <= _LIMIT_BYTES:
+            return
+        self._forget([record for record in self._waiting if record.topic == PICTURE_TOPIC])
+        excess, oldest = self._waiting_bytes - _LIMIT_BYTES * 9 // 10, []
+        for record in self._waiting:
+            if excess <= 0:
+                break
+            oldest.append(record)
+            excess -= _size(record)
+        self._forget(oldest)
+
+    def _forget(self, records: list[Record]) -> None:
+        if not records:
+            return
+        gone = set(map(id, records))
+        self._waiting = deque(record for record in self._waiting if id(record) not in gone)
+        self._waiting_bytes -= sum(map(_size, records))
+        self._lost.update(record.topic for record in records)
+
+
+def _size(record: Record) -> int:
+    return len(record.data) + _RECORD_BYTES

@@ -1,0 +1,89 @@
+"""A thread in which a log's disk may take its time."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from google.protobuf.message import Message
+
+from groundsbot.onboard.log import EventKind, LogNote, Severity
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper, LogStatus
+
+# From one step's start to the next one's. With what readings and detections wait for before (0.35 s), and with the
+# steps of a disk that takes 0.1 s for a sync, what is older than a second is safe.
+_PERIOD_S: Final = 0.25
+_END_LIMIT_S: Final = 2.0  # with what devices and detection may take, a recording ends within 5 s
+
+
+class LogThread:
+    """A run's log whose disk works in a thread of its own."""
+
+    def __init__(self, keeper: LogKeeper, period_s: float = _PERIOD_S) -> None:
+        """Starts the thread, which opens the files."""
+        self._keeper = keeper
+        self._period_s = period_s
+        self._stop = threading.Event()
+        self._stepped_s = time.monotonic()
+        self._given_up: deque[LogNote] = deque()
+        self._fault = ""
+        self._finished = False
+        self._thread = threading.Thread(target=self._work, name="log", daemon=True)
+        self._thread.start()
+
+    @property
+    def last_log_time_ns(self) -> int:
+        """The newest log time taken."""
+        return self._keeper.last_log_time_ns
+
+    @property
+    def status(self) -> LogStatus:
+        """How the log does."""
+        return self._keeper.status
+
+    @property
+    def stalled_s(self) -> float:
+        """How long the disk has not come back: a healthy one does so four times a second. For a watchdog."""
+        return time.monotonic() - self._stepped_s
+
+    def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
+        """As `LogKeeper.write`."""
+        return self._keeper.write(topic, message, log_time_ns, publish_time_ns)
+
+    def take_notes(self) -> Sequence[LogNote]:
+        """As `LogKeeper.take_notes`; and of a thread that failed, or did not end when it was told to."""
+        return [*self._keeper.take_notes(), *(self._given_up.popleft() for _ in range(len(self._given_up)))]
+
+    def close(self) -> None:
+        """Finishes the files, or gives up on a disk that does not answer. A second call does nothing."""
+        if self._stop.is_set():
+            return
+        self._stop.set()
+        self._thread.join(_END_LIMIT_S)
+        if self._thread.is_alive():
+            text = f"the disk did not answer for {_END_LIMIT_S:g} s: the files stay unfinished"
+            self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"log left unfinished": 1}))
+        elif not self._finished:
+            self._keeper.give_up()
+
+    def _work(self) -> None:
+        while True:
+            begun_s = time.monotonic()
+            self._told(self._keeper.step, begun_s)
+            self._stepped_s = time.monotonic()
+            if self._stop.wait(begun_s + self._period_s - self._stepped_s):
+                break
+        self._finished = self._told(self._keeper.finish, time.monotonic())
+
+    def _told(self, act: Callable[[float], None], now_s: float) -> bool:
+        """Whether it went well; a fault of ours or of a library's is told of and must not end the log's thread."""
+        try:
+            act(now_s)
+        except Exception as error:
+            if repr(error) != self._fault:
+                self._fault = repr(error)
+                text = f"the log's thread failed and goes on: {error!r}"
+                self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"faults of the log": 1}))
+            return False
+        return True

@@ -1,0 +1,256 @@
+"""The recorder at work: threads read port and camera, a child process detects, the core writes.
+
+Everything reaches the core through one queue, in one thread. Whatever arrives is stamped where it arrives, so that a
+busy core delays no stamp.
+"""
+
+import contextlib
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from google.protobuf.message import Message
+
+from groundsbot.calib.foundation import is_complete, is_jpeg
+from groundsbot.onboard.camera import Frame
+from groundsbot.onboard.detection import ChildDetector, DetectionResult
+from groundsbot.onboard.log import Disk, Event, EventKind, segment_limits
+from groundsbot.onboard.process import RunClock, read_clocks, wall_clock_synchronised
+from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.log_thread import LogThread
+from groundsbot.onboard.recorder.disk.room import DiskRoom, one_recorder, space_policy
+from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.wheels import EncoderPort
+
+_NS_PER_S: Final = 1_000_000_000
+_WAIT_S: Final = 0.05
+_TICK_NS: Final = 100_000_000
+_PICTURES_UNDER_WAY: Final = 8
+_END_LIMIT_NS: Final = 1_500_000_000  # a device that blocks must not keep the log open
+
+
+def new_run_id(start_ns: int) -> str:
+    """A name for a run: its start in UTC, and four digits by chance in case two start at once."""
+    start = datetime.fromtimestamp(start_ns // _NS_PER_S, UTC)
+    return f"{start:%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
+
+
+class LiveRecorder:
+    """Records one run until it is told to stop.
+
+    Attributes:
+        core: what has been written and lost; there from `run` on.
+        log: how the log does on its disk; there from `run` on.
+        begun: set once both are there.
+        files: the robot.
+        output: where run folders go.
+        start_ns: on the run's clock, once it has begun.
+    """
+
+    core: RecorderCore
+    log: LogThread
+
+    def __init__(
+        self,
+        files: RobotFiles,
+        output: Path,
+        stop: threading.Event,
+        on_event: Callable[[Event], None],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """Opens nothing yet.
+
+        Args:
+            files: the robot.
+            output: where run folders go.
+            stop: set it to end the recording.
+            on_event: told of each event in the log.
+            on_notice: told, in words, of what is not for the log: what is waited for.
+        """
+        self.files = files
+        self.output = output
+        self.begun = threading.Event()
+        self._stop = stop
+        self._on_event = on_event
+        self._on_notice = on_notice
+        self._clock = RunClock()
+        self.start_ns = 0
+        self._served_s = time.monotonic()
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # for the core, in its thread
+        self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
+        self._under_way: dict[Frame, bool] = {}  # pictures in detection, and whether they are to be kept
+        self._detector: ChildDetector | None = None
+
+    def now_ns(self) -> int:
+        """Now, on the run's clock."""
+        return self._clock.now_ns()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether it has been told to stop."""
+        return self._stop.is_set()
+
+    @property
+    def stalled_s(self) -> float:
+        """How long the core's thread has not come round: a healthy one does so twenty times a second."""
+        return time.monotonic() - self._served_s
+
+    def run(self) -> None:
+        """Records until `stop` is set, then takes in what the devices still hold and closes the log.
+
+        Raises:
+            OnboardError: recording cannot start or go on.
+        """
+        files = self.files
+        if files.camera_settings is not None:
+            self._detector = ChildDetector(files.detector_settings, self._detector_restarted)
+        self.start_ns = self._clock.now_ns()  # only now: what came before, nobody listened to
+        try:
+            run = Run(
+                files.robot,
+                files.text,
+                files.camera,
+                new_run_id(self.start_ns),
+                self.start_ns,
+                self._clock.run_epoch_ns,
+            )
+            wheels = files.robot.devices.encoder_port is not None
+            with one_recorder(files.path, self.output, files.robot.robot_id):
+                self.core = RecorderCore(
+                    self.output,
+                    run,
+                    on_event=self._on_event,
+                    expect_wheels=wheels,
+                    expect_camera=files.camera_settings is not None,
+                    open_log=self._open_log,
+                )
+                self.begun.set()
+                try:
+                    self._record()
+                finally:
+                    self.core.close(self._clock.now_ns())
+        finally:
+            if self._detector is not None:
+                self._detector.close()
+
+    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> LogThread:
+        robot, disk = self.files.robot, Disk()
+        room = DiskRoom(disk, self.output, robot.robot_id, space_policy(robot))
+        limits = segment_limits(robot)
+        keeper = LogKeeper(folder, head, start_ns, disk, room, keep_pictures=keep_pictures, limits=limits)
+        self.log = LogThread(keeper)
+        return self.log
+
+    def _record(self) -> None:
+        threads = self._device_threads()
+        for thread in threads:
+            thread.start()
+        try:
+            self._serve(lambda: not self._stop.is_set())
+        finally:
+            self._stop.set()
+        end_ns = self._clock.now_ns() + _END_LIMIT_NS
+        self._serve(
+            lambda: (
+                (self._under_way or any(each.is_alive() for each in threads) or not self._work.empty())
+                and self._clock.now_ns() < end_ns
+            )
+        )
+        while not self._work.empty():  # only if time ran out
+            self._work.get()()
+        for frame, is_wanted in self._under_way.items():
+            reason = f"pictures: detection had not ended {_END_LIMIT_NS / _NS_PER_S:g} s after the stop"
+            self._undetected(frame, is_wanted, reason, self._clock.now_ns())
+
+    def _device_threads(self) -> list[DeviceThread]:
+        files, devices = self.files, self.files.robot.devices
+        threads: list[DeviceThread] = []
+        if devices.encoder_port is not None:
+            port = EncoderPort(str(files.path.parent / devices.encoder_port), devices.encoder_baud)
+            threads.append(WheelThread(port, self.core, self._put, self._stop, self._on_notice))
+        if files.camera_settings is not None:
+            camera = CameraThread(
+                files.camera_settings,
+                self.core,
+                self._put,
+                self._stop,
+                self._on_notice,
+                clock=self._clock,
+                since_ns=self.start_ns,
+                slots=self._slots,
+                detect=self._detect,
+                drop=self._drop,
+            )
+            threads.append(camera)
+        return threads
+
+    def _serve(self, go_on: Callable[[], bool]) -> None:
+        next_tick_ns = 0
+        while go_on():
+            self._served_s = time.monotonic()
+            with contextlib.suppress(queue.Empty):
+                self._work.get(timeout=_WAIT_S)()
+            now_ns = self._clock.now_ns()
+            if now_ns >= next_tick_ns:
+                next_tick_ns = now_ns + _TICK_NS
+                clocks = read_clocks()
+                now_ns = self._clock.from_monotonic(clocks.monotonic_ns)
+                self.core.tick(now_ns, clocks.realtime_ns, wall_clock_synchronised())
+
+    # --- in the thread of the core
+
+    def _detect(self, frame: Frame, _now_ns: int) -> None:
+        if self._detector is None:
+            return
+        self._under_way[frame] = want_jpeg = self.core.wants_picture(frame.stamp_ns)
+        self._detector.submit(
+            frame.picture, want_jpeg, lambda result: self._put(partial(self._detected, frame, result))
+        )
+
+    def _drop(self, frame: Frame, now_ns: int) -> None:
+        self._undetected(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
+
+    def _undetected(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
+        """Keeps the picture alone, where it is one to keep: its tags can be found later."""
+        picture = frame.picture
+        if is_wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
+            self.core.on_picture(picture, frame.stamp_ns, frame.receive_ns)
+        self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, now_ns)
+
+    def _detected(self, frame: Frame, result: DetectionResult, now_ns: int) -> None:
+        self._under_way.pop(frame)
+        self._slots.release()
+        if self._detector is None:
+            return
+        if result.error is not None:
+            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"pictures of no use: {result.error}", now_ns)
+            return
+        if result.jpeg is not None:
+            self.core.on_picture(result.jpeg, frame.stamp_ns, frame.receive_ns)
+        self.core.on_detections(
+            result.detections,
+            result.size_px,
+            frame.stamp_ns,
+            frame.receive_ns,
+            frame.source,
+            frame.sequence,
+            detector=self._detector.library,
+            detector_settings=self._detector.settings,
+        )
+
+    # --- for all threads
+
+    def _detector_restarted(self, reason: str) -> None:
+        self._put(partial(self.core.on_detector_restarted, reason))
+
+    def _put(self, act: Act) -> None:
+        """Hands an act to the core's thread, with the time it was handed over."""
+        self._work.put(partial(act, self._clock.now_ns()))

@@ -1,0 +1,107 @@
+"""What a recording has lost, as events in its log and as counts at its end."""
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.onboard.log import EventKind, Severity
+from groundsbot.onboard.recorder.counted_log import CountedLog
+from groundsbot.onboard.recorder.watches import Watches
+from groundsbot.onboard.wheels import StampedReading, WheelIntake
+
+
+class Tally(NamedTuple):
+    """What happened several times."""
+
+    kind: EventKind
+    times: int
+    text: str  # of the last time
+
+
+class Tallies:
+    """Counts what comes in numbers, so that it is told of now and then and not each time."""
+
+    def __init__(self) -> None:
+        self._counted: dict[EventKind, Tally] = {}
+        self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines counted so far
+
+    def add(self, kind: EventKind, count: int, text: str) -> None:
+        """Counts; nothing if `count` is 0."""
+        if count:
+            before = self._counted.get(kind)
+            self._counted[kind] = Tally(kind, count + (before.times if before else 0), text)
+
+    def add_left_out(self, intake: WheelIntake) -> None:
+        """Counts the lines that the intake has left out since the last time."""
+        parser, unwrapper = intake.parser, intake.unwrapper
+        left_out = (parser.rejected, unwrapper.repeated, unwrapper.overtaken)
+        rejected, repeated, overtaken = np.subtract(left_out, self._left_out).tolist()
+        self._left_out = left_out
+        pieces = f"pieces that are no line, the last {list(parser.last_rejected)}"
+        self.add(EventKind.WHEEL_LINE_REJECTED, rejected, pieces)
+        text = f"lines left out: {repeated} repeated, {overtaken} overtaken by newer ones"
+        self.add(EventKind.WHEEL_SEQUENCE, repeated + overtaken, text)
+
+    def take(self) -> Iterator[Tally]:
+        """What has been counted since the last time."""
+        counted, self._counted = self._counted, {}
+        yield from counted.values()
+
+
+_NS_PER_S: Final = 1_000_000_000
+_WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
+
+
+class RecordingLosses:
+    """Tells of what comes singly at once, and of what comes in numbers when `tell` is called."""
+
+    def __init__(self, log: CountedLog) -> None:
+        """Tells `log`, and counts there."""
+        self._log = log
+        self._tallies = Tallies()
+
+    def note_reading(self, each: StampedReading, before_ns: int | None) -> None:
+        """What is missing before a wheel reading; `before_ns`: stamp of the one before, None where there is none."""
+        reading = each.reading
+        if reading.lost:
+            self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
+            self._log.losses["wheel lines"] += reading.lost
+        if before_ns is None:
+            return
+        gap_ns = each.stamp_ns - before_ns
+        if reading.new_epoch:
+            self._log.losses["wheel controller resets"] += 1
+            text = f"boot {reading.boot_id} after {gap_ns / _NS_PER_S:.3f} s: the motion in between is unknown"
+            self._log.event(EventKind.WHEEL_RESET, Severity.SEVERITY_WARNING, text, each.host_ns, 1)
+        elif gap_ns > _WHEEL_GAP_NS:
+            text = f"no wheel reading for {gap_ns / _NS_PER_S:.3f} s"
+            self._log.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
+
+    def note_pictures(self, kind: EventKind, count: int, reason: str) -> None:
+        """Pictures whose tags the log will not have."""
+        self._log.losses["pictures"] += count
+        self._tallies.add(kind, count, reason)
+
+    def note_stamp(self) -> None:
+        """A picture that only its arrival can date."""
+        text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
+        self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
+
+    def tell(self, intake: WheelIntake, now_ns: int) -> None:
+        """Tells of what was counted since the last time, the lines that the intake left out included."""
+        self._tallies.add_left_out(intake)
+        for each in self._tallies.take():
+            text = f"{each.times} {each.text}"
+            self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times)
+
+    def count_missing(self, watches: Watches, *, port_is_lost: bool) -> None:
+        """At the end: a device that does not come back leaves nothing to be counted, neither lines nor pictures."""
+        losses, counts = self._log.losses, self._log.counts
+        if watches.wheels.is_silent and not counts["/wheels"]:
+            losses["recording without a single wheel reading"] += 1
+        elif watches.wheels.is_silent or port_is_lost:
+            losses["wheel port gone or silent at the end"] += 1
+        if watches.camera.is_missing:
+            never = not counts["/tags/detections"] and not losses["pictures"]
+            losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1

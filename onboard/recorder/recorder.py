@@ -1,0 +1,296 @@
+"""The recorder's core: bytes and pictures with their times in, a log out.
+
+It reads no clock and no device, so that a live recording and a simulated one run through the same code: the same
+calls give the same log to the byte.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.calib.camera import CameraModel
+from groundsbot.calib.robot import Robot
+from groundsbot.onboard.detection import Detection, TagDetector, detections_message
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log import (
+    CAMERA_FRAME,
+    ClockAnchor,
+    CompressedImage,
+    Event,
+    EventKind,
+    LogOpener,
+    LogWriter,
+    RunLog,
+    Severity,
+    StampSource,
+    encode_jpeg,
+    log_head,
+    segment_limits,
+    timestamp,
+)
+from groundsbot.onboard.recorder.counted_log import CountedLog
+from groundsbot.onboard.recorder.losses import RecordingLosses
+from groundsbot.onboard.recorder.pictures import PictureChecks, PictureSchedule
+from groundsbot.onboard.recorder.waiting_detections import ReadyDetections, WaitingDetections
+from groundsbot.onboard.recorder.watches import Watches
+from groundsbot.onboard.wheels import StampedReading, WheelIntake, wheel_message
+
+_NS_PER_S: Final = 1_000_000_000
+_ANCHOR_PERIOD_NS: Final = _NS_PER_S
+
+
+class Run(NamedTuple):
+    """What names and describes one run."""
+
+    robot: Robot
+    robot_yaml: str  # the text that `robot` was read from
+    camera: CameraModel | None  # None: a run of wheels only
+    run_id: str
+    start_ns: int  # on the run's clock
+    run_epoch_ns: int  # realtime minus monotonic, frozen at the start
+
+
+class RecorderCore:
+    """Writes one run into `<folder>/<run_id>/`.
+
+    All times are ns on the run's clock. A message's log time is when the host received it, or the log's newest time
+    where another one has been written since.
+
+    Attributes:
+        folder: the run's folder.
+        counts: messages written, by topic.
+        losses: what is missing from the log, by a word for it.
+        newest_ns: when the newest message arrived, by topic.
+        tags_in_view: of the newest picture, by family and id.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run: Run,
+        *,
+        detector: TagDetector | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        expect_wheels: bool = True,
+        expect_camera: bool = False,
+        durable: bool = True,
+        open_log: LogOpener | None = None,
+    ) -> None:
+        """Opens the log.
+
+        Args:
+            folder: where run folders go.
+            run: what is recorded.
+            detector: for `on_frame`; one that gives its detections ready does without.
+            on_event: told of each event as it is written.
+            expect_wheels: whether their silence is worth an event, and a picture worth waiting for them.
+            expect_camera: whether one that never comes is a loss.
+            durable: see LogWriter.
+            open_log: opens another log than a LogWriter's: one that waits for no disk.
+
+        Raises:
+            LogError: the log cannot be opened.
+        """
+        self.folder = folder / run.run_id
+        self.tags_in_view: tuple[str, ...] = ()
+        self._run = run
+        self._options = run.robot.recorder
+        self._detector = detector
+        self._intake = WheelIntake()
+        self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None, expect_camera=expect_camera)
+        self._waiting = WaitingDetections(wheels=expect_wheels)
+        self._checks = PictureChecks(run.camera)
+        self._next_anchor_ns = 0
+        head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
+        keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
+        if open_log is None:
+            limits = segment_limits(run.robot)
+            writer: RunLog = LogWriter(
+                self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable, limits=limits
+            )
+        else:
+            writer = open_log(self.folder, head, run.start_ns, keep_pictures)
+        self._log = CountedLog(writer, on_event)
+        self._missing = RecordingLosses(self._log)
+        self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
+        self._keep_pictures = keep_pictures
+        self._schedule = PictureSchedule(self._options.picture_rate_hz, run.robot.devices.camera_fps)
+        self._port_is_lost = False
+        self._closed = False
+        self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
+
+    # --- wheels
+
+    def on_serial_bytes(self, data: bytes, host_ns: int) -> None:
+        """Takes what the port gave at `host_ns`: any number of bytes, cut anywhere."""
+        for each in self._intake.feed(data, host_ns):
+            self._write_reading(each)
+        self._write_waiting(host_ns)
+
+    def on_port_connected(self, name: str, host_ns: int) -> None:
+        """The port is open, for the first time or again."""
+        self._intake.parser.restart()
+        self._port_is_lost = False
+        self.event(EventKind.PORT_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
+
+    def on_port_lost(self, reason: str, host_ns: int) -> None:
+        """The port is gone."""
+        self._port_is_lost = True
+        self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
+
+    def _write_reading(self, each: StampedReading) -> None:
+        self._missing.note_reading(each, self._waiting.newest_wheels_ns)
+        self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
+        self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)
+        self._watches.wheels.heard(each.host_ns)
+
+    # --- camera
+
+    def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
+        """The camera is open, for the first time or again; `refused` says what it would not be set to."""
+        self._watches.camera.heard(host_ns)
+        self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
+        if refused:
+            text = f"{name} would not be set: {'; '.join(refused)}"
+            self.event(EventKind.CAMERA_SETTING, Severity.SEVERITY_WARNING, text, host_ns)
+
+    def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
+        """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
+        self._watches.camera.gone(at_its_end=at_its_end)
+        severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
+        self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
+
+    def on_detector_restarted(self, reason: str, host_ns: int) -> None:
+        """The detection's process had to be replaced."""
+        self.event(EventKind.DETECTOR_RESTARTED, Severity.SEVERITY_WARNING, reason, host_ns, 1)
+
+    def on_frame(
+        self, grey: NDArray[np.uint8], stamp_ns: int, receive_ns: int, source: "StampSource | int", sequence: int
+    ) -> None:
+        """Detects the tags in a grey picture [height, width] at once, and keeps the picture where one is due.
+
+        Args:
+            grey: the picture.
+            stamp_ns: middle of the exposure.
+            receive_ns: when the host received it.
+            source: where the stamp comes from.
+            sequence: the camera's picture number.
+
+        Raises:
+            LogError: the core was made without a detector.
+        """
+        if self._detector is None:
+            raise LogError("pictures came to a recorder that was made without a detector; give it one")
+        height_px, width_px = grey.shape
+        if self.wants_picture(stamp_ns):
+            self.on_picture(encode_jpeg(grey, self._options.jpeg_quality), stamp_ns, receive_ns)
+        self.on_detections(
+            self._detector.detect(grey),
+            (width_px, height_px),
+            stamp_ns,
+            receive_ns,
+            source,
+            sequence,
+            detector=self._detector.library,
+            detector_settings=self._detector.settings,
+        )
+
+    def on_detections(
+        self,
+        detections: Sequence[Detection],
+        size_px: tuple[int, int],
+        stamp_ns: int,
+        receive_ns: int,
+        source: "StampSource | int",
+        sequence: int,
+        *,
+        detector: str = "",
+        detector_settings: str = "",
+    ) -> None:
+        """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
+        self._watches.camera.heard(receive_ns)
+        odd_size = self._checks.odd_size(size_px)
+        if odd_size is not None:
+            self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, odd_size, receive_ns)
+        if self._checks.lost_its_stamps(source):
+            self._missing.note_stamp()
+        self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
+        try:
+            message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
+        except ValueError as error:  # protobuf's word for a number that does not fit its field
+            self._log.refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
+            return
+        self._waiting.add(message, receive_ns)
+        self._write_waiting(receive_ns)
+
+    def wants_picture(self, stamp_ns: int) -> bool:
+        """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
+        return self._keep_pictures and self._schedule.is_due(stamp_ns)
+
+    def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
+        """Keeps one picture, encoded as JPEG."""
+        if self._keep_pictures:
+            message = CompressedImage(timestamp=timestamp(stamp_ns), frame_id=CAMERA_FRAME, data=jpeg, format="jpeg")
+            self._log.write("/camera/image", message, receive_ns, stamp_ns)
+
+    def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
+        """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
+        self._watches.camera.heard(host_ns)
+        self._missing.note_pictures(kind, count, reason)
+
+    def _write_waiting(self, now_ns: int) -> None:
+        self._write_detections(self._waiting.take_ready(now_ns))
+
+    def _write_detections(self, ready: Iterable[ReadyDetections]) -> None:
+        for message, receive_ns in ready:
+            self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
+
+    # --- time
+
+    def tick(self, now_ns: int, realtime_ns: int | None = None, synchronised: bool = False) -> None:
+        """Does what is due without news from a device; call it a few times a second.
+
+        Args:
+            now_ns: now.
+            realtime_ns: the wall clock at that moment; None where it is the run's own, as in a simulation.
+            synchronised: whether something disciplines the wall clock.
+        """
+        for each in self._intake.release_due(now_ns):
+            self._write_reading(each)
+        self._write_waiting(now_ns)
+        for alarm in self._watches.alarms(now_ns, now_ns if realtime_ns is None else realtime_ns):
+            self.event(alarm.kind, Severity.SEVERITY_WARNING, alarm.text, now_ns)
+        self._log.tell_notes(now_ns)
+        if now_ns < self._next_anchor_ns:
+            return
+        self._next_anchor_ns = now_ns - now_ns % _ANCHOR_PERIOD_NS + _ANCHOR_PERIOD_NS
+        anchor = ClockAnchor(
+            stamp_ns=now_ns,
+            monotonic_ns=now_ns - self._run.run_epoch_ns,
+            realtime_ns=now_ns if realtime_ns is None else realtime_ns,
+            synchronised=synchronised,
+        )
+        self._log.write("/clock", anchor, now_ns, now_ns)
+        self._missing.tell(self._intake, now_ns)
+
+    def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
+        """Writes one event."""
+        self._log.event(kind, severity, text, host_ns, count)
+
+    def close(self, now_ns: int) -> None:
+        """Writes what still waits and finishes the files. A second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        for each in self._intake.release_all():
+            self._write_reading(each)
+        self._write_detections(self._waiting.take_all())
+        self._missing.tell(self._intake, now_ns)
+        self._missing.count_missing(self._watches, port_is_lost=self._port_is_lost)
+        self._log.tell_notes(now_ns)
+        lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
+        self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
+        self._log.close()

@@ -1,0 +1,67 @@
+"""Detections wait for the wheel reading after their picture, so that they can name the one before it."""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+from typing import Final, NamedTuple
+
+from groundsbot.onboard.log import TagDetections
+from groundsbot.onboard.wheels import WARM_UP_NS
+
+_WAIT_FOR_WHEELS_NS: Final = WARM_UP_NS  # readings that are held back come within that time too
+_WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
+
+
+class ReadyDetections(NamedTuple):
+    """Detections that wait no longer."""
+
+    message: TagDetections
+    receive_ns: int
+
+
+class WaitingDetections:
+    """Detections in their order, and the wheel readings that were written last."""
+
+    def __init__(self, *, wheels: bool) -> None:
+        """`wheels`: whether there are any to wait for."""
+        self._wait_ns = _WAIT_FOR_WHEELS_NS if wheels else 0
+        self._waiting: deque[ReadyDetections] = deque()
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence), in order
+
+    @property
+    def newest_wheels_ns(self) -> int | None:
+        """Stamp of the newest wheel reading; None: there was none."""
+        return self._recent[-1][0] if self._recent else None
+
+    def note_wheels(self, stamp_ns: int, sequence: int) -> None:
+        """A wheel reading has been written."""
+        self._recent.append((stamp_ns, sequence))
+
+    def add(self, message: TagDetections, receive_ns: int) -> None:
+        """Takes the detections of one picture."""
+        self._waiting.append(ReadyDetections(message, receive_ns))
+
+    def take_ready(self, now_ns: int) -> Iterator[ReadyDetections]:
+        """Gives those whose wheel readings are there, the sequence filled in, or that have waited long enough."""
+        return self._taken(lambda receive_ns: now_ns - receive_ns >= self._wait_ns)
+
+    def take_all(self) -> Iterator[ReadyDetections]:
+        """Gives all, at the end."""
+        return self._taken(lambda _: True)
+
+    def _taken(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:
+        newest_ns = self.newest_wheels_ns
+        while self._waiting:
+            message, receive_ns = self._waiting[0]
+            wheels_are_past = newest_ns is not None and newest_ns > message.stamp_ns
+            if not (wheels_are_past or is_late(receive_ns)):
+                return
+            self._name_wheels(message)
+            yield self._waiting.popleft()
+
+    def _name_wheels(self, message: TagDetections) -> None:
+        n_before = bisect_right(self._recent, message.stamp_ns, key=itemgetter(0))
+        if n_before:
+            message.has_wheel_sequence = True
+            message.wheel_sequence = self._recent[n_before - 1][1]
