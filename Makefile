@@ -49,12 +49,12 @@ pictures: demo
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks
-	$(BIN)/python -m tests.benchmarks.fleet
-	$(BIN)/python -m tests.benchmarks.solver_bench
-	$(BIN)/python -m tests.benchmarks.solver_scaling
-	$(BIN)/python -m tests.benchmarks.stages_bench
-	$(BIN)/python -m tests.benchmarks.corners_bench
-	$(BIN)/python -m tests.benchmarks.thinning_bench
+	$(BIN)/python -m tests.benchmarks.speed.fleet
+	$(BIN)/python -m tests.benchmarks.speed.solver_bench
+	$(BIN)/python -m tests.benchmarks.speed.solver_scaling
+	$(BIN)/python -m tests.benchmarks.speed.stages_bench
+	$(BIN)/python -m tests.benchmarks.speed.corners_bench
+	$(BIN)/python -m tests.benchmarks.speed.thinning_bench
 
 # Writes requirements.lock anew: exact versions and hashes for every platform.
 lock: $(READY)

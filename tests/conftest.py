@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
-from tests.programs import Outcome, Run
+from tests.support.programs import Outcome, Run
 
 if TYPE_CHECKING:
     from groundsbot.fixtures.recording.devices import PtyPort
@@ -147,6 +147,6 @@ def refused(map_to: Run, tmp_path: Path) -> Callable[..., str]:
 @pytest.fixture
 def logs(tmp_path: Path) -> dict[str, Path]:
     """Two short drives for `map`, by robot."""
-    from tests.map_cases import made_logs
+    from tests.support.data.map_cases import made_logs
 
     return made_logs(tmp_path / "logs")

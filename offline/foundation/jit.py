@@ -16,6 +16,7 @@ from numba import extending
 from numba.core import event, types
 
 _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
+_COMPILED: Final = re.compile(rb"^ *@(jitted|inner|inlined)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
 
 COMPILING: Final = "compiling the solver, this once; some twenty seconds"

@@ -1,4 +1,6 @@
 from .localization import localize
+from .online.drive import TagReading
+from .online.localizer import OnlineLocalizer, OnlinePose
 from .result import Candidate, Localization, LocatedRun, NotLocated
 
 __all__ = [
@@ -6,5 +8,8 @@ __all__ = [
     "Localization",
     "LocatedRun",
     "NotLocated",
+    "OnlineLocalizer",
+    "OnlinePose",
+    "TagReading",
     "localize",
 ]

@@ -1,7 +1,7 @@
 """The map to look at: report.html and map.png.
 
-In: a map and what it was made from. Out: a page that opens from disk without a network, and a picture. In the paper: its
-figures of maps.
+In: a map and what it was made from. Out: a page that opens from disk without a network, and a picture. In the paper:
+its figures of maps.
 """
 
 from lazy_loader import attach_stub

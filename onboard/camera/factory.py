@@ -14,8 +14,8 @@ def camera_for(settings: CameraSettings, clock: RunClock, since_ns: int) -> Came
         clock: the run's clock.
         since_ns: pictures in a folder that are older are left alone.
     """
-    from groundsbot.onboard.picture_folder import FolderCamera
-    from groundsbot.onboard.v4l2_camera import V4l2Camera
+    from groundsbot.onboard.camera.folder import FolderCamera
+    from groundsbot.onboard.camera.v4l2 import V4l2Camera
 
     path = Path(settings.device)
     if path.is_dir():

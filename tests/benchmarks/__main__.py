@@ -2,6 +2,6 @@
 
 import sys
 
-from tests.benchmarks import map_process
+from tests.benchmarks.speed import map_process
 
 sys.exit(map_process.main())

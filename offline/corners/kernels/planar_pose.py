@@ -1,9 +1,9 @@
 """Compiled: the two poses that explain the four corners of a square, and rays through pixels.
 
-As `groundsbot.calib.intrinsics.bundle.planar_poses`, which is by OpenCV and for any board; tests hold both to each other. Collins and
-Bartoli, "Infinitesimal plane-based pose estimation" (2014): the homography's first derivatives at the tag's centre fix
-its turn up to the sign of how it leans from the ray. Heckbert, "Fundamentals of texture mapping and image warping"
-(1989): the homography of a square.
+As `groundsbot.calib.intrinsics.bundle.planar_poses`, which is by OpenCV and for any board; tests hold both to each
+other. Collins and Bartoli, "Infinitesimal plane-based pose estimation" (2014): the homography's first derivatives at
+the tag's centre fix its turn up to the sign of how it leans from the ray. Heckbert, "Fundamentals of texture mapping
+and image warping" (1989): the homography of a square.
 """
 
 from typing import Final

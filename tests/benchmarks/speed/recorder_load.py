@@ -1,0 +1,257 @@
+"""The recorder under load: what is lost, how late, and what it costs, from a pseudo terminal and a folder of pictures.
+
+    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table]
+
+One run is 1 kHz of wheel lines and 30 pictures a second of 1280x720 with six tags, all pictures kept as they come.
+`--table` runs other sizes, rates and both detectors too, a shorter time each. The devices' processes are not counted.
+Results go to build/benchmarks/recorder_load.jsonl.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from groundsbot.calib.camera.file import write_camera_yaml
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, wheel_line
+from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
+from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from tests.support.tag_pictures import draw_tag
+
+OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
+_WARM_UP_S: Final = 5.0  # of the clock mapping
+_PICTURES: Final = 12  # different ones
+_TAGS: Final = 6
+_NOISE: Final = 2.0  # sigma of the sensor, grey levels
+_QUALITY: Final = 85
+_TICKS_HZ: Final = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Load:
+    """What the devices give."""
+
+    seconds: float
+    lines_hz: float = 1000.0
+    fps: float = 30.0
+    width_px: int = 1280
+    height_px: int = 720
+    detector: str = "pupil-apriltags"
+    keep: bool = True
+
+
+_ROWS: Final = (  # lines and pictures a second, size, pictures kept
+    (100.0, 15.0, 640, 480, False),
+    (100.0, 15.0, 640, 480, True),
+    (100.0, 15.0, 1280, 720, False),
+    (100.0, 15.0, 1280, 720, True),
+    (100.0, 30.0, 1280, 720, True),
+    (1000.0, 30.0, 1280, 720, True),
+    (100.0, 15.0, 1920, 1080, True),
+)
+
+
+def table(seconds: float) -> list[Load]:
+    """Loads for the page about the recorder."""
+    return [
+        Load(seconds, lines_hz, fps, width_px, height_px, detector, keep)
+        for lines_hz, fps, width_px, height_px, keep in _ROWS
+        for detector in ("pupil-apriltags", "pyapriltags")
+    ]
+
+
+def pictures(load: Load) -> list[bytes]:
+    """JPEG files of six tags on a textured wall, a little further along in each."""
+    rng = np.random.default_rng(1)
+    width, height = load.width_px, load.height_px
+    side = height / 5
+    texture = cv2.resize(rng.normal(0.0, 12.0, (height // 8, width // 8)), (width, height))
+    made = []
+    for step in range(_PICTURES):
+        grey = 150.0 + texture
+        for tag in range(_TAGS):
+            x, y = width * (0.5 + tag % 3) / 3 - side / 2 + 3.3 * step, height * (0.5 + tag // 3) / 2 - side / 2
+            patch = round(1.5 * side)
+            corners = np.array([[0.25, 0.25], [1.25, 0.3], [1.2, 1.3], [0.3, 1.25]]) * side * 0.95
+            left, top = round(x - 0.25 * side), round(y - 0.25 * side)
+            drawn = draw_tag("tag36h11", tag, corners, (patch, patch))
+            grey[top : top + patch, left : left + patch] = drawn[: height - top, : width - left]
+        noisy = np.clip(grey + rng.normal(0.0, _NOISE, grey.shape), 0, 255).astype(np.uint8)
+        made.append(cv2.imencode(".jpg", np.dstack([noisy] * 3), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+    return made
+
+
+def _speak(load: Load, folder: Path, go: Any, measured: Any, over: Any) -> None:
+    port = PtyPort(folder / "wheels", patient=True)  # held up itself, it would send more at once than a wire can
+    times: list[int] = []
+
+    def act(index: int) -> None:
+        now_ns = time.monotonic_ns()
+        port.send(wheel_line(index, now_ns))
+        times.append(now_ns)
+
+    go.wait()
+    at_rate(load.lines_hz, load.seconds, act)
+    measured.put((times, port.refused))
+    over.wait()  # a port that goes before the recording ends is a loss
+
+
+def _show(load: Load, folder: Path, go: Any, shown: Any, over: Any) -> None:
+    ready = pictures(load)
+    camera = PictureFolder(folder / "pictures", keep=60)
+    go.wait()
+    stamps: list[int] = []
+    at_rate(load.fps, load.seconds, lambda index: stamps.append(camera.show(ready[index % len(ready)])))
+    shown.put(len(stamps))
+    over.wait()
+
+
+def _robot(load: Load, folder: Path) -> Path:
+    model = CameraModel("front", load.width_px, load.height_px, 900.0, 900.0, 639.5, 359.5, "plumb_bob", (0.0,) * 5)
+    write_camera_yaml(model, folder / "camera.yaml")
+    path = folder / "robot.yaml"
+    path.write_text(f"""
+robot_id: load
+wheels: {{radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}}
+camera: camera.yaml
+devices: {{encoder_port: {folder / "wheels"}, encoder_baud: 921600, camera: pictures, camera_fps: {load.fps}}}
+recorder: {{picture_rate_hz: {load.fps if load.keep else 0.0}, detector: {load.detector}, quad_decimate: 2.0}}
+""")
+    return path
+
+
+def _processes(pid: int) -> Iterator[int]:
+    yield pid
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        children = ""
+        with suppress(OSError):  # a thread that has just ended
+            children = (task / "children").read_text()
+        for child in children.split():
+            yield from _processes(int(child))
+
+
+def _cpu_s(pid: int) -> dict[int, float]:
+    """Seconds of CPU that the process and each below it have had."""
+    used = {}
+    for each in _processes(pid):
+        fields = Path(f"/proc/{each}/stat").read_text().rpartition(") ")[2].split()
+        used[each] = (int(fields[11]) + int(fields[12])) / _TICKS_HZ
+    return used
+
+
+def _memory_mb(pid: int) -> float:
+    """What the processes have for themselves, and their shares of what they have in common."""
+    total_kb = 0
+    for each in _processes(pid):
+        lines = Path(f"/proc/{each}/smaps_rollup").read_text().splitlines()
+        total_kb += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return total_kb / 1000
+
+
+def run(load: Load, folder: Path) -> dict[str, Any]:
+    """Records once; returns what came of it."""
+    context = multiprocessing.get_context("spawn")
+    go, over, answers = context.Event(), context.Event(), (context.Queue(), context.Queue())
+    devices = [
+        context.Process(target=target, args=(load, folder, go, answer, over), daemon=True)
+        for target, answer in zip((_speak, _show), answers, strict=True)
+    ]
+    for each in devices:
+        each.start()
+    command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
+    with subprocess.Popen([*command, "--output", str(folder / "logs")], stdout=subprocess.PIPE, text=True) as recorder:
+        try:
+            assert recorder.stdout is not None
+            waited_for = {"port_connected", "camera_connected"}
+            while waited_for:
+                line = recorder.stdout.readline()
+                waited_for -= {word for word in waited_for if word in line}
+            before, start_s = _cpu_s(recorder.pid), time.monotonic()
+            go.set()
+            time.sleep(load.seconds)
+            after, end_s = _cpu_s(recorder.pid), time.monotonic()
+            memory_mb = _memory_mb(recorder.pid)
+            (measured_ns, refused), n_shown = (answer.get() for answer in answers)
+            time.sleep(0.5)
+            recorder.send_signal(signal.SIGTERM)
+            said = recorder.communicate()[0]
+        except BaseException:
+            recorder.kill()  # else nobody would tell it to end
+            raise
+        finally:
+            over.set()
+    shares = {pid: (after[pid] - before.get(pid, 0.0)) / (end_s - start_s) for pid in after}
+    own = shares.pop(recorder.pid)
+    found = {
+        **asdict(load),
+        "exit_code": recorder.returncode,
+        "cpu_recorder": round(own, 3),
+        "cpu_detection": round(sum(shares.values()), 3),
+        "cpu_total": round(own + sum(shares.values()), 3),
+        "memory_mb": round(memory_mb),
+        "refused_bytes": refused,
+        **_judged(folder / "logs", measured_ns, n_shown, load),
+    }
+    if recorder.returncode:
+        found["said"] = said[-400:]
+    return found
+
+
+def _judged(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict[str, Any]:
+    (log,) = find_logs([logs])
+    epoch_ns = read_run_info(log).run_epoch_ns
+    wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
+    frames = [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
+    kept = sum(1 for _ in read_log(log, ["/camera/image"])) if load.keep else 0
+    warm = round(_WARM_UP_S * load.lines_hz)
+    measured = np.array([measured_ns[each.sequence] for each in wheels])
+    # The least delay of a link cannot be seen from one end: here it is none, so nothing is taken out.
+    error_ms = np.abs(np.array([each.stamp_ns for each in wheels]) - epoch_ns - measured)[warm:] / 1e6
+    size = sum(each.stat().st_size for each in logs.rglob("*.mcap"))
+    return {
+        "lines_sent": len(measured_ns),
+        "lines_lost": len(measured_ns) - len({each.sequence for each in wheels}),
+        "pictures_shown": n_shown,
+        "pictures_undetected": n_shown - len(frames),
+        "pictures_not_kept": n_shown - kept if load.keep else 0,
+        "tags_per_picture": round(float(np.mean([len(each.detections) for each in frames])), 2),
+        "stamp_error_p99_ms": round(float(np.quantile(error_ms, 0.99)), 3),
+        "stamp_error_max_ms": round(float(error_ms.max()), 3),
+        "mb_per_hour": round(size / load.seconds * 3600 / 1e6),
+    }
+
+
+def main() -> int:
+    """Runs what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--table", action="store_true")
+    arguments = parser.parse_args()
+    loads = table(arguments.seconds) if arguments.table else [Load(arguments.seconds)]
+    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
+    for load in loads:
+        with tempfile.TemporaryDirectory(prefix="recorder_load_") as folder:
+            found = run(load, Path(folder))
+        with OUTPUT.open("a") as file:
+            file.write(json.dumps(found) + "\n")
+        sys.stdout.write(json.dumps(found) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Whether self-calibration spoils a map whose robot.yaml is right, seed by seed.
+
+    python -m tests.benchmarks.trust.gating_study --worlds room,nsh,nsh_flat,nsh_rough --seeds 0-99
+
+Drives without rendering, calibration drawn from the priors of robot.yaml; each is mapped with `--calibrate off` and
+`auto`, under the true noise and under one three times too small and too large. A row a map: RMSE of the starts and of
+the tags, as the map stands, and what was freed. Then RMSE over the seeds. Exit 1 where auto's is above 1.05 times
+off's, where one error of auto is above three times off's RMSE, or where a map came out in parts.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.worlds.world import World
+from groundsbot.offline.evaluation.truth import read_truth
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.self_calibration.option import Calibrate
+from groundsbot.onboard.log.reading.reader import find_logs
+from tests.benchmarks.accuracy.accuracy import study_worlds
+from tests.benchmarks.accuracy.accuracy_study import figures_of
+from tests.benchmarks.command_line import say, seeds_of
+
+MOST_RMSE: Final = 1.05
+MOST_SINGLE: Final = 3.0
+FACTORS: Final = (1.0, 1.0 / 3.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Errors of one seed's map in m, starts and tags (2,), with self-calibration off and on."""
+
+    world: str
+    seed: int
+    factor: float
+    off: tuple[float, float]
+    auto: tuple[float, float]
+    freed: tuple[str, ...]
+
+
+def study_seed(world: World, seed: int, factors: Sequence[float] = FACTORS) -> list[Pair | str]:
+    """A pair for each noise, or why there is none."""
+    true, rows = NoiseParameters(), list[Pair | str]()
+    with tempfile.TemporaryDirectory() as folder:
+        drives = Path(folder) / "drives"
+        simulate(world, seed, drives, render=False)
+        truth, runs = read_truth(drives / TRUTH_FILE), read_runs(find_logs([drives]))
+        for factor in factors:
+            noise = NoiseParameters(**{name: factor * value for name, value in true})
+            try:
+                off, auto = (build_map(runs, noise, calibrate=Calibrate(is_on=is_on)) for is_on in (False, True))
+                errors = [
+                    (f.start_rmse_m, f.tags_rmse_m) for f in (figures_of(seed, each, truth) for each in (off, auto))
+                ]
+            except ValueError as error:
+                rows.append(f"{world.name}, seed {seed}, noise {factor:.2g} times: {error}")
+                continue
+            freed = tuple(f"{each.name} of {each.owner}" for each in auto.choices if each.is_freed)
+            rows.append(Pair(world.name, seed, factor, errors[0], errors[1], freed))
+    return rows
+
+
+def summary(pairs: Sequence[Pair]) -> tuple[list[str], bool]:
+    """A line for each world and noise, and whether all bounds hold."""
+    lines, good = [], True
+    for world, factor in dict.fromkeys((each.world, each.factor) for each in pairs):
+        some = [each for each in pairs if (each.world, each.factor) == (world, factor)]
+        off, auto = np.array([each.off for each in some]), np.array([each.auto for each in some])
+        rmse = np.sqrt((off**2).mean(axis=0))
+        ratio, worst = np.sqrt((auto**2).mean(axis=0)) / rmse, auto.max(axis=0) / rmse
+        good &= bool((ratio <= MOST_RMSE).all() and (worst <= MOST_SINGLE).all())
+        n_freed = sum(bool(each.freed) for each in some)
+        lines.append(
+            f"{world:10s} noise {factor:5.2f} times, {len(some)} seeds: auto over off, starts {ratio[0]:.3f}, tags "
+            f"{ratio[1]:.3f}; largest error of auto over RMSE of off {worst[0]:.2f}, {worst[1]:.2f}; freed in {n_freed}"
+        )
+    return lines, good
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The script: 0 where every bound holds, else 1."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    known = study_worlds()
+    parser.add_argument("--worlds", default=",".join(known), help=f"[{','.join(known)}]")
+    parser.add_argument("--seeds", type=seeds_of, default="0-99", help="FIRST-LAST or one seed [0-99]")
+    given = parser.parse_args(arguments)
+    pairs, failed = [], False
+    for name in given.worlds.split(","):
+        for seed in given.seeds:
+            for row in study_seed(known[name], seed):
+                say(str(row))
+                failed |= isinstance(row, str)
+                pairs += [row] if isinstance(row, Pair) else []
+    lines, good = summary(pairs)
+    for line in lines:
+        say(line)
+    return 0 if good and not failed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,207 @@
+"""The parts of a calibration: derivatives, corners, poses, the fit on made corners."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.calib.board.corner_fit import Corners
+from groundsbot.calib.board.finder import BoardFinder
+from groundsbot.calib.board.finder import View as FoundView
+from groundsbot.calib.camera.model import CameraModel
+from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
+from groundsbot.calib.camera.planar_pose import board_pose
+from groundsbot.calib.intrinsics.bundle import Observations, Poses, adjusted
+from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
+from groundsbot.calib.intrinsics.projection_uncertainty import (
+    PictureGrid,
+    difference_px,
+    expected_error_px,
+    projection_covariance,
+    rms_px,
+)
+from groundsbot.calib.intrinsics.robust_fit import first_guess, fitted_lens
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of, drawn_views
+from tests.support.board_cases import CASES, FISHEYE, NARROW, WIDE
+from tests.support.board_views import PLAIN
+
+SIGMA_PX = 0.05
+FINDER = BoardFinder(DEFAULT_BOARD)
+every_camera = pytest.mark.parametrize("camera", CASES.values(), ids=lambda camera: camera.name)
+
+
+def made_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Observations, list[View]]:
+    """Exact corners and noise, without pictures."""
+    rng = np.random.default_rng(seed)
+    views = drawn_views(camera, DEFAULT_BOARD, count, rng)
+    number, points, pixels = [], [], []
+    for index, view in enumerate(views):
+        own = corners_of(view, camera, DEFAULT_BOARD)
+        seen = ((own > 0) & (own < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
+        number.append(np.full(seen.sum(), index))
+        points.append(FINDER.corners_m[seen])
+        pixels.append(own[seen] + SIGMA_PX * rng.standard_normal((seen.sum(), 2)))
+    corners = np.concatenate(pixels)
+    covariance = np.tile(0.0001 * np.eye(2), (len(corners), 1, 1))
+    return Observations(np.concatenate(number).astype(np.int64), np.concatenate(points), corners, covariance), views
+
+
+@every_camera
+def test_derivatives_by_the_parameters_agree_with_differences(camera: CameraModel) -> None:
+    rays = PictureGrid.of(camera, 9).rays.reshape(-1, 3)
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    exact = pixels_by_parameters(camera, rays, camera.project(rays))
+    at = parameters_of(camera)
+    for index in range(len(at)):
+        step = np.zeros(len(at))
+        step[index] = 1e-5 * max(abs(at[index]), 1.0)
+        ahead, behind = (with_parameters(camera, at + sign * step).project(rays) for sign in (1.0, -1.0))
+        difference = (ahead - behind) / (2.0 * step[index])
+        np.testing.assert_allclose(exact[..., index], difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("camera", [NARROW, WIDE, FISHEYE], ids=lambda camera: camera.name)
+def test_corners_lie_to_a_hundredth_of_a_pixel_and_their_covariance_says_so(camera: CameraModel) -> None:
+    rng = np.random.default_rng(5)
+    painter, errors, squares = BoardPainter(camera, DEFAULT_BOARD), [], []
+    for taken in drawn_views(camera, DEFAULT_BOARD, 3, rng):
+        view = FINDER.find(painter.picture(taken, rng))
+        assert view is not None
+        T = taken.T_camera_board
+        corners = FINDER.find_again(view, camera.project(FINDER.places_around_m() @ T[:3, :3].T + T[:3, 3])).corners
+        assert len(corners.ids) >= len(view.corners.ids)
+        error = corners.pixels - corners_of(taken, camera, DEFAULT_BOARD)[corners.ids]
+        errors.append(error)
+        squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(corners.covariance), error))
+    assert rms_px(np.concatenate(errors)) < 0.009  # both coordinates
+    assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.004
+    assert np.median(np.concatenate(squares)) == pytest.approx(chi2.median(2), rel=0.6)
+
+
+def test_light_that_slopes_across_the_board_moves_no_corner() -> None:
+    """By a third from side to side: it would move an edge by as much as it grows along it."""
+    rng = np.random.default_rng(5)
+    taken = drawn_views(NARROW, DEFAULT_BOARD, 1, rng)[0]
+    picture = BoardPainter(NARROW, DEFAULT_BOARD).picture(taken, rng)
+    slope = np.linspace(0.67, 1.0, NARROW.width_px)
+    places = FINDER.places_around_m() @ taken.T_camera_board[:3, :3].T + taken.T_camera_board[:3, 3]
+    found = []
+    for each in (picture, np.rint(picture * slope).astype(np.uint8)):
+        view = FINDER.find(each)
+        assert view is not None
+        found.append(FINDER.find_again(view, NARROW.project(places)).corners)
+    np.testing.assert_array_equal(found[0].ids, found[1].ids)
+    assert rms_px(found[1].pixels - found[0].pixels) < 0.003
+
+
+def test_corners_of_edges_along_the_pixels_rows_are_as_good_as_others() -> None:
+    """A renderer that samples before it blurs would show its beat there: 0.015 px."""
+    rng = np.random.default_rng(6)
+    T = np.eye(4)
+    T[:3, 3] = [-0.09, -0.11, 0.57]
+    taken = View(T)
+    corners = FINDER.find(BoardPainter(PLAIN, DEFAULT_BOARD).picture(taken, rng))
+    assert corners is not None
+    again = FINDER.find_again(corners, PLAIN.project(FINDER.places_around_m() + T[:3, 3])).corners
+    error = again.pixels - corners_of(taken, PLAIN, DEFAULT_BOARD)[again.ids]
+    assert np.sqrt((error**2).mean()) < 0.006
+
+
+def test_a_board_far_off_the_axis_of_a_fisheye_has_a_pose() -> None:
+    """Its origin may even lie behind the camera."""
+    seen, views = made_corners(FISHEYE, 1, 30)
+    origins = np.array([view.T_camera_board[2, 3] for view in views])
+    assert origins.min() < 0.0
+    for index, view in enumerate(views):
+        own = seen.view == index
+        pose = board_pose(seen.points_m[own], FISHEYE.unproject(seen.pixels[own]))
+        assert pose is not None
+        assert np.linalg.norm(pose[1] - view.T_camera_board[:3, 3]) < 0.01
+
+
+@every_camera
+def test_a_fit_finds_the_camera_to_within_its_covariance(camera: CameraModel) -> None:
+    squares = []
+    for seed in range(2):
+        seen, views = made_corners(camera, seed)
+        size_px = (camera.width_px, camera.height_px)
+        lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
+        off = parameters_of(lens.fit.model) - parameters_of(camera)
+        squares.append(float(off @ np.linalg.solve(lens.covariance(), off)))
+        assert lens.extra_sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
+        assert lens.views.all()
+    assert sum(squares) < chi2.ppf(0.999, 2 * len(parameters_of(camera)))
+    if camera.distortion_model != "rational_polynomial":  # there linear theory ends
+        assert sum(squares) > chi2.ppf(0.001, 2 * len(parameters_of(camera)))
+
+
+def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
+    seen, views = made_corners(WIDE, 1)
+    wrong = np.zeros(len(seen.view), dtype=bool)
+    wrong[np.random.default_rng(0).choice(len(wrong), 20, replace=False)] = True
+    seen.pixels[wrong] += [0.9, -0.7]
+    moved = seen.view == 3
+    seen.pixels[moved] += np.random.default_rng(1).normal(0.0, 0.6, (int(moved.sum()), 2))
+    lens = fitted_lens(seen, len(views), first_guess(seen, len(views), (640, 480), "plumb_bob", "c"))
+    assert list(np.nonzero(~lens.views)[0]) == [3]
+    assert not lens.corners[wrong].any()
+    assert lens.corners[~wrong & ~moved].mean() > 0.995
+    assert rms_px(difference_px(lens.fit.model, PictureGrid.of(WIDE))) < 0.1
+
+
+def test_a_turned_camera_is_no_other_camera() -> None:
+    """What a rotation makes up for does not count: a shift of the centre, nearly, of a narrow one."""
+    grid = PictureGrid.of(NARROW)
+    shifted = with_parameters(NARROW, parameters_of(NARROW) + np.array([0, 0, 1.0, 0, 0, 0, 0, 0, 0]))
+    assert rms_px(difference_px(shifted, grid)) < 0.2
+    longer = with_parameters(NARROW, parameters_of(NARROW) * np.array([1.01, 1.01, 1, 1, 1, 1, 1, 1, 1]))
+    assert rms_px(difference_px(longer, grid)) > 1.0
+
+
+@every_camera
+def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera: CameraModel) -> None:
+    seen, views = made_corners(camera, 2)
+    start = first_guess(seen, len(views), (640, 480), camera.distortion_model, "c")
+    lens = fitted_lens(seen, len(views), start)
+    covariance, grid = 0.01 * lens.covariance(), PictureGrid.of(lens.fit.model, 12)
+    predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid))
+    root = np.linalg.cholesky(covariance + 1e-18 * np.diag(np.diag(covariance)))
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(60):
+        other = with_parameters(lens.fit.model, parameters_of(lens.fit.model) + root @ rng.standard_normal(len(root)))
+        drawn.append((difference_px(other, grid) ** 2).sum(axis=-1))
+    ratio = np.sqrt(np.mean(drawn, axis=0)) / predicted
+    assert np.nanmin(ratio) > 0.7
+    assert np.nanmax(ratio) < 1.3
+
+
+@every_camera
+@pytest.mark.parametrize("n_corners", [1, 2])
+def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: CameraModel, n_corners: int) -> None:
+    """Robust weights may leave a spoilt view as few: its pose is then no matter, and the others tell the camera."""
+    seen, views = made_corners(camera, seed=2, count=6)
+    T_camera_board = np.array([view.T_camera_board for view in views])
+    poses = Poses(T_camera_board[:, :3, :3], T_camera_board[:, :3, 3])
+    counts = (seen.view > 0) | (np.cumsum(seen.view == 0) <= n_corners)
+    fit, others = (
+        adjusted(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2)) for each in (counts, seen.view > 0)
+    )
+    np.testing.assert_allclose(fit.information, others.information, rtol=1e-3, atol=1e-6 * others.information.max())
+
+
+def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
+    """A kind with more freedom fits a little better each time, and bends where there are no corners."""
+    size_px = (WIDE.height_px, WIDE.width_px)
+    for seed in range(3):
+        seen, views = made_corners(WIDE, seed=seed, count=8)
+        found = [_view_of(seen, index, size_px) for index in range(len(views))]
+        assert first_fit(found, FINDER, "camera", KINDS).fit.model.distortion_model != "rational_polynomial"
+
+
+def _view_of(seen: Observations, index: int, size_px: tuple[int, int]) -> FoundView:
+    own = seen.view == index
+    ids = np.array([np.argmin(np.linalg.norm(FINDER.corners_m - point, axis=1)) for point in seen.points_m[own]])
+    ones = np.ones(int(own.sum()))
+    corners = Corners(ids, seen.pixels[own], seen.covariance[own], blur_px=ones, contrast=100.0 * ones)
+    return FoundView(f"{index}", np.zeros(size_px, np.uint8), corners)

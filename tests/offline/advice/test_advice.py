@@ -1,0 +1,195 @@
+"""What is foretold of one more pass or tag is what a solve with it would find, and the best of them is advised."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.advice.advice import advise, candidates_of, judged, known_of
+from groundsbot.offline.advice.information_gain import Known
+from groundsbot.offline.advice.new_tags import Place, gain_of_place, place_beside
+from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
+from groundsbot.offline.advice.visibility import expected_sigmas_m, seen_shares
+from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.sensor_model.readings import joined
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.report.sentences import advice_sentence
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import Graph, build_graph
+from groundsbot.offline.sam.solver import Solution
+from tests.benchmarks.trust.advice_study import Scene, made_scene, trial
+
+NEW = TagKey("tag36h11", 500)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return made_scene(0)
+
+
+def sigmas_at(graph: Graph, state: State) -> dict[TagKey, float]:
+    """Exact ones, where a graph is linearised at a state."""
+    solution = Solution(state, (0.0,), "", True, graph.problem)
+    return dict(zip(graph.tags, known_of(solution, []).sigmas_m().tolist(), strict=True))
+
+
+def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
+    candidates = candidates_of(scene.graph, scene.solution.state)
+    wanted = candidates.passes[len(candidates.passes) // 2]
+    gain = gain_of_pass(scene.graph, scene.solution.state, wanted)
+    foretold = known_of(scene.solution, [gain]).sigmas_with_m(gain)
+    part = scene.graph.chains[wanted.chain].part(wanted.first, wanted.last + 1)
+    graph = build_graph([*scene.graph.chains, replace(part, name="again")])
+    state = scene.solution.state
+    driven = scene.graph.poses_of(state, wanted.chain)[wanted.first : wanted.last + 1]
+    exact = sigmas_at(graph, State(np.concatenate([state.poses, driven]), state.tags, state.calibration))
+    np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
+    assert foretold.max() < 0.999 * known_of(scene.solution, []).sigmas_m().max()
+
+
+def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
+    found = candidates_of(scene.graph, scene.solution.state)
+    place = max(found.places, key=lambda each: each.n_sightings)
+    gain = gain_of_place(found.drives, found.view, place)
+    foretold = known_of(scene.solution, [gain]).sigmas_with_m(gain)
+    state, chains = scene.solution.state, list(scene.graph.chains)
+    for i, chain in enumerate(chains):
+        first = int(scene.graph.first_pose[i])
+        keyframe = place.viewers[(place.viewers >= first) & (place.viewers < first + len(chain.stamps_ns))] - first
+        if not len(keyframe):
+            continue
+        like = chain.readings.where(np.zeros(len(keyframe), dtype=np.int64))
+        n_each = max(found.view.n_a_sighting * place.n_sightings / len(place.viewers), 1.0)
+        new = replace(
+            like,
+            keyframe=keyframe,
+            tag=np.full(len(keyframe), len(chain.tags)),
+            value=_seen(found.drives.sensors[first + keyframe], place),
+            covariance=like.covariance / n_each,  # all readings of these drives have the same
+        )
+        both = joined(chain.readings, new)
+        both = both.where(np.argsort(both.keyframe, kind="stable"))
+        chains[i] = replace(chain, tags=(*chain.tags, NEW), readings=both)
+    exact = sigmas_at(
+        build_graph(chains), State(state.poses, np.vstack([state.tags, place.position_m]), state.calibration)
+    )
+    del exact[NEW]
+    np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
+
+
+def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
+    """Its mount and scale would be another robot's."""
+    found = candidates_of(scene.graph, scene.solution.state)
+    place = found.places[0]
+    pose = int(scene.graph.first_pose[place.chain]) + place.keyframe
+    assert pose in place_beside(found.drives, found.view, place.chain, place.keyframe, 1.0).viewers
+    lengths = [len(each.stamps_ns) for each in scene.graph.chains]
+    is_silent = np.repeat(np.arange(len(lengths)), lengths) == place.chain
+    drives = found.drives._replace(example=np.where(is_silent, -1, found.drives.example))
+    assert not len(place_beside(drives, found.view, place.chain, place.keyframe, 1.0).viewers)
+
+
+def _seen(sensors: FloatArray, place: Place) -> FloatArray:
+    away = place.position_m - sensors[:, :2]
+    return np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0]) - sensors[:, 2]])
+
+
+def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
+    told = advise(scene.graph, scene.solution, 0)
+    best = judged(scene.graph, scene.solution)
+    assert sorted(each.kind for each in told) == ["pass", "tag"]
+    assert told[0].sigma_then_m <= told[1].sigma_then_m < told[0].sigma_m == pytest.approx(best[0].now_m.max())
+    found = candidates_of(scene.graph, scene.solution.state)
+    gains = {"pass": [gain_of_pass(scene.graph, scene.solution.state, each) for each in found.passes]}
+    drives, view = found.drives, found.view
+    gains["tag"] = [gain_of_place(drives, view, each) for each in found.places]
+    known = known_of(scene.solution, gains["tag"])
+    shares = [seen_shares(drives, view, each, known) for each in found.places]
+    assert {float(each.max()) for each in shares} == {1.0}  # from the pose beside it
+    assert min(float(each.min()) for each in shares) < 0.9  # some may have passed too far away
+    expected = [expected_sigmas_m(drives, view, each, known).max() for each in found.places]
+    for certain, doubtful in zip(gains["tag"], expected, strict=True):
+        assert known.sigmas_with_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
+    by_pass = known_of(scene.solution, gains["pass"])
+    foretold = {"tag": expected, "pass": [by_pass.sigmas_with_m(gain).max() for gain in gains["pass"]]}
+    for each in told:
+        assert each.sigma_then_m == pytest.approx(min(foretold[each.kind]))
+    (advised,) = [each for each in told if each.kind == "pass"]
+    assert advised.length_m is not None
+    assert 0.0 < advised.length_m <= most_length_m(found.drives.ways) <= 50.0
+    assert np.hypot(*np.diff(advised.way_m, axis=0).T).sum() <= 1.01 * advised.length_m
+
+
+def test_the_same_map_gets_the_same_advice(scene: Scene) -> None:
+    first, second = (advise(scene.graph, scene.solution, 0) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.way_m, b.way_m)
+        assert (a.tags, a.sigma_then_m) == (b.tags, b.sigma_then_m)
+
+
+def test_covariances_that_mean_nothing_give_no_advice(scene: Scene) -> None:
+    assert advise(scene.graph, replace(scene.solution, converged=False), 0) == []
+    alone = build_graph([replace(chain, name=str(i)) for i, chain in enumerate(_strangers(scene))])
+    state = State(
+        np.concatenate([each.T_start_base for each in scene.maps[:2]]),
+        np.zeros((len(alone.tags), 2)),
+        np.zeros(len(alone.parameters)),
+    )
+    assert advise(alone, Solution(state, (0.0,), "", True, alone.problem), 0) == []
+
+
+def _strangers(scene: Scene) -> list[Chain]:
+    first, second, *_ = (each.chain for each in scene.maps)
+    return [first, replace(second, tags=tuple(TagKey(tag.family, tag.tag_id + 200) for tag in second.tags))]
+
+
+def test_a_pass_and_a_tag_that_tell_nothing_change_nothing() -> None:
+    known = Known(np.arange(4), np.diag([1.0, 4.0, 9.0, 16.0]), 2)
+    np.testing.assert_allclose(known.sigmas_m(), [2.0, 4.0])
+
+
+def test_the_advice_in_words() -> None:
+    advice = {
+        "kind": "pass",
+        "run": "blue_two",
+        "tags": [{"family": "f", "tag_id": 3, "instance": ""}, {"family": "f", "tag_id": 7, "instance": "b"}],
+        "way_m": [[0.0, 1.0], [4.0, 1.0]],
+        "length_m": 14.2,
+        "worst_tag": {"family": "f", "tag_id": 12, "instance": ""},
+        "sigma_m": 0.314,
+        "sigma_then_m": 0.181,
+    }
+    assert advice_sentence(advice, several_families=False) == (
+        "One more pass from tag 3 to tag 7b, 14 m along the way of blue_two, would bring the largest sigma, tag 12's, "
+        "from 0.31 m to about 0.18 m."
+    )
+    tag = advice | {"kind": "tag", "way_m": [[4.04, -1.0]], "tags": advice["tags"][:1]}  # type: ignore[index]
+    assert advice_sentence(tag, several_families=True) == (
+        "One more tag at x 4.0 m, y -1.0 m (beside the way of blue_two; nearest is tag f:3), and the same drives "
+        "again, would bring the largest sigma, tag f:12's, from 0.31 m to about 0.18 m."
+    )
+    assert "hardly help" in advice_sentence(advice | {"sigma_then_m": 0.312}, several_families=False)
+
+
+def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
+    """The study in small."""
+    outcome = trial(scene, 0, 3)
+    assert outcome.n_beaten(0, ["pass", "tag"]) >= 5
+    assert outcome.found_m[0] == pytest.approx(outcome.foretold_m[0], rel=0.15)
+
+
+def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(scene: Scene) -> None:
+    """Readings that count by their probability would promise as good as all of what certain ones do."""
+    found = candidates_of(scene.graph, scene.solution.state)
+    drives, view = found.drives, found.view
+    known = known_of(scene.solution, [gain_of_place(drives, view, each) for each in found.places])
+    shares = [seen_shares(drives, view, each, known) for each in found.places]
+    place, share = min(zip(found.places, shares, strict=True), key=lambda each: float(each[1].min()))
+    without = known.sigmas_with_m(gain_of_place(drives, view, place, share > share.min()))
+    with_it = known.sigmas_with_m(gain_of_place(drives, view, place))
+    expected = expected_sigmas_m(drives, view, place, known)
+    worst = int(np.argmax(without - with_it))
+    assert with_it[worst] < expected[worst] < known.sigmas_m()[worst]
+    # Where not all see it, those that may have been farthest off do not.
+    assert expected[worst] >= share.min() * with_it[worst] + (1.0 - share.min()) * without[worst] - 1e-9

@@ -1,0 +1,53 @@
+"""`map` as a person meets it: what it says, and what it leaves behind."""
+
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+from groundsbot.offline.maps.files import read_map
+from tests.support.data.drives import made_robot, write_drive
+from tests.support.data.map_cases import DRIVES, TAGS
+from tests.support.programs import Run
+
+
+def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    outcome = map_to(logs["a"], logs["b"])
+    assert (outcome.code, outcome.err) == (0, "")
+    for part in ("a_one: ", "4 of 4 shared tags fit", "start of a_one to start of b_one: 1.118 m", "4 tags in one map"):
+        assert part in outcome.out
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    report = {"report.html"} if find_spec("plotly") else set()
+    files = {"map.json", "map.npz", "tags.csv", "map.png", "map.mcap", "a_one.tum", "b_one.tum"}
+    assert names == files | report
+    assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
+
+
+def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    outcome = map_to(tmp_path / "logs", "--json")
+    assert outcome.code == 0
+    assert [run["run"] for run in json.loads(outcome.out)["runs"]] == ["a_one", "b_one"]
+
+
+def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
+    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
+    outcome = map_to(logs["a"], logs["b"], alone)
+    assert outcome.code == 3
+    assert "c_one shares no tag with the others" in outcome.out
+    assert len(read_map(tmp_path / "out").components) == 2
+
+
+def test_recordings_are_left_alone(map_to: Run, logs: dict[str, Path]) -> None:
+    files = sorted(path for log in logs.values() for path in log.iterdir())
+    before = [path.read_bytes() for path in files]
+    map_to(*logs.values())
+    assert [path.read_bytes() for path in files] == before
+
+
+def test_a_map_is_replaced_only_when_told_so(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    assert map_to(logs["a"]).code == 0
+    assert map_to(logs["a"], logs["b"]).code == 1
+    assert len(read_map(tmp_path / "out").runs) == 1
+    assert map_to(logs["a"], logs["b"], "--overwrite").code == 0
+    assert len(read_map(tmp_path / "out").runs) == 2

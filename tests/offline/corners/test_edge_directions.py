@@ -1,0 +1,52 @@
+"""Which way sides face, for cameras that see them too far in: as corners are predicted, not as they were seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.tags.edges import outward
+from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.factors import CornerFactors, SpatialState
+from tests.offline.corners.test_factors import CAMERAS, made_factors, made_state
+
+
+def made(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
+    rng = np.random.default_rng(3)
+    return made_factors(rng, model), made_state(rng)
+
+
+def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
+    """What the factors hold the seen corners against, of a camera that sees sides where they are."""
+    sharp = replace(state, calibration=np.append(state.calibration[:-1], 0.0))  # the shift is the last one
+    off = factors.residual(sharp).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
+    return np.asarray(off + factors.looks.corners_px)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_sides_face_as_the_state_has_them(model: str) -> None:
+    factors, state = made(model)
+    faced = facing_as_predicted(factors, state)
+    np.testing.assert_allclose(faced.looks.outward, outward(predicted_px(factors, state)), atol=1e-9)
+    np.testing.assert_array_equal(faced.looks.corners_px, factors.looks.corners_px)
+
+
+def test_noise_of_seen_corners_turns_no_side() -> None:
+    factors, state = made()
+    seen = predicted_px(factors, state)
+    noise = np.random.default_rng(4).standard_normal(seen.shape)
+    clean, noisy = (
+        facing_as_predicted(replace(factors, looks=replace(factors.looks, corners_px=each)), state).looks.outward
+        for each in (seen, seen + noise)
+    )
+    np.testing.assert_array_equal(clean, noisy)
+
+
+def test_where_a_lens_has_no_image_sides_face_as_they_were_seen() -> None:
+    factors, state = made()
+    behind = replace(state, tags=np.where(np.arange(len(state.tags))[:, None] == 1, -state.tags, state.tags))
+    faced, hidden = facing_as_predicted(factors, behind), factors.looks.tag == 1
+    np.testing.assert_array_equal(faced.looks.outward[hidden], factors.looks.outward[hidden])
+    assert (faced.looks.outward[~hidden] != factors.looks.outward[~hidden]).any()
+    assert np.isfinite(faced.looks.outward).all()

@@ -1,0 +1,164 @@
+"""A map against a survey: figures, wrong entries, swapped pairs, scale, bad files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation.survey import SurveyEntry, judge_survey, read_survey
+from groundsbot.offline.maps.result import Component, MapResult, TagResult
+from tests.support.data.maps import made_component, made_map
+
+_N_TAGS = 15
+_SIGMA_M = 0.02
+T_SURVEY_MAP = np.array([300.0, -40.0, 2.5])
+
+
+def _places() -> FloatArray:
+    return np.array([[4.0 * (i // 3), 3.0 * (i % 3) + 0.4 * (i % 2)] for i in range(_N_TAGS)])
+
+
+def _component(rng: np.random.Generator) -> tuple[Component, FloatArray]:
+    """A map whose errors are drawn from its joint covariance: a common turn and noise. And the true places."""
+    true = _places()
+    turn = np.stack([-true[:, 1], true[:, 0]], axis=-1).reshape(-1, 1)
+    covariance = (0.01 * turn) @ (0.01 * turn).T + 0.01**2 * np.eye(2 * _N_TAGS)
+    found = true + rng.multivariate_normal(np.zeros(2 * _N_TAGS), covariance).reshape(-1, 2)
+    like = made_component()
+    joint = np.zeros((6 + 2 * _N_TAGS, 6 + 2 * _N_TAGS))
+    joint[6:, 6:] = covariance
+    tags = tuple(
+        TagResult("tag36h11", i, "", 0.15, place, covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], 9, ("red_one",))
+        for i, place in enumerate(found)
+    )
+    return replace(like, tags=tags, joint_covariance=joint), true
+
+
+def _surveyed(rng: np.random.Generator, true: FloatArray, scale: float = 1.0) -> list[SurveyEntry]:
+    measured = scale * se2.apply(T_SURVEY_MAP, true) + rng.normal(0.0, _SIGMA_M, true.shape)
+    return [SurveyEntry("", i, "", place, _SIGMA_M) for i, place in enumerate(measured)]
+
+
+def _map_and_survey(seed: int) -> tuple[MapResult, list[SurveyEntry]]:
+    rng = np.random.default_rng(seed)
+    component, true = _component(rng)
+    return made_map(component), _surveyed(rng, true)
+
+
+def test_a_good_survey_fits_with_honest_figures() -> None:
+    squares, flagged = [], 0
+    for seed in range(30):
+        result, survey = _map_and_survey(seed)
+        (judged,) = judge_survey(result, survey).components
+        flagged += len(judged.odd)
+        squares.append((judged.nees_per_dim or 0.0) * (2 * _N_TAGS - 3))
+        assert judged.rmse_m == pytest.approx(np.sqrt(2) * np.hypot(_SIGMA_M, 0.01), rel=0.5)
+        assert abs(judged.scale_error) < 4.0 * judged.scale_sigma
+    n = 30 * (2 * _N_TAGS - 3)
+    assert chi2.ppf(0.0005, n) < sum(squares) < chi2.ppf(0.9995, n)
+    assert flagged <= 1  # one in a thousand surveys
+
+
+def test_wrong_entries_are_named_with_their_shift() -> None:
+    result, survey = _map_and_survey(1)
+    d = np.array([0.3, -0.2])
+    survey[4] = replace(survey[4], position_m=survey[4].position_m + d)
+    survey[11] = replace(survey[11], position_m=survey[11].position_m + np.array([0.0, 15.0]))
+    (judged,) = judge_survey(result, survey).components
+    assert [(entry.tag.tag_id, entry.verdict) for entry in judged.odd] == [(4, "wrong"), (11, "wrong")]
+    assert np.linalg.norm(judged.odd[0].shift_m) == pytest.approx(np.linalg.norm(d), abs=0.1)
+    assert "entry tag36h11 4 looks wrong" in "\n".join(judged.lines())
+    assert judged.rmse_m < 0.06  # of those that fit
+
+
+def test_a_swapped_pair_is_named_as_one() -> None:
+    result, survey = _map_and_survey(2)
+    survey[3], survey[8] = (
+        replace(survey[3], position_m=survey[8].position_m),
+        replace(survey[8], position_m=survey[3].position_m),
+    )
+    (judged,) = judge_survey(result, survey).components
+    assert [(e.tag.tag_id, e.verdict, e.swapped_with) for e in judged.odd] == [(3, "swapped", 8), (8, "swapped", 3)]
+    assert "entry tag36h11 3 looks swapped with 8" in "\n".join(judged.lines())
+
+
+def test_a_wrong_scale_is_found_with_its_sigma() -> None:
+    rng = np.random.default_rng(3)
+    component, true = _component(rng)
+    (judged,) = judge_survey(made_map(component), _surveyed(rng, true, scale=0.99)).components
+    assert judged.scale_error == pytest.approx(0.01, abs=4.0 * judged.scale_sigma)
+    assert judged.scale_sigma < 0.003
+
+
+def test_a_tag_that_two_families_share_needs_its_family() -> None:
+    result, survey = _map_and_survey(4)
+    component = result.components[0]
+    other = replace(component.tags[1], family="tag25h9", tag_id=0)
+    result = made_map(replace(component, tags=(component.tags[0], other, *component.tags[2:])))
+    notes = judge_survey(result, survey).notes
+    assert notes == ("not in the map: tags 0, 1",)
+    survey[0] = replace(survey[0], family="tag36h11")
+    assert judge_survey(result, survey).notes == ("not in the map: tags 1",)
+
+
+def test_two_shared_tags_are_too_few() -> None:
+    result, survey = _map_and_survey(5)
+    with pytest.raises(OfflineError, match="shares 2 tags with the map, and three"):
+        judge_survey(result, survey[:2])
+
+
+def test_a_tag_with_and_without_its_family_is_no_third_tag() -> None:
+    result, survey = _map_and_survey(5)
+    again = replace(survey[1], family="tag36h11")
+    with pytest.raises(OfflineError, match="has tag 1 of tag36h11 twice, once without its family"):
+        judge_survey(result, [*survey[:2], again])
+
+
+def test_entries_in_one_place_tell_no_direction() -> None:
+    result, survey = _map_and_survey(6)
+    piled = [replace(entry, position_m=np.zeros(2)) for entry in survey]
+    with pytest.raises(OfflineError, match="all in one place"):
+        judge_survey(result, piled)
+
+
+def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
+    """The odd one is left out, and the others tell no direction then."""
+    result, survey = _map_and_survey(6)
+    (component,) = result.components
+    board = tuple(replace(tag, position_m=np.zeros(2)) for tag in component.tags[:3])
+    result = made_map(replace(component, tags=(*board, *component.tags[3:])))
+    piled = [replace(entry, position_m=np.zeros(2)) for entry in survey[:3]]
+    (judged,) = judge_survey(result, [*piled, replace(survey[14], position_m=np.array([1e3, 0.0]))]).components
+    assert [entry.tag.tag_id for entry in judged.odd] == [14]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tag_id,x_m\n1,2\n", "has no column y_m"),
+        ("tag_id,x_m,y_m\n1,2,3\n1,4,5\n", "line 3, column tag_id: '1' is there twice"),
+        ("tag_id,x_m,y_m\n1,2,1e200\n", "line 2, column y_m: '1e200' must be below 1e"),
+        ("tag_id,x_m,y_m,sigma_m\n1,2,3,1e200\n", "line 2, column sigma_m: '1e200' must be below 1000"),
+        ("tag_id,x_m,y_m\n1,2,nan\n", "line 2, column y_m: 'nan' is not finite"),
+        ("tag_id,x_m,y_m,sigma_m\n1,2,3,0\n", "column sigma_m: '0' must be above 0"),
+        ("", "is empty"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "survey.csv"
+    path.write_text(text)
+    with pytest.raises(OfflineError, match=said) as error:
+        read_survey(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_maps_own_tags_file_is_a_survey(tmp_path: Path) -> None:
+    path = tmp_path / "tags.csv"
+    path.write_text("tag_id,x_m,y_m,z_m,family,instance\n7,1.5,-2,,tag36h11,a\n")
+    (entry,) = read_survey(path)
+    assert (entry.family, entry.tag_id, entry.instance, entry.position_m.tolist()) == ("tag36h11", 7, "a", [1.5, -2.0])

@@ -1,0 +1,112 @@
+"""Stages of mapping: told as they go on, timed, and shown to the person who waits."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.offline.foundation import stages as stages_module
+from groundsbot.offline.foundation.stages import Stages
+from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+from tests.support.programs import Run, on_terminal
+
+ALL = [
+    "reading logs",
+    "keyframes and readings",
+    "local maps",
+    "tags that do not belong",
+    "breaks of odometry",
+    "fitting the noise",
+    "aligning local maps",
+    "building the graph",
+    "solving all runs together",
+    "covariances",
+    "advice",
+    "checking that it fits",
+    "writing files",
+    "drawing the picture",
+    "writing the report",
+]
+
+
+def test_beginning_and_progress_are_told() -> None:
+    told: list[tuple[str, int, int]] = []
+    stages = Stages(lambda *news: told.append(news))
+    with stages.stage("first", 2) as done:
+        done()
+        done()
+    with stages.stage("second"):
+        pass
+    assert told == [("first", 0, 2), ("first", 1, 2), ("first", 2, 2), ("second", 0, 1)]
+
+
+def test_a_stage_in_parts_is_one_stage_and_failures_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([1.0, 3.5, 10.0, 10.25, 20.0, 21.0])
+    monkeypatch.setattr("groundsbot.offline.foundation.stages.time.perf_counter", lambda: next(clock))
+    cpu_clock = iter([0.0, 2.0, 3.0, 3.25, 4.0, 4.5])
+    monkeypatch.setattr("groundsbot.offline.foundation.stages.time.process_time", lambda: next(cpu_clock))
+    stages = Stages()
+    with stages.stage("graph"):
+        pass
+    with stages.stage("solve"):
+        pass
+    with pytest.raises(ZeroDivisionError), stages.stage("graph"):
+        raise ZeroDivisionError
+    assert [cost[:3] for cost in stages.costs] == [("graph", 3.5, 2.5), ("solve", 0.25, 0.25)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells")
+def test_the_peak_is_of_this_process_and_never_falls() -> None:
+    """Whatever the tests before took and gave back: more than their peak is taken."""
+    stages = Stages()
+    with stages.stage("before"):
+        pass
+    peak_mib = stages.costs[0].peak_mib or 0.0
+    with stages.stage("large"):
+        np.ones(int((peak_mib + 60.0) * 2**17))  # gone at once
+    with stages.stage("after"):
+        pass
+    before, large, after = (cost.peak_mib or 0.0 for cost in stages.costs)
+    assert before + 40.0 < large <= after
+
+
+def test_no_peak_where_the_kernel_tells_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(stages_module, "_STATUS", tmp_path / "none")
+    stages = Stages()
+    with stages.stage("any"):
+        pass
+    assert stages.costs[0].peak_mib is None
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    tags = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 2.0, 0.4), np.pi), MadeTag(2, (6.0, -1.0, 0.6), np.pi)]
+    for name, start in (("a", [0.0, 0.0, 0.2]), ("b", [0.5, 1.0, -0.1])):
+        write_drive(tmp_path / "logs", made_drive(start, [(0.5, 0.52, 3.0)]), tags, made_robot(name))
+    return tmp_path / "logs"
+
+
+def test_verbose_prints_each_stage(run: Run, logs: Path, tmp_path: Path) -> None:
+    outcome = run("map", logs, "-o", tmp_path / "map", "-v")
+    assert (outcome.code, outcome.err) == (0, "")
+    table = outcome.out[outcome.out.index("stage  ") :].splitlines()[1:]
+    assert [line[:28].rstrip() for line in table] == ALL
+
+
+def test_verbose_json_holds_the_stages_and_the_map_file_does_not(run: Run, logs: Path, tmp_path: Path) -> None:
+    outcome = run("map", logs, "-o", tmp_path / "map", "--verbose", "--json")
+    printed = json.loads(outcome.out)
+    stages = printed.pop("stages")
+    assert [stage["name"] for stage in stages] == ALL
+    assert all(stage["seconds"] >= 0.0 for stage in stages)
+    assert printed == json.loads((tmp_path / "map" / "map.json").read_text())
+    assert "stages" not in json.loads(run("map", logs, "-o", tmp_path / "again", "--json").out)
+
+
+def test_a_terminal_shows_the_stages_and_is_left_clean(logs: Path, tmp_path: Path) -> None:
+    code, shown, printed = on_terminal("-m", "groundsbot.offline.cli", "map", logs, "-o", tmp_path / "map")
+    assert code == 0
+    assert "drawing the picture" in shown
+    assert shown.endswith("\x1b[2K")  # the bar's line is wiped
+    assert "stage " not in printed

@@ -1,0 +1,50 @@
+"""Whether runs fit together is told from solves that are there, and agrees with fitting the windows of all of them."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.goodness_of_fit import joined_goodness
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.sam.solver import Solution
+from tests.support.data.moved_tags import CLEAN, MOVED, made_scene
+
+
+@cache
+def mapped(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
+    """Two runs under fitted noise, joined; tags are moved between them and taken for one all the same."""
+    drives = made_scene(41, kind, n_tags, 0.5).drives[1:3]
+    maps = fit_and_weigh([solve_local_map(drive.chain) for drive in drives], NoiseParameters()).maps
+    (group,) = merge(maps).groups
+    _, solution = solve_global_map(maps, group, Stages())
+    return maps, solution
+
+
+def by_windows(solution: Solution) -> Goodness:
+    return fitted_windows(solution.problem).judge(solution.state)
+
+
+@pytest.mark.parametrize(("kind", "n_tags", "fits"), [(CLEAN, 0, True), (MOVED, 4, False)])
+def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fits: bool) -> None:
+    maps, solution = mapped(kind, n_tags)
+    assert all(each.goodness.fits for each in maps)
+    found, all_windows = joined_goodness(maps, solution), by_windows(solution)
+    assert found.fits == all_windows.fits == fits
+    assert found.expected == all_windows.expected
+    assert found.chi_square == pytest.approx(all_windows.chi_square, rel=0.2)
+    assert found.bound == pytest.approx(all_windows.bound, rel=0.2)
+
+
+def test_sigmas_that_were_told_are_not_believed() -> None:
+    """Windows then tell how far off they are, and nothing is added up."""
+    maps, solution = mapped(CLEAN, 0)
+    told = [replace(each, goodness=replace(each.goodness, reading_factor=1.5)) for each in maps]
+    assert joined_goodness(told, solution) == by_windows(solution)
+    assert joined_goodness(maps, solution) != by_windows(solution)

@@ -1,0 +1,118 @@
+"""Wheels held against tags: by how much they differ is found, with an honest sigma, and said where it is too much."""
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import TAG_SCALE
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.scale_checks import check_warnings
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.warnings import calibration_warnings
+from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tape import TapeOptions
+from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
+
+ROUND = [(0.5, 0.5, 4.0), (0.3, 0.5, 7.85), (0.5, 0.5, 4.0), (0.5, 0.3, 7.85), (0.2, -0.2, 7.85)]
+PLACES = np.array([[2.0, 1.0], [1.0, -2.0], [4.0, 4.0], [-1.0, 3.0], [3.0, 0.5], [-2.0, 1.0]])
+SIGMA_M = 0.03
+
+
+def mapped(size: float = 1.0, track: float = 1.0, seed: int | None = None, distance: str | None = None) -> MapResult:
+    """A drive past six tags; these are `size` times what is told, the track is `track` times that.
+
+    Args:
+        size: of the tags.
+        track: of the robot.
+        seed: of noise of the sigma told; none where None.
+        distance: --distance.
+    """
+    drive = made_drive([0.0, 0.0, 0.0], ROUND, track_m=0.5 * track, step_ns=50_000_000)
+    at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(drive.stamps_ns) : 4, 0 : len(PLACES)])
+    seen: FloatArray = se2.apply(se2.inverse(drive.T_world_base[at]), PLACES[tag]) / size
+    if seed is not None:
+        seen = seen + SIGMA_M * np.random.default_rng(seed).standard_normal(seen.shape)
+    run = made_run(
+        [drive.track],
+        robot=made_robot("carl"),
+        tags=[TagKey(FAMILY, i) for i in range(len(PLACES))],
+        positions=made_positions(drive.stamps_ns[at], tag, seen, SIGMA_M),
+    )
+    return build_map([run], NoiseParameters(), Stages(), TapeOptions(distances=[distance] if distance else []))
+
+
+def check(result: MapResult, name: str) -> CheckResult:
+    (found,) = [each for each in result.checks if each.name == name]
+    return found
+
+
+def contradictions(result: MapResult) -> list[str]:
+    return [warning for warning in result.warnings if warning.startswith("wheels and tags contradict each other")]
+
+
+def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
+    result = mapped(size=1.10)
+    scale = check(result, "scale")
+    assert scale.value == pytest.approx(0.10, abs=0.01)
+    assert scale.sigma < 0.01
+    assert scale.batch == f"default {FAMILY}"
+    (said,) = contradictions(result)
+    assert "what the tags (default tag36h11) call one is" in said
+    assert "longer by the wheels of carl" in said
+    assert "the tags are larger than their size says" in said
+    assert "outer edge of the black border" in said
+
+
+def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
+    result = mapped(track=1.15)
+    turn = check(result, "turn")
+    assert turn.value == pytest.approx(-0.15, abs=0.03)
+    (said,) = contradictions(result)
+    assert "less than its wheels say" in said
+    assert "track_m" in said
+
+
+def test_what_is_as_told_contradicts_nothing() -> None:
+    result = mapped()
+    for name in ("scale", "turn"):
+        assert check(result, name).value == pytest.approx(0.0, abs=1e-6)
+    assert not contradictions(result)
+
+
+def test_values_are_off_by_as_much_as_their_sigmas_say() -> None:
+    """Readings are noisy, wheels are not; so what the wheels' sigma adds is no error here."""
+    found = [check(mapped(seed=seed), "scale") for seed in range(5)]
+    assert all(abs(each.value) < 4.0 * each.sigma for each in found)
+
+
+def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
+    apart_m = float(np.linalg.norm(PLACES[2] - PLACES[5]))
+    one, other = check(mapped(size=1.02), "scale"), check(mapped(size=1.02, distance=f"2,5={apart_m!r},0.001"), "scale")
+    assert other.value == pytest.approx(one.value, abs=0.2 * one.sigma)
+    assert other.sigma == pytest.approx(one.sigma, rel=0.2)
+
+
+def test_sigmas_count_both_what_readings_and_what_robot_yaml_leave_open() -> None:
+    checks = [CheckResult("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
+    assert checks[0].sigmas == pytest.approx(0.05 / np.hypot(0.003, 0.01))
+    assert len(check_warnings(checks)) == 1
+
+
+def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
+    """What a check tells of is not told twice; another robot's wheels and other prints are another matter."""
+    told = CheckResult("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
+    corrections = [
+        CalibrationResult(owner, name, 0, value=0.05, sigma=0.001, prior_sigma=0.005)
+        for owner, name in (
+            ("carl", "wheel_scale"),
+            ("printed", TAG_SCALE),
+            ("dora", "wheel_scale"),
+            ("new", TAG_SCALE),
+        )
+    ]
+    warnings = calibration_warnings(corrections, [told])
+    assert [warning.partition(" came out")[0] for warning in warnings] == ["wheel_scale of dora", "tag_scale of new"]

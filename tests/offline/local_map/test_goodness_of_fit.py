@@ -1,0 +1,148 @@
+"""Whether a solve fits together, told without the truth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map import goodness_of_fit as goodness
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows, in_windows
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers import local_maps
+from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import Solution, solve
+from tests.support.data.drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
+from tests.support.data.long_drives import made_long_drive, with_a_moved_tag
+
+LENGTH_M = 500.0
+
+
+def judged(chain: Chain) -> Goodness:
+    return solve_local_map(chain).goodness
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
+    """Plain Levenberg-Marquardt from dead reckoning ends in a wrong valley here; the same windows judge both."""
+    drive = made_long_drive(seed, LENGTH_M)
+    graph = build_graph([drive.chain])
+    right = solve(graph.problem, drive.true_state(graph))
+    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckoned(), {}, {}))
+    assert wrong.cost > 1.01 * right.cost
+    windows = fitted_windows(graph.problem)
+    assert windows.judge(right.state).fits
+    assert windows.judge(right.state).warnings("a_run") == []
+    verdict = windows.judge(wrong.state)
+    assert not verdict.fits
+    (sentence,) = verdict.warnings("a_run")
+    assert sentence.startswith("a_run: its readings contradict each other")
+    assert f"chi-square {verdict.chi_square:.0f}, expected {verdict.expected}" in sentence
+
+
+def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
+    """Told of twice the wheels' noise and half that of the readings, the check finds as much less and more."""
+    chain = made_long_drive(5, LENGTH_M).chain
+    odometry, readings = chain.odometry, chain.readings
+    told_wrong = replace(
+        chain,
+        odometry=replace(odometry, covariance=4.0 * odometry.covariance),
+        readings=replace(readings, covariance=0.25 * readings.covariance),
+    )
+    one, other = judged(chain), judged(told_wrong)
+    # What was told counts a little: like four measurements.
+    assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
+    assert other.reading_factor == pytest.approx(2.0 * one.reading_factor, rel=0.05)
+    assert other.expected == one.expected
+    assert other.chi_square == pytest.approx(one.chi_square, rel=0.3)
+
+
+def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wheels and readings take turns at what rounding leaves over; both would go on to and fro."""
+    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
+    stamps_ns, tag = drive.stamps_ns[::5], np.arange(len(drive.stamps_ns[::5])) % 3
+    places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]
+    positions = made_positions(stamps_ns, tag, se2.apply(se2.inverse(drive.at(stamps_ns)), places))
+    tags = [TagKey(FAMILY, i) for i in range(3)]
+    (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    rounds = []
+    left_over = goodness._left_over
+
+    def counted(solution: Solution) -> tuple[FloatArray, FloatArray]:
+        rounds.append(solution)
+        return left_over(solution)
+
+    monkeypatch.setattr(goodness, "_left_over", counted)
+    windows = fitted_windows(build_graph([chain]).problem)
+    assert (windows.factors < 0.1).all()
+    assert len(rounds) <= 8
+
+
+def test_single_wrong_readings_do_not_count_against_a_map() -> None:
+    chain = made_long_drive(5, LENGTH_M).chain
+    readings = chain.readings
+    value = readings.value.copy()
+    value[::20] += [1.0, 0.5]
+    assert judged(replace(chain, readings=replace(readings, value=value))).fits
+
+
+def test_a_tag_that_moved_in_between_is_noticed() -> None:
+    drive = made_long_drive(5, LENGTH_M)
+    graph = build_graph([with_a_moved_tag(drive)])
+    best = solve(graph.problem, drive.true_state(graph))
+    assert not fitted_windows(graph.problem).judge(best.state).fits
+
+
+@pytest.mark.parametrize("bias_px", [0.0, 5.0])
+def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
+    """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
+    chain = with_a_moved_tag(made_long_drive(5, LENGTH_M))
+    readings = chain.readings
+    parts = CovarianceParts(
+        ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
+    )
+    biased = replace(readings, parts=parts, corner_bias_px=np.full((len(readings), 2), bias_px))
+    assert judged(replace(chain, readings=biased)).fits is (bias_px > 0.0)
+
+
+def test_windows_share_neither_poses_nor_tags() -> None:
+    problem = build_graph([made_long_drive(5, LENGTH_M).chain]).problem
+    apart = in_windows(problem, 10.0)
+    windows = np.cumsum(apart.columns.poses[:, 0] < 0)
+    assert windows[-1] == pytest.approx(LENGTH_M / 10.0, abs=2)
+    assert (windows[apart.odometry.first] == windows[apart.odometry.first + 1]).all()
+    of_reading = windows[apart.readings.pose]
+    for tag in range(len(apart.columns.tags)):
+        assert len(set(of_reading[apart.readings.tag == tag])) == 1
+    assert sorted(set(apart.columns.poses[apart.columns.poses >= 0])) == list(range(int(apart.columns.tags[0, 0])))
+
+
+def test_what_no_condition_joins_fits() -> None:
+    """A drive of one window has nothing to contradict."""
+    drive = made_long_drive(5, LENGTH_M)
+    verdict = judged(drive.chain.prefix(30))
+    assert verdict.expected == 0
+    assert verdict.fits
+
+
+def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tags = [MadeTag(i, (4.0, 1.5 * i - 1.5, 0.5), np.pi) for i in range(3)]
+    log = write_drive(tmp_path, made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
+    assert build_map(read_runs([log])).warnings == ()
+
+    def contradictory(chain: Chain, _: Effort) -> LocalMap:
+        return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
+
+    monkeypatch.setattr(local_maps, "solve_local_map", contradictory)
+    (warning,) = build_map(read_runs([log])).warnings
+    assert warning.startswith("carl_one: its readings contradict each other")
+    assert "(chi-square 300, expected 40, at most 80)" in warning

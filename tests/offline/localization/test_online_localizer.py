@@ -1,0 +1,153 @@
+"""The class for the robot: reading by reading, with the result of the batch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import groundsbot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.localization.localization import localize_maps
+from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
+from groundsbot.offline.localization.result import LocatedRun
+from groundsbot.offline.measurements.chain import Chain
+from tests.benchmarks.accuracy.localize_study import (
+    Scene,
+    against,
+    filtered,
+    judged,
+    made_scene,
+    missed,
+    taken_one_by_one,
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    made = made_scene(4)
+    assert made is not None
+    return made
+
+
+def test_the_study_in_small(scene: Scene) -> None:
+    """Its bounds, of one seed with moved tags and one without, the online class within 2 % of a sigma of the batch."""
+    moved = made_scene(3)
+    assert moved is not None
+    rows = [judged(4, scene), judged(3, moved)]
+    assert [sentence for sentence in missed(rows) if "NEES" not in sentence and "slowest" not in sentence] == []
+    assert (rows[1].moved_missed, rows[1].falsely_named) == (0, 0)
+    for row in rows:
+        assert row.found
+        assert row.nees is not None
+        assert row.nees < 6.9  # chi-square with two degrees of freedom, once in a thousand times, were all poses one
+        assert row.settled_off is not None
+        assert row.settled_off < 1e-3
+    assert rows[0].online_off is not None
+    assert rows[0].online_off < 1e-3
+    # Three of the four tags seen were moved: nothing is told before all is judged at once.
+    assert "may as well be those that stayed" in rows[1].online_reason
+
+
+def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None:
+    chain = scene.drive.chain
+    online = OnlineLocalizer(scene.known, chain.run.robot)
+    assert online.reason == "no tag of the map was seen yet"
+    reasons = []
+    for motion, readings in taken_one_by_one(chain):
+        if motion is not None:
+            online.add_motion(*motion)
+        for reading in readings:
+            online.add_reading(reading)
+            reasons.append(online.reason)
+            assert (online.pose is None) == bool(online.reason)
+    assert "one tag of the map was seen; two are needed" in reasons
+    assert reasons[-1] == ""
+
+
+def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
+    """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
+    made = made_scene(47)
+    assert made is not None
+    online = OnlineLocalizer(made.known, made.drive.chain.run.robot)
+    seen, starts = set[int](), []
+    doubted = set[int]()
+    for motion, readings in taken_one_by_one(made.drive.chain):
+        if motion is not None:
+            online.add_motion(*motion)
+        for reading in readings:
+            seen.add(reading.tag_id)
+            if online.add_reading(reading) is not None:
+                starts.append(len(seen))
+            doubted |= {tag.tag_id for tag in online.moved_tags}
+    assert starts[0] == 3  # two agree by their distance only, which a tag that was moved may keep
+    assert doubted - made.moved
+    assert {tag.tag_id for tag in online.moved_tags} == made.moved
+    (run,) = localize_maps([made.local_map], made.known).runs
+    assert _most_off(run, online) < 0.02
+    online.settle()
+    assert _most_off(run, online) < 1e-3
+    assert {tag.tag_id for tag in online.moved_tags} == made.moved
+
+
+def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
+    """All tags but the first three elsewhere, as one: they are more, and may be those that stayed."""
+    chain = scene.drive.chain
+    online = OnlineLocalizer(scene.known, chain.run.robot)
+    first: list[int] = []
+    located = 0
+    for motion, readings in taken_one_by_one(chain):
+        if motion is not None:
+            online.add_motion(*motion)
+        for reading in readings:
+            if reading.tag_id not in first and online.pose is None and not located:
+                first.append(reading.tag_id)
+            aside = np.zeros(2) if reading.tag_id in first else np.array([1.5, 0.0])
+            located += online.add_reading(replace(reading, value=reading.value + aside)) is not None
+    assert located
+    assert online.pose is None
+    assert online.reason == "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
+
+
+def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
+    """Ids that the map does not have: nothing is located, and nothing breaks."""
+    chain = scene.drive.chain
+    renamed = tuple(tag._replace(tag_id=tag.tag_id + 500) for tag in chain.tags)
+    online, _ = filtered(replace(scene, drive=replace(scene.drive, chain=replace(chain, tags=renamed))))
+    assert online.pose is None
+    assert online.reason == "no tag of the map was seen; two are needed"
+    assert online.settle() is None
+
+
+def test_readings_that_are_no_numbers_and_components_that_are_not_there_are_refused(scene: Scene) -> None:
+    robot = scene.drive.chain.run.robot
+    online = OnlineLocalizer(scene.known, robot)
+    with pytest.raises(OfflineError, match="holds no numbers"):
+        online.add_reading(TagReading("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
+    with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has 1"):
+        OnlineLocalizer(scene.known, robot, component=1)
+
+
+def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene) -> None:
+    """Settled half way, and at the end."""
+    chain: Chain = scene.drive.chain
+    online = OnlineLocalizer(scene.known, chain.run.robot)
+    half = len(chain.stamps_ns) // 2
+    for k, (motion, readings) in enumerate(taken_one_by_one(chain)):
+        if motion is not None:
+            online.add_motion(*motion)
+        for reading in readings:
+            online.add_reading(reading)
+        if k == half:
+            online.settle()
+    (run,) = localize_maps([scene.local_map], scene.known).runs
+    assert _most_off(run, online) < 0.02
+    online.settle()
+    assert _most_off(run, online) < 1e-3
+
+
+def _most_off(run: LocatedRun, online: OnlineLocalizer) -> float:
+    off, sigma = against(run, online)
+    assert off is not None
+    assert sigma is not None
+    return max(off, sigma)

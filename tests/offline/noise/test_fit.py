@@ -1,0 +1,202 @@
+"""The noise of drives, found again from far off; and where it is not believed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.parameter_results import NOT_NEEDED
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.motion_model.odometry import ODOMETRY_NOISE
+from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.noise import fit as noise_fit
+from groundsbot.offline.noise.reweighing import fit_and_weigh, weighed_as
+from groundsbot.onboard.log.reading.reader import find_logs
+from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
+from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+
+PRIOR = NoiseParameters()
+HALL = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi), MadeTag(2, (0.0, 1.2, 0.45), 0.1)]
+
+
+@pytest.fixture(scope="module")
+def maps(room: Path) -> list[LocalMap]:
+    return [solve_local_map(chain) for log in find_logs([room]) for chain in chains_of(load_run(log), PRIOR)]
+
+
+def test_noise_is_found_from_ten_times_too_large_and_too_small() -> None:
+    """The whole study is tests/benchmarks/trust/noise_study.py."""
+    rows = [row for row in study_seed("room", 3, (0.1, 10.0)) if isinstance(row, Mapped)]
+    lines, _ = summary(rows)
+    assert lines[-1].startswith("2 maps: mean tags NEES")
+    for row in rows:
+        # Wheels that slip go sideways too, which no lateral noise was drawn for.
+        fitted = {
+            each.found.name: each
+            for each in row.parameters
+            if not each.found.kept and each.found.name != "sigma_lateral_m_per_sqrt_m"
+        }
+        assert fitted.keys() >= {"sigma_corner_px", "sigma_distance_m_per_sqrt_m"}
+        for each in fitted.values():
+            assert each.found.high is not None
+            assert abs(np.log(each.ratio)) / np.log(each.found.high / each.found.value) < 4.0 / 2.576
+            assert each.close in (True, None)
+        assert 0.2 < row.nees_tags < 2.5
+
+
+def test_what_is_fitted_is_used_and_told(room: Path) -> None:
+    result = build_map(read_runs(find_logs([room])))
+    assert result.noise_fit is not None
+    assert result.noise_fit.runs == ("a_seed3", "b_seed3", "c_seed3")
+    by_name = {each.name: each for each in result.noise_fit.parameters}
+    assert list(by_name) == list(NoiseParameters.model_fields)
+    for name, each in by_name.items():
+        assert each.value == getattr(result.noise, name)
+        assert (each.low is None) == bool(each.kept)
+    corner = by_name["sigma_corner_px"]
+    assert corner.low is not None
+    assert corner.high is not None
+    assert corner.low < corner.value < corner.high
+    assert corner.value != PRIOR.sigma_corner_px
+    assert by_name["sigma_range_m"].kept == NOT_NEEDED
+    assert by_name["sigma_range_m"].value == PRIOR.sigma_range_m
+
+
+def test_noise_that_is_given_is_fitted_no_more(room: Path) -> None:
+    given = PRIOR.model_copy(update={"sigma_corner_px": 0.4})
+    result = build_map(read_runs(find_logs([room / "a"])), noise=given)
+    assert result.noise == given
+    assert result.noise_fit is None
+
+
+def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no_more(maps: list[LocalMap]) -> None:
+    odd = replace(maps[0], goodness=replace(maps[0].goodness, chi_square=1e4))
+    found = fit_and_weigh([odd, *maps[1:]], PRIOR)
+    assert found.fitted.runs == tuple(each.chain.name for each in maps[1:])
+    assert found.fitted.contradicting == (odd.chain.name,)
+    assert found.noise == fit_and_weigh(maps[1:], PRIOR).noise
+    larger = {name: max(value, getattr(PRIOR, name)) for name, value in found.noise.model_dump().items()}
+    assert larger != found.noise.model_dump()
+    expected = maps[0].chain.weighed(NoiseParameters(**larger)).odometry.covariance
+    np.testing.assert_allclose(found.maps[0].chain.odometry.covariance, expected)
+    alone = fit_and_weigh([odd], PRIOR)
+    assert alone.noise == PRIOR
+    assert {each.kept for each in alone.fitted.parameters} == {"no run has tag readings that fit together"}
+    assert alone.maps[0] is odd
+
+
+@pytest.mark.parametrize("n_late", [1, 2])
+def test_of_long_runs_beginnings_may_be_without_tags(
+    maps: list[LocalMap], monkeypatch: pytest.MonkeyPatch, n_late: int
+) -> None:
+    late = [_read_late(each.chain) for each in maps[:n_late]]
+    both = [*(solve_local_map(chain) for chain in late), *maps[n_late:2]]
+    monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.chain.stamps_ns) for each in both)))
+    found = fit_and_weigh(both, PRIOR)
+    by_name = {each.name: each for each in found.fitted.parameters}
+    assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
+    assert (found.fitted.shared_range, found.fitted.shared_bearing) == (0.0, 0.0) or n_late == 1
+
+
+def _read_late(chain: Chain) -> Chain:
+    """Without the readings of its first half."""
+    readings = chain.readings.where(chain.readings.keyframe >= len(chain.stamps_ns) // 2)
+    seen, tag = np.unique(readings.tag, return_inverse=True)
+    return replace(chain, tags=tuple(chain.tags[i] for i in seen), readings=replace(readings, tag=tag))
+
+
+def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
+    """Readings without any error: less noise than the best of encoders and lenses leave."""
+    legs = [(0.4, 0.4, 4.0), (0.5, 0.3, 4.0), (-0.3, 0.3, 3.0), (0.4, 0.4, 3.0)]
+    log = write_drive(tmp_path, made_drive([1.0, 1.5, 0.3], legs), HALL, made_robot("a"))
+    result = build_map(read_runs([log]))
+    assert result.noise_fit is not None
+    assert all(each.kept for each in result.noise_fit.parameters)
+    assert result.noise == PRIOR
+
+
+def test_what_no_noise_explains_leaves_all_as_it_was(maps: list[LocalMap]) -> None:
+    """Wheels that err a hundred times as much as they are taken to: no wheels do, so something else is wrong."""
+    odometry = maps[0].chain.odometry
+    parts = replace(odometry.parts, unit=odometry.parts.unit / 100.0**2)
+    odd = replace(maps[0].chain, odometry=replace(odometry, parts=parts))
+    found = fit_and_weigh([replace(maps[0], chain=odd)], PRIOR)
+    assert found.noise == PRIOR
+    told = {each.kept for each in found.fitted.parameters} - {NOT_NEEDED}
+    (why,) = told
+    assert why.startswith(ODOMETRY_NOISE)
+    assert why.endswith(" times the default: what is left over is no noise")
+
+
+def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
+    """A bias that lasts for metres: corners look better than what they say of the tag's place."""
+    simulate("nsh", 3, tmp_path / "nsh", ["hallway"], render=False)
+    maps = [solve_local_map(chain) for log in find_logs([tmp_path]) for chain in chains_of(load_run(log), PRIOR)]
+    rng = np.random.default_rng(1)
+    biased = []
+    for each in maps:
+        readings = each.chain.readings
+        root = np.linalg.cholesky(readings.covariance)
+        part = (np.append(0.0, np.cumsum(each.chain.odometry.distance_m))[readings.keyframe] / 2.5).astype(int)
+        n_parts = int(part.max()) + 1
+        shared = rng.standard_normal((n_parts, len(each.chain.tags), 2))[part, readings.tag]
+        value = readings.value + (root @ shared[..., None])[..., 0]
+        biased.append(solve_local_map(replace(each.chain, readings=replace(readings, value=value))))
+    good, bad = fit_and_weigh(maps, PRIOR), fit_and_weigh(biased, PRIOR)
+    assert good.fitted.shared_range < 0.03
+    assert bad.fitted.shared_range > 0.1
+    for before, after in zip(biased, bad.maps, strict=True):
+        spread = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
+        assert np.median(spread) > 2.0
+        np.testing.assert_allclose(after.chain.readings.parts.under(bad.noise), after.chain.readings.covariance)
+
+
+@pytest.mark.parametrize("prior", [PRIOR, NoiseParameters(sigma_corner_px=0.05)])
+def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap], prior: NoiseParameters) -> None:
+    """Of m readings of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
+    plain = [solve_local_map(each.chain.weighed(prior)) for each in maps]
+    refined = []
+    for each in plain:
+        bias_px = np.tile([0.1, 0.2], (len(each.chain.readings), 1))
+        chain = replace(each.chain, readings=replace(each.chain.readings, corner_bias_px=bias_px))
+        refined.append(replace(each, chain=chain))
+    for before, after in zip(weighed_as(plain, prior, None), weighed_as(refined, prior, None), strict=True):
+        assert (before.chain.readings.corner_sigmas == 1.0).all()
+        times = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
+        m = (times - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
+        np.testing.assert_allclose(m, np.rint(m), rtol=1e-6)
+        of_corners = m * 0.2**2 / (prior.sigma_corner_px**2 + 0.2**2)
+        np.testing.assert_allclose(after.chain.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
+        assert m.min() >= 1.0
+        assert m.max() > 5.0
+
+
+@pytest.mark.parametrize("noise", [None, NoiseParameters(sigma_corner_px=0.05)])
+def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
+    room: Path, noise: NoiseParameters | None
+) -> None:
+    runs = read_runs(find_logs([room]))
+    times = []
+    for refined in (False, True):
+        workings = Workings()
+        build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
+        chains = [each.chain for each in workings.maps]
+        times.append(np.concatenate([chain.readings.corner_sigmas for chain in chains]).max())
+    assert times[1] > 1.2 * times[0]
+
+
+def test_readings_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:
+    """A few metres past a tag: the scatter of its corners says nothing of a bias in all of them."""
+    short = maps[0].chain.prefix(60)
+    better = replace(short, readings=replace(short.readings, value=short.readings.value))
+    found = fit_and_weigh([solve_local_map(better)], PRIOR)
+    for each in found.fitted.parameters:
+        if each.name not in ODOMETRY_NOISE:
+            assert each.value >= getattr(PRIOR, each.name)

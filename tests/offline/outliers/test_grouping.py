@@ -1,0 +1,98 @@
+"""Tags that are passed very often: fewer sightings, and still a move is found to the passing."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers import grouping as suspects_passings
+from groundsbot.offline.outliers.grouping import few_of_each_tag
+from groundsbot.offline.outliers.sightings import sightings_of
+from groundsbot.offline.outliers.split import split_alone
+from groundsbot.offline.sam.graph import Graph, build_graph
+from tests.support.data.drives import FAMILY, S, made_drive, made_positions, made_run
+
+TAGS_M = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0], [0.5, -1.5]])
+N_LAPS = 24
+MOVED_AFTER = 10
+SIGMA_M = 0.02
+
+
+@cache
+def laps() -> Chain:
+    """Round and round, each tag read once a lap; the last one is moved by a metre while a lap goes on."""
+    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.6, N_LAPS * 5.0 * np.pi)], step_ns=S // 10)
+    lap_ns = int((drive.stamps_ns[-1] - drive.stamps_ns[0]) / N_LAPS)
+    each = np.arange(N_LAPS)
+    ids = np.tile(np.arange(4), N_LAPS)
+    stamps_ns = drive.stamps_ns[0] + (each[:, None] * lap_ns + lap_ns // 5 * np.arange(1, 5)).reshape(-1)
+    places = np.tile(TAGS_M, (N_LAPS, 1))
+    places[3 + 4 * MOVED_AFTER :: 4] += [0.8, 0.6]
+    seen = se2.apply(se2.inverse(drive.at(stamps_ns)), places)
+    seen = seen + SIGMA_M * np.random.default_rng(4).standard_normal(seen.shape)
+    positions = made_positions(stamps_ns, ids, seen, SIGMA_M)
+    tags = [TagKey(FAMILY, i) for i in range(4)]
+    (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    return chain
+
+
+@cache
+def graph() -> Graph:
+    return build_graph([laps()])
+
+
+@cache
+def solved() -> LocalMap:
+    return solve_local_map(laps())
+
+
+def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
+    whole = sightings_of([laps()])
+    assert len(whole) == 4 * N_LAPS
+    assert few_of_each_tag(graph(), whole) is whole
+
+
+@pytest.mark.parametrize("most", [20, 8, 1])
+def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In order, each reading once, and no more than are allowed; what there were is told."""
+    monkeypatch.setattr(suspects_passings, "_MOST_OF_A_TAG", most)
+    whole = sightings_of([laps()])
+    few = few_of_each_tag(graph(), whole)
+    assert (np.bincount(few.id) <= most).all()
+    assert len(few) < len(whole)
+    assert (few.passing == whole.of_reading).all()
+    assert (few.id[few.of_reading] == whole.id[whole.of_reading]).all()
+    assert (few.n_readings == np.bincount(few.of_reading)).all()
+    for s in range(len(few)):
+        own = np.unique(whole.of_reading[few.of_reading == s])
+        assert (np.diff(own) == 1).all()
+        assert (few.first_ns[s], few.last_ns[s]) == (whole.first_ns[own].min(), whole.last_ns[own].max())
+    assert (np.lexsort((few.first_ns, few.chain, few.id)) == np.arange(len(few))).all()
+
+
+def test_few_tags_leave_room_to_those_that_are_seen_often() -> None:
+    counts = np.array([3, 500, 90, 40])
+    assert suspects_passings._most_of_each(counts, 2048) == 128
+    assert suspects_passings._most_of_each(counts, 193) == 75
+    assert np.minimum(counts, suspects_passings._most_of_each(counts, 20)).sum() <= 20
+
+
+@pytest.mark.parametrize("most", [128, 8])
+def test_a_move_is_found_to_the_passing(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gathered or not: two places, of the readings before and after."""
+    monkeypatch.setattr(suspects_passings, "_MOST_OF_A_TAG", most)
+    found = split_alone(solved())
+    tags = found.chain.tags
+    assert [(tag.tag_id, bool(tag.instance)) for tag in tags] == [
+        (0, False), (1, False), (2, False), (3, True), (3, True),
+    ]  # fmt: skip
+    readings = found.chain.readings
+    moved = np.array([tags[i].instance for i in readings.tag])[readings.tag >= 3]
+    assert (moved[:MOVED_AFTER] == moved[0]).all()
+    assert (moved[MOVED_AFTER:] == moved[-1]).all()
+    assert moved[0] != moved[-1]

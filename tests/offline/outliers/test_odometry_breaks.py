@@ -1,0 +1,131 @@
+"""Odometry that broke is found where tags tell of it, split there, and worth as much as two runs; nothing else is."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers.grown_segments import Grown
+from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
+from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
+from tests.support.data.broken_odometry import made_clean_drive
+from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
+from tests.support.data.long_drives import with_a_moved_tag
+
+
+@pytest.mark.parametrize(("kind", "moved_m", "turned_deg"), [("carried", 2.0, 0.0), ("slipped", 3.0, 0.0)])
+def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: float) -> None:
+    broken = broken_drive(kind, 1)
+    found = find_break(solve_local_map(broken.drive.chain))
+    assert found is not None
+    assert found.reach[0] <= broken.end - 1
+    assert found.reach[1] >= broken.begin
+    assert np.hypot(*found.jump[:2]) == pytest.approx(moved_m, abs=0.5)
+    assert np.degrees(found.jump[2]) == pytest.approx(turned_deg, abs=10.0)
+    assert found.chi_square > 10.0 * found.bound
+
+
+def test_a_slip_for_which_the_solve_gives_up_readings_is_found() -> None:
+    broken = broken_drive("slipped", 11)
+    found = find_break(solve_local_map(broken.drive.chain))
+    assert found is not None
+    assert found.reach[0] <= broken.end - 1
+    assert found.reach[1] >= broken.begin
+
+
+def test_the_map_is_as_good_as_that_of_two_runs() -> None:
+    outcome = outcome_of("turned", 1)
+    assert (outcome.can_be_told, outcome.n_stretches) == (True, 2)
+    assert outcome.rms_m < 1.1 * outcome.two_runs_rms_m
+    assert "1 of 1 drives split; of 1 that two tags tell of, 1 found" in summary([outcome])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_split_where_nothing_broke(seed: int) -> None:
+    local_map = solve_local_map(made_clean_drive(seed).chain)
+    mended = split_where_broken([local_map])
+    assert mended.maps == [local_map]
+    assert not mended.warnings
+
+
+def test_a_tag_that_was_moved_is_no_break() -> None:
+    drive = made_clean_drive(1)
+    assert find_break(solve_local_map(with_a_moved_tag(drive))) is None
+
+
+@pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
+def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
+    drive = made_clean_drive(0).chain
+    readings = drive.readings.where(np.arange(len(where)))
+    chain = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
+    whole = Grown(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
+    places = _places(chain, whole, whole)
+    assert all(0 < place.end <= place.begin < 10 for place in places)
+    assert all(np.isfinite(_seconds_between(chain, place)) for place in places)
+    assert (places == []) == (len(where) == 1)
+
+
+PLACES = {1: (2.0, 1.0), 2: (4.0, -2.0), 3: (7.0, 1.0), 4: (8.0, 3.0), 5: (0.0, 4.0)}
+ROUND = [(0.5, 0.5, 6.0), (0.4, 0.5, 3.0), (0.5, 0.3, 4.0), (0.5, 0.5, 4.0)]
+
+
+def mapped(T_moved: tuple[float, float, float]) -> MapResult:
+    """Drives round, is moved while its wheels stand, and drives round again; all tags are seen all the time."""
+    first = made_drive((0.0, 0.0, 0.0), [*ROUND, (0.0, 0.0, 2.0)], step_ns=100_000_000)
+    T_world_again = se2.compose(first.T_world_base[-1], np.array(T_moved))
+    second = made_drive(T_world_again.tolist(), [(0.0, 0.0, 2.0), *ROUND], step_ns=100_000_000)
+    shift = first.stamps_ns[-1] - second.stamps_ns[0]
+    stamps_ns = np.concatenate([first.stamps_ns, second.stamps_ns[1:] + shift])
+    left_m, right_m = (
+        np.concatenate([getattr(first, side), getattr(first, side)[-1] + getattr(second, side)[1:]])
+        for side in ("left_m", "right_m")
+    )
+    poses = np.concatenate([first.T_world_base, second.T_world_base[1:]])
+    at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(stamps_ns) : 3, 0 : len(PLACES)])
+    seen = se2.apply(se2.inverse(poses[at]), np.array(list(PLACES.values()))[tag])
+    run = made_run(
+        [WheelTrack(stamps_ns, left_m, right_m)],
+        robot=made_robot("carl"),
+        tags=[TagKey(FAMILY, key) for key in PLACES],
+        positions=made_positions(stamps_ns[at], tag, seen),
+    )
+    return build_map([run])
+
+
+@pytest.mark.parametrize("T_moved", [(0.0, 0.0, np.pi / 2), (-1.6, 1.2, 0.0)])
+def test_a_robot_carried_while_its_wheels_stand_becomes_two_stretches(T_moved: tuple[float, float, float]) -> None:
+    result = mapped(T_moved)
+    (component,) = result.components
+    assert [(run.name, run.run) for run in component.runs] == [
+        ("carl_one", "carl_one"),
+        ("carl_one_stretch2", "carl_one"),
+    ]
+    places = {tag.tag_id: tag.position_m for tag in component.tags}
+    for tag_id, place in PLACES.items():
+        np.testing.assert_allclose(places[tag_id], place, atol=0.01)
+    (said,) = [warning for warning in result.warnings if "its wheels do not explain" in warning]
+    figures = re.search(r"between ([\d.]+) s and ([\d.]+) s after its start .* by ([\d.]+) m and (-?\d+) deg", said)
+    assert figures is not None
+    begin_s, end_s, moved_m, turned_deg = map(float, figures.groups())
+    assert begin_s <= 19.0 <= end_s < begin_s + 5.0
+    # What was driven in between, a quarter of a metre, it drove in another direction.
+    assert moved_m == pytest.approx(np.hypot(*T_moved[:2]), abs=0.3)
+    assert turned_deg == round(np.degrees(T_moved[2]))
+
+
+def test_a_robot_that_was_not_moved_stays_one() -> None:
+    assert [run.name for run in mapped((0.0, 0.0, 0.0)).runs] == ["carl_one"]
+
+
+def test_stretches_of_several_runs_keep_their_names() -> None:
+    one, other = (
+        solve_local_map(replace(made_clean_drive(seed).chain.prefix(200), name=f"r{seed}")) for seed in (0, 1)
+    )
+    assert [each.chain.name for each in split_where_broken([one, other]).maps] == ["r0", "r1"]

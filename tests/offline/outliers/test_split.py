@@ -1,0 +1,215 @@
+"""Tags that do not belong: the joint evidence is that of solves, and `map` names, splits or keeps what it finds."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.commands.map_drives import exit_code, summary
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.global_map.joint_solve import solve_global_map
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
+from groundsbot.offline.outliers.false_detections import Views, chances
+from groundsbot.offline.outliers.joint_information import rows_of
+from groundsbot.offline.outliers.places import NOWHERE, gain_of, settled
+from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
+from groundsbot.offline.outliers.split import Searched, split_together
+from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
+from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
+from tests.support.data.moved_tags import made_scene
+
+HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(8)}
+STARTS = {"a": [0.0, 0.0, 0.0], "b": [5.0, 1.0, 2.0], "c": [9.0, -1.0, -3.0], "d": [4.0, 0.0, 1.0]}
+NAMES = tuple(STARTS)
+SIGMA_M = 0.05
+
+
+def stood(name: str, places: dict[int, FloatArray], seed: int = 0, hours: int = 0) -> Run:
+    """A robot that sees each tag once from where it stands, with noise, and then drives on a little."""
+    drive = made_drive(STARTS[name], [(0.5, 0.5, 1.0)])
+    late_ns = 3600 * S * hours
+    track = replace(drive.track, stamps_ns=drive.stamps_ns + late_ns)
+    ids = sorted(places)
+    x, y, theta = STARTS[name]
+    turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    noise = SIGMA_M * np.random.default_rng([seed, hours]).standard_normal((len(ids), 2))
+    seen = np.array([(places[i] - [x, y]) @ turn for i in ids]) + noise
+    positions = made_positions(np.full(len(ids), START_NS + late_ns), np.arange(len(ids)), seen, SIGMA_M)
+    tags = [TagKey(FAMILY, i) for i in ids]
+    return made_run([track], robot=made_robot(name), tags=tags, positions=positions)
+
+
+def mapped(*halls: dict[int, FloatArray], keep_suspects: bool = False) -> MapResult:
+    """One run after the other, each in a hall of its own."""
+    runs = [stood(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
+    return build_map(runs, keep_suspects=keep_suspects)
+
+
+MOVED = {3: HALL[3] + [0.9, -0.5]}
+SWAPPED = {3: HALL[4], 4: HALL[3]}
+
+
+def test_a_hall_as_it_was_has_no_suspects() -> None:
+    result = mapped({}, {}, {}, {})
+    assert result.suspects == ()
+    assert all(tag.instance == "" for tag in result.components[0].tags)
+
+
+def test_a_moved_tag_is_named_and_has_two_places() -> None:
+    result = mapped({}, {}, MOVED, MOVED)
+    (suspect,) = result.suspects
+    assert (suspect.tag_id, suspect.kind, suspect.runs) == (3, "moved", ("c_one", "d_one"))
+    assert "by 1.0" in suspect.evidence
+    assert "in a_one and b_one (2 readings), then in c_one and d_one (2 readings)" in suspect.evidence
+    a, b = (tag for tag in result.components[0].tags if tag.tag_id == 3)
+    assert (a.instance, b.instance, a.runs, b.runs) == ("a", "b", ("a_one", "b_one"), ("c_one", "d_one"))
+    assert np.linalg.norm(b.position_m - a.position_m) == pytest.approx(np.hypot(0.9, 0.5), abs=0.2)
+    assert exit_code(result) == 0
+    assert not [text for text in result.warnings if "tag 3" in text]
+
+
+def test_suspects_can_be_kept(tmp_path: Path) -> None:
+    result = mapped({}, {}, MOVED, MOVED, keep_suspects=True)
+    assert [each.kind for each in result.suspects] == ["moved"]
+    assert [tag.instance for tag in result.components[0].tags if tag.tag_id == 3] == [""]
+    assert any(line.startswith("suspect: tag 3 (tag36h11) moved: by") for line in summary(result, tmp_path))
+
+
+def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
+    result = mapped({}, {}, SWAPPED, SWAPPED)
+    assert [(each.tag_id, each.kind, each.swapped_with) for each in result.suspects] == [
+        (3, "swapped", 4),
+        (4, "swapped", 3),
+    ]
+    write_map(result, tmp_path)
+    entries = json.loads((tmp_path / "map.json").read_text())["suspect_tags"]
+    assert [entry["swapped_with"] for entry in entries] == [4, 3]
+    assert set(entries[0]) == {"family", "tag_id", "kind", "runs", "evidence", "swapped_with"}
+    assert read_map(tmp_path).suspects == result.suspects
+    rows = (tmp_path / "tags.csv").read_text().splitlines()
+    assert sum(",a," in row or ",b," in row for row in rows) == 4
+
+
+def test_there_and_back_is_two_tags_with_one_id() -> None:
+    far = {3: HALL[3] + [4.0, -2.5]}
+    (suspect,) = mapped({}, far, {}, far).suspects
+    assert (suspect.tag_id, suspect.kind) == (3, "duplicated")
+    assert suspect.runs == ("a_one", "b_one", "c_one", "d_one")
+
+
+def test_a_run_that_has_most_of_its_tags_elsewhere_is_wrong_itself() -> None:
+    angle = np.linspace(0.0, 6.0, 5)
+    shifted = {i: HALL[i] + 1.5 * np.array([np.cos(angle[i]), np.sin(angle[i])]) for i in range(5)}
+    suspects = mapped({}, {}, shifted, {}).suspects
+    assert {(each.tag_id, each.kind, each.runs) for each in suspects} == {
+        (i, "inconsistent", ("c_one",)) for i in range(5)
+    }
+    assert "c_one has this tag and 4 more" in suspects[0].evidence
+    assert "swapped_with" not in map_as_json(mapped({}, {}, MOVED, MOVED))["suspect_tags"][0]
+
+
+@cache
+def local_maps() -> tuple[LocalMap, ...]:
+    return tuple(solve_local_map(drive.chain) for drive in made_scene(31).drives)
+
+
+@cache
+def searched() -> Searched:
+    maps = local_maps()
+    graph, solution = solve_global_map(maps, merge(maps).groups[0], Stages())
+    return split_together(graph, solution, maps)
+
+
+@pytest.mark.parametrize("which", [0, 7, 30])
+def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
+    """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
+    seen = searched()
+    own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
+    plain = heard(seen.graph, seen.solution.state, np.ones((4, 2)))
+    bare = gathered(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
+    at = int(np.flatnonzero(bare.which == own)[0])
+    gain, _ = gain_of(settled(bare, seen.place[bare.which]), np.array([at]))
+    joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)
+    place = seen.place.copy()
+    place[own] = place.max() + 1
+    tags = instances(seen.sightings, place)
+    apart = build_graph(with_instances(seen.graph.chains, seen.sightings, tags))
+    start = apart.start(joined.state.poses, {}, seen.graph.calibration_of(joined.state))
+    split = solve(apart.problem, start, losses=PLAIN_SQUARES)
+    assert gain == pytest.approx(2.0 * (joined.cost - split.cost), rel=0.02, abs=0.02)
+
+
+def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few tags keep Z with its zeros, fleets without: blocks, sums and what gives way are the same by dense algebra."""
+    seen = searched()
+    information = seen.evidence.information
+    n = len(seen.evidence.score)
+    whole = information.times(np.eye(n))
+    monkeypatch.setattr(arrowhead_covariance, "_FEW", 0)
+    scales = noise_scales([each.goodness for each in local_maps()])
+    apart = gathered(heard(seen.graph, seen.solution.state, scales), seen.sightings).information
+    assert apart.root.below.shape[0] > 0
+    assert information.root.below.shape[0] == 0
+    gather = np.zeros((2 * int(seen.places.place.max()) + 2, n))
+    gather[rows_of(seen.places.place), np.arange(n)] = 1.0
+    across = whole @ gather.T
+    stiffness = whole - across @ np.linalg.inv(gather @ across + NOWHERE * np.eye(len(gather))) @ across.T
+    members = seen.places.held[3].members
+    rows = rows_of(members)
+    for each in (information, apart):
+        parts = each.gathered(seen.places.place, len(gather) // 2)
+        assert_allclose(each.times(np.eye(n)), whole, rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(each.among(rows), whole[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(parts.whole(), gather @ across, rtol=0.0, atol=1e-6 * whole.max())
+        assert_allclose(parts.across(rows), across[rows], rtol=0.0, atol=1e-6 * whole.max())
+    found = seen.places.stiffness
+    assert_allclose(next(found.among_each([members])), stiffness[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
+    together = stiffness.reshape(n, -1, 2)[:, members].sum(axis=1)
+    assert_allclose(found.against(members), together, rtol=0.0, atol=1e-6 * whole.max())
+
+
+def test_all_splits_of_a_place_are_weighed_at_once() -> None:
+    places = searched().places
+    held = next(each for each in places.held if len(each.members) > 3)
+    masks = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
+    masks = np.pad(masks, ((0, 0), (0, len(held.members) - 4)))
+    one_by_one = [gain_of(places, held.members[mask > 0.0])[0] for mask in masks]
+    assert_allclose(held.gains(masks), one_by_one, rtol=1e-6)
+
+
+def test_sightings_end_where_a_tag_is_out_of_sight() -> None:
+    seen = searched()
+    for s in range(len(seen.sightings)):
+        readings = np.flatnonzero(seen.sightings.of_reading == s)
+        assert len(readings) == seen.sightings.n_readings[s]
+    again = sightings_of(seen.graph.chains, np.ones(len(seen.sightings.of_reading), dtype=np.bool_))
+    assert (again.n_readings == 1).all()
+
+
+def test_a_tag_is_read_again_from_where_it_was_read() -> None:
+    """Once in thirty near views is no tag among tags that are read in seven of ten; once in two is."""
+    n = 25
+    place = np.r_[np.repeat(np.arange(n), 2), n, n + 1]
+    zeros = np.zeros(len(place), dtype=np.int64)
+    n_readings = np.r_[np.full(2 * n, 7), 1, 1]
+    keys = tuple(TagKey(FAMILY, i) for i in range(n + 2))
+    sightings = Sightings(keys, zeros, zeros, place, zeros, zeros, zeros, n_readings, zeros)
+    found = chances(sightings, place, Views(n_readings, np.r_[np.full(2 * n, 10), 30, 2]))
+    assert (found[: 2 * n] == 1.0).all()
+    assert found[-2] < 1e-6
+    assert found[-1] > 0.05

@@ -1,0 +1,169 @@
+"""map.png shows what the map holds, to scale."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Ellipse
+
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.report.label_places import place_labels
+from groundsbot.offline.report.picture import draw_map, write_picture
+from tests.support.data.maps import START_B, made_component, made_map, made_run
+
+
+def texts_of(result: MapResult) -> list[str]:
+    return [text.get_text() for axes in draw_map(result).axes for text in axes.texts]
+
+
+def with_sigma(component: Component, sigma_x_m: float, sigma_y_m: float) -> Component:
+    covariance = np.diag([sigma_x_m**2, sigma_y_m**2])
+    return replace(component, tags=tuple(replace(tag, covariance=covariance) for tag in component.tags))
+
+
+def test_the_file_is_a_picture_1600_pixels_wide_and_always_the_same(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_picture(made_map(), tmp_path / name)
+    image = cv2.imread(str(tmp_path / "a.png"))
+    assert image is not None
+    assert image.shape[1] == 1600
+    assert 600 <= image.shape[0] <= 1600
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_trajectories_starts_and_tags_are_drawn_where_they_are() -> None:
+    result = made_map()
+    (axes,) = draw_map(result).axes
+    drawn = [np.asarray(line.get_xydata()) for line in axes.lines]
+    squares = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "s"]
+    for run in result.runs:
+        assert any(data.shape == (20, 2) and np.allclose(data, run.T_map_base[:, :2]) for data in drawn)
+        assert any(data.shape == (1, 2) and np.allclose(data[0], run.T_map_start[:2]) for data in drawn)
+    for tag in result.components[0].tags:
+        assert any(np.isclose(data, tag.position_m).all(axis=1).any() for data in squares)
+
+
+def test_both_axes_have_the_same_scale() -> None:
+    (axes,) = draw_map(made_map()).axes
+    one = axes.transData.transform([(0, 0), (1, 0), (0, 1)])
+    assert np.linalg.norm(one[1] - one[0]) == pytest.approx(np.linalg.norm(one[2] - one[0]))
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x in m", "y in m")
+
+
+@pytest.mark.parametrize(("sigmas", "factor"), [((0.3, 0.1), 1), ((0.004, 0.001), 20)])
+def test_ellipses_are_one_sigma_or_say_how_much_larger(sigmas: tuple[float, float], factor: int) -> None:
+    figure = draw_map(made_map(with_sigma(made_component(), *sigmas)))
+    ellipses = [patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)]
+    assert len(ellipses) == 3
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    said = next(label for label in labels if "1-sigma ellipse" in label)
+    for ellipse in ellipses:
+        assert (ellipse.width, ellipse.height) == pytest.approx((2 * sigmas[0] * factor, 2 * sigmas[1] * factor))
+        assert np.cos(np.radians(ellipse.angle)) ** 2 == pytest.approx(1)  # the long axis along x
+    assert ("times its size" in said) == (factor > 1)
+    assert factor == 1 or f"drawn {factor} times" in said
+
+
+def test_an_ellipse_leans_as_its_covariance_does() -> None:
+    component = made_component()
+    covariance = np.array([[0.05, 0.03], [0.03, 0.05]])  # long axis at 45 degrees, variances 0.08 and 0.02
+    tags = tuple(replace(tag, covariance=covariance) for tag in component.tags)
+    axes = draw_map(made_map(replace(component, tags=tags))).axes[0]
+    ellipse = next(patch for patch in axes.patches if isinstance(patch, Ellipse))
+    assert ellipse.angle % 180 == pytest.approx(45)
+    assert ellipse.width / ellipse.height == pytest.approx(2)
+
+
+def test_runs_have_colours_and_shared_tags_another() -> None:
+    figure = draw_map(made_map())
+    lines = [line for line in figure.axes[0].lines if len(np.asarray(line.get_xydata())) == 20]
+    colours = {to_rgb(line.get_color()) for line in lines}
+    assert len(colours) == 2
+    texts = {text.get_text(): to_rgb(text.get_color()) for text in figure.axes[0].texts}
+    assert texts["tag36h11:7"] not in colours
+    assert texts["tag25h9:3"] in colours
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "red_one: 1.9 m, 2 tags" in labels
+    assert "blue_two: 1.9 m, 3 tags" in labels
+
+
+def test_the_title_has_the_figures() -> None:
+    suptitle = draw_map(made_map()).get_suptitle()
+    assert "3 tags, 2 runs, 4 m driven" in suptitle
+    assert "start to start 10.20 m" in suptitle
+
+
+def test_ids_are_bare_where_there_is_one_family() -> None:
+    component = made_component()
+    rows = np.r_[0:10]
+    one_family = replace(
+        component, tags=component.tags[:2], joint_covariance=component.joint_covariance[np.ix_(rows, rows)]
+    )
+    assert sorted(texts_of(made_map(one_family))) == ["3", "7"]
+
+
+def test_components_are_panels_of_their_own() -> None:
+    figure = draw_map(made_map(made_component(), made_component("green_one", "grey_two")))
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles == [
+        "component 1: 3 tags, from the start of red_one",
+        "component 2: 3 tags, from the start of green_one",
+    ]
+    assert "in 2 components" in figure.get_suptitle()
+    many = made_map(*(made_component(f"a_{k}", f"b_{k}") for k in range(8)))
+    assert len(draw_map(many).axes) == 6
+    assert "the 6 largest drawn" in draw_map(many).get_suptitle()
+
+
+def test_a_run_that_never_moved_and_saw_nothing_can_be_drawn() -> None:
+    run = made_run("red_one", np.zeros(3), np.zeros((3, 3)), n=1)
+    component = Component("red_one", (run,), (), np.zeros((3, 3)), 0.0, 0)
+    figure = draw_map(made_map(component))
+    assert "0 tags, 1 run, 0 m driven" in figure.get_suptitle()
+
+
+def test_stretches_look_alike_and_count_as_one_run() -> None:
+    component = made_component()
+    stretch = replace(component.runs[1], name="blue_two_stretch2", T_map_start=START_B + np.array([5.0, 0.0, 0.0]))
+    figure = draw_map(made_map(replace(component, runs=(*component.runs, stretch))))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "blue_two: 3.8 m, 3 tags, 2 stretches" in labels
+    assert "2 runs" in figure.get_suptitle()
+
+
+@given(st.integers(1, 30), st.integers(0, 10_000))
+def test_labels_of_points_far_apart_cover_nothing(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells = rng.permutation(100)[:n]
+    points = np.asarray(np.column_stack([cells % 10, cells // 10]) * 120.0, dtype=np.float64)
+    sizes = rng.uniform(10, 30, size=(n, 2))
+    centres = place_labels(points, sizes, np.empty((0, 2)))
+    for index in range(n):
+        others = np.delete(points, index, axis=0)
+        assert (np.abs(others - centres[index]) >= sizes[index] / 2).any(axis=1).all()
+        assert np.abs(centres[index] - points[index]).max() < 60
+    apart = np.abs(centres[:, None] - centres) >= (sizes[:, None] + sizes) / 2
+    assert (apart.any(axis=-1) | np.eye(n, dtype=bool)).all()
+
+
+def test_labels_of_neighbours_keep_clear_of_each_other() -> None:
+    points = np.array([[0.0, 0.0], [12.0, 0.0], [6.0, 9.0]])
+    sizes = np.tile([20.0, 12.0], (3, 1))
+    centres = place_labels(points, sizes, np.empty((0, 2)))
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert (np.abs(centres[a] - centres[b]) >= sizes[0]).any()
+
+
+def test_a_label_covers_no_other_point() -> None:
+    points = np.array([[0.0, 0.0], [14.0, 10.0]])  # the second stands where the first's label would go first
+    sizes = np.array([[16.0, 10.0], [16.0, 10.0]])
+    centres = place_labels(points, sizes, np.empty((0, 2)))
+    assert (np.abs(centres[0] - points[1]) >= sizes[0] / 2).any()
+    assert (np.abs(centres[1] - points[0]) >= sizes[1] / 2).any()
+    assert (centres[0] < points[1]).any()

@@ -1,0 +1,347 @@
+"""The report says what the map says, whatever names are in it, and a browser draws it."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.offline.commands.map_drives import MapOptions, make_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import RunEvent
+from groundsbot.offline.report.figures import figures
+from groundsbot.offline.report.page import as_script_data, page
+from groundsbot.offline.report.report import write_report
+from groundsbot.offline.report.sentences import sentences
+from groundsbot.offline.report.tables import tables
+from tests.support.browser import Page, browser, chromium
+from tests.support.data.drives import START_NS, S, made_robot, write_drive
+from tests.support.data.map_cases import DRIVES, TAGS
+from tests.support.report_reader import Read, data_of
+
+pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
+
+HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
+
+Inside = tuple[MapResult, Workings]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def logs(folder: Path) -> list[Path]:
+    return [
+        write_drive(folder / "logs", drive, TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
+        for i, (name, drive) in enumerate(DRIVES.items())
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(folder: Path, logs: list[Path]) -> Path:
+    """What `map` writes."""
+    make_map(MapOptions(logs, folder / "map"))
+    return folder / "map"
+
+
+@pytest.fixture(scope="module")
+def inside(logs: list[Path]) -> Inside:
+    workings = Workings()
+    return build_map(read_runs(logs), workings=workings), workings
+
+
+def written(inside: Inside, folder: Path) -> Read:
+    write_report(*inside, folder / "report.html")
+    return Read((folder / "report.html").read_text())
+
+
+def close(told: str, true: float) -> bool:
+    """Whether a figure is the number as rounded where it ends."""
+    digits = len(told.partition(".")[2])
+    return abs(float(told) - true) <= 0.5001 * 10.0**-digits
+
+
+def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
+    document = json.loads((made / "map.json").read_text())
+    read = Read((made / "report.html").read_text())
+    facts: list[tuple[str, float]] = []
+    for row, tag in zip(read.rows("tags"), document["tags"], strict=True):
+        covariance = np.array(tag["covariance"])
+        assert (row["tag"], row["family"], row["runs"]) == (str(tag["tag_id"]), tag["family"], ", ".join(tag["runs"]))
+        facts += zip((row["x (m)"], row["y (m)"]), tag["position_m"], strict=True)
+        facts += zip((row["sigma x (m)"], row["sigma y (m)"]), np.sqrt(np.diag(covariance)), strict=True)
+        facts += [(row["largest sigma (m)"], np.linalg.eigvalsh(covariance)[-1] ** 0.5)]
+        facts += [(row["readings"], tag["n_observations"])]
+    for row, run in zip(read.rows("runs"), document["runs"], strict=True):
+        assert (row["run"], row["robot"], row["log"]) == (run["run"], run["robot"], run["log"])
+        facts += [(row["keyframes"], run["n_keyframes"]), (row["driven (m)"], run["distance_m"])]
+        facts += [(row["heading (deg)"], np.degrees(run["T_map_start"][2]))]
+        facts += zip(row["start x, y (m)"].split(", "), run["T_map_start"][:2], strict=True)
+    for row, each in zip(read.rows("alignments"), document["alignments"], strict=True):
+        fit, _, shared = row["shared tags that fit"].partition(" of ")
+        facts += [(fit, each["n_inliers"]), (shared, each["n_shared"]), (row["RMS (m)"], each["inlier_rmse_m"])]
+        facts += [(row["turned (deg)"], np.degrees(each["transform"][2]))]
+    for row, each in zip(read.rows("starts"), document["start_to_start"], strict=True):
+        facts += [(row["distance (m)"], each["distance_m"]), (row["sigma (m)"], each["sigma_m"])]
+    for row, each in zip(read.rows("checks"), document["checks"], strict=True):
+        facts += [(row["differ by (%)"], 100.0 * each["value"]), (row["sigmas"], each["sigmas"])]
+    for row, each in zip(read.rows("metres"), document["metres"], strict=True):
+        facts += [(row["sigma (%)"], 100.0 * each["sigma"]), (row["wheels (%)"], 100.0 * each["shares"]["wheels"])]
+    for row, each in zip(read.rows("calibration"), document["calibration"], strict=True):
+        assert (row["of"], row["correction"]) == (each["owner"], each["name"])
+        facts += [(row["value"], each["value"]), (row["sigma"], each["sigma"])]
+    assert [row["sigma"] for row in read.rows("noise")] == list(document["noise"])
+    assert len(facts) >= 30
+    assert [fact for fact in facts if not close(*fact)] == []
+
+
+def test_the_sentences_are_those_of_the_map(made: Path) -> None:
+    document = json.loads((made / "map.json").read_text())
+    words = Read((made / "report.html").read_text()).words
+    assert 3 <= len(words) <= 6
+    assert words == sentences(document)
+    driven_m = sum(run["distance_m"] for run in document["runs"])
+    assert words[0] == (
+        f"2 runs (a_one and b_one; {driven_m:.1f} m driven) became one map of 4 tags, joined by 4 tags that more than "
+        "one of them read."
+    )
+    sigmas = [np.linalg.eigvalsh(tag["covariance"])[-1] ** 0.5 for tag in document["tags"]]
+    worst = document["tags"][int(np.argmax(sigmas))]
+    (pair,) = document["start_to_start"]
+    for part in (
+        f"typical tag is known to {100.0 * np.median(sigmas):.1f} cm",
+        f"the worst, tag {worst['tag_id']}, to {100.0 * max(sigmas):.1f} cm",
+        f"it is {pair['distance_m']:.2f} m, give or take {100.0 * pair['sigma_m']:.1f} cm",
+    ):
+        assert part in words[1]
+    assert f"known to {100.0 * document['metres'][0]['sigma']:.2f} %" in words[2]
+
+
+def test_figures_draw_what_the_map_holds(made: Path) -> None:
+    document = json.loads((made / "map.json").read_text())
+    data = data_of(made / "report.html")
+    (component,) = data["components"]
+    assert component["is_merged"]
+    for drawn, tag in zip(component["tags"], document["tags"], strict=True):
+        assert drawn["position_m"] == pytest.approx(tag["position_m"], abs=1e-4)
+        (xx, xy), (_, yy) = tag["covariance"]
+        assert drawn["covariance"] == pytest.approx([xx, xy, yy], rel=1e-3)
+        assert sum(run["n"] for run in drawn["readings"]) == drawn["n"] == tag["n_observations"]
+        assert [run["run"] for run in drawn["readings"]] == tag["runs"]
+        assert all(0.1 < run["rms"] <= run["worst"] + 0.1 < 6.0 for run in drawn["readings"])
+    for drawn, run in zip(component["runs"], document["runs"], strict=True):
+        assert [drawn["x"][0], drawn["y"][0]] == pytest.approx(run["T_map_start"][:2], abs=1e-3)
+    before = component["before"]
+    assert [layer["run"] for layer in before] == ["a_one", "b_one"]
+    apart = np.hypot(*(np.subtract(before[0]["tags"][axis], before[1]["tags"][axis]) for axis in "xy"))
+    assert apart.max() < 0.5  # the alignment lays them over each other
+
+
+def test_timelines_show_speed_tags_gaps_and_events(inside: Inside) -> None:
+    result, workings = inside
+    document = map_as_json(result)
+    first = figures(document, workings)["timelines"][0]
+    assert first["run"] == "a_one"
+    assert max(value for value in first["speed_m_s"] if value is not None) == pytest.approx(0.51, abs=0.02)
+    assert max(first["tags"]) == 4
+    assert first["t_s"][-1] == pytest.approx(5.5, abs=0.3)
+    assert (first["gaps"], first["events"]) == ([], [])
+    solved = workings.solved[0]
+    chain = solved.graph.chains[0]
+    track = chain.run.stretches[0]
+    kept = (track.stamps_ns < START_NS + 2 * S) | (track.stamps_ns > START_NS + 3 * S)
+    holed = replace(track, stamps_ns=track.stamps_ns[kept], left_m=track.left_m[kept], right_m=track.right_m[kept])
+    events = (RunEvent(START_NS + S, True, HOSTILE), RunEvent(START_NS + 100 * S, False, "stopped"))
+    changed = replace(chain, run=replace(chain.run, stretches=(holed,), events=events))
+    graph = replace(solved.graph, chains=(changed, *solved.graph.chains[1:]))
+    lame = Workings(workings.maps, [solved._replace(graph=graph)])
+    first = figures(document, lame)["timelines"][0]
+    assert first["gaps"] == [[1.99, 3.01]]
+    assert [(event["t_s"], event["loss"]) for event in first["events"]] == [(1.0, True), (first["t_s"][-1], False)]
+    assert first["events"][0]["text"] == HOSTILE
+
+
+def test_no_name_can_become_a_script(inside: Inside, folder: Path) -> None:
+    result, workings = inside
+    document = json.loads(json.dumps(map_as_json(result)).replace("a_one", "HOSTILE").replace("tag36h11", "HOSTILE"))
+    document = json.loads(json.dumps(document).replace("HOSTILE", json.dumps(HOSTILE)[1:-1]))
+    document["suspect_tags"] = [
+        {"tag_id": 3, "family": HOSTILE, "kind": HOSTILE, "runs": [HOSTILE], "evidence": HOSTILE}
+    ]
+    drawn = json.loads(json.dumps(figures(map_as_json(result), workings)).replace("a_one", json.dumps(HOSTILE)[1:-1]))
+    text = page(HOSTILE, [HOSTILE, *sentences(document)], [HOSTILE], tables(document), drawn)
+    read = Read(text)
+    assert [tag for tag, _ in read.elements].count("script") == 3
+    assert all(tag != "img" and "onerror" not in attributes for tag, attributes in read.elements)
+    assert read.words[0] == HOSTILE
+    assert read.rows("suspects")[0]["evidence"] == HOSTILE
+    assert f"{HOSTILE} and b_one" in read.words[1]
+    (folder / "hostile.html").write_text(text)
+    assert data_of(folder / "hostile.html")["components"][0]["runs"][0]["run"] == HOSTILE
+
+
+def test_data_in_a_script_holds_no_markup() -> None:
+    text = as_script_data({HOSTILE: [HOSTILE, None, 1.5]})
+    assert not set(text) & set("<>&")
+    assert json.loads(text) == {HOSTILE: [HOSTILE, None, 1.5]}
+
+
+def test_nothing_is_fetched(made: Path) -> None:
+    text = (made / "report.html").read_text()
+    read = Read(text)
+    for tag, attributes in read.elements:
+        assert "src" not in attributes, tag
+        assert (attributes.get("href") or "data:,").startswith("data:")
+    policy = next(attributes for tag, attributes in read.elements if "http-equiv" in attributes)
+    assert "default-src 'none'" in (policy["content"] or "")
+
+
+def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
+    workings = Workings()
+    read = written((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
+    assert read.words[0].startswith("One run, a_one, drove ")
+    assert read.words[0].endswith("nothing was to be joined.")
+    assert "before" not in {attributes.get("id") for _, attributes in read.elements}
+    assert "holding" not in read.tables
+    assert len(read.rows("tags")) == 4
+
+
+def test_a_run_without_tags(tmp_path: Path) -> None:
+    log = write_drive(tmp_path / "logs", DRIVES["a"], [], made_robot("a"))
+    workings = Workings()
+    read = written((build_map(read_runs([log]), workings=workings), workings), tmp_path)
+    assert "It places no tag, so that nothing corrects what the wheels say." in read.words
+    assert data_of(tmp_path / "report.html")["components"][0]["tags"] == []
+
+
+def test_several_components(logs: list[Path], tmp_path: Path) -> None:
+    far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
+    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
+    workings = Workings()
+    read = written((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
+    assert "3 runs" in read.words[0]
+    assert "fall into 2 components" in read.words[0]
+    assert "the largest holds 2 runs and 4 tags" in read.words[0]
+    assert read.words[-1].startswith("To join the components, drive one more run past two or more tags of each")
+    assert [row["component"] for row in read.rows("runs")] == ["1", "1", "2"]
+    plots = [attributes["class"] for _, attributes in read.elements if "plot" in (attributes.get("class") or "")]
+    assert plots == ["plot map"] * 2 + ["plot before"] + ["plot timeline"] * 3
+
+
+# Size.
+
+
+def test_long_drives_are_thinned(inside: Inside) -> None:
+    # Ten runs of 10,000 keyframes: what a figure takes may not grow with the drive.
+    from groundsbot.offline.report.figures import _MOST_POINTS, _trace
+    from groundsbot.offline.report.timeline import _MOST_POINTS as _MOST_TIMES
+    from groundsbot.offline.report.timeline import timeline
+
+    poses = np.cumsum(np.full((10_000, 3), 0.0421), axis=0) * 10.0
+    trace = _trace("a_one", {"a_one": "#000000"}, poses)
+    assert len(trace["x"]) <= _MOST_POINTS + 1
+    assert [trace["x"][0], trace["x"][-1]] == pytest.approx([poses[0, 0], poses[-1, 0]], abs=1e-3)
+    chain = inside[1].solved[0].graph.chains[0]
+    rng = np.random.default_rng(0)
+    n, m = 10_000, 30_000
+    long = replace(
+        chain,
+        stamps_ns=START_NS + np.arange(n) * (S // 10),
+        odometry=replace(chain.odometry, distance_m=rng.uniform(0.0, 0.1, n - 1)),
+        readings=replace(chain.readings, keyframe=np.sort(rng.integers(0, n, m))),
+    )
+    drawn = timeline(long, rng.uniform(0.0, 4.0, m), [])
+    assert len(drawn["t_s"]) <= _MOST_TIMES
+    # Merged, before merging and over time, ten times: a tenth of what is allowed.
+    assert 10 * (2 * len(as_script_data(trace)) + len(as_script_data(drawn))) < 1_500_000
+
+
+def test_the_report_is_small(made: Path) -> None:
+    from plotly.offline import get_plotlyjs
+
+    assert len((made / "report.html").read_bytes()) - len(get_plotlyjs().encode()) < 200_000
+
+
+# In a browser.
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if chromium() is None:
+        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+# Where a tag of the first map is on the screen.
+SPOT = """(() => {
+  const plot = document.querySelector(".plot.map"), layout = plot._fullLayout;
+  const trace = plot.data.find((each) => (each.name || "").startsWith("tags")), box = plot.getBoundingClientRect();
+  return [box.left + layout.xaxis._offset + layout.xaxis.d2p(trace.x[0]),
+    box.top + layout.yaxis._offset + layout.yaxis.d2p(trace.y[0])];
+})()"""
+HOVERED = "[...document.querySelectorAll('.plot.map .hoverlayer')].map((each) => each.textContent).join('')"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_browser_draws_it_and_answers(window: Page, made: Path, scheme: str) -> None:
+    document = json.loads((made / "map.json").read_text())
+    window.complaints.clear()
+    window.requests.clear()
+    window.scheme(scheme)
+    window.open(made / "report.html")
+    assert window.look("document.querySelectorAll('.plot').length") == 4
+    assert window.look("document.querySelectorAll('.plot .main-svg .trace').length") > 12
+    back = window.look("getComputedStyle(document.body).backgroundColor")
+    assert back == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(21, 24, 27)")
+    window.look("document.querySelector('.plot.map').scrollIntoView({block: 'center', behavior: 'instant'})")
+    x, y = window.look(SPOT)
+    window.point_at(x, y)
+    window.wait_for(f"{HOVERED}.includes('tag')")
+    tag = document["tags"][0]
+    assert f"tag {tag['tag_id']} (tag36h11)" in window.look(HOVERED)
+    assert f"x {tag['position_m'][0]:.3f} m" in window.look(HOVERED)
+    assert f"read {tag['n_observations']} times" in window.look(HOVERED)
+    wide = "(([low, high]) => high - low)(document.querySelector('.plot.map')._fullLayout.xaxis.range)"
+    before = window.look(wide)
+    window.turn_wheel(x, y, -300.0)
+    window.wait_for(f"{wide} < {0.95 * before}")
+    window.look("document.querySelector('button[data-apart=\"1\"]').click()")
+    assert window.look("document.querySelector('button[data-apart=\"1\"]').ariaPressed") == "true"
+    assert window.complaints == []
+    assert all(request.startswith(("file:", "data:", "blob:")) for request in window.requests)
+
+
+def test_a_browser_runs_no_name(window: Page, inside: Inside, folder: Path) -> None:
+    test_no_name_can_become_a_script(inside, folder)
+    window.open(folder / "hostile.html")
+    assert window.look("window.hacked === undefined")
+    legend = window.look("document.querySelector('.plot.map .legend').textContent")
+    assert "window.hacked=1</script>" in legend  # as text
+
+
+def test_it_prints(window: Page, made: Path) -> None:
+    import pypdfium2
+
+    window.open(made / "report.html", wide=700)
+    printed = pypdfium2.PdfDocument(window.pdf())
+    text = "".join(printed[i].get_textpage().get_text_range() for i in range(len(printed)))
+    assert 2 <= len(printed) <= 8
+    for part in ("became one map of 4 tags", "Before merging", "Calibration"):
+        assert part in " ".join(text.split())
+
+
+def test_figures_follow_the_window_and_overlap_nothing(window: Page, made: Path) -> None:
+    window.open(made / "report.html", wide=1200)
+    window.call("Emulation.setDeviceMetricsOverride", width=800, height=2500, deviceScaleFactor=1, mobile=False)
+    drawn = "[...document.querySelectorAll('.plot')].map((each) => [each, each.querySelector('.main-svg')])"
+    window.wait_for(f"{drawn}.every(([each, svg]) => svg.clientWidth === each.clientWidth && svg.clientWidth < 800)")
+    assert window.look(f"{drawn}.every(([each, svg]) => svg.clientHeight <= each.clientHeight)")

@@ -1,0 +1,66 @@
+"""What the report's sentences and tables make of a map."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.report.join_tables import essential_tags
+from groundsbot.offline.report.sentences import largest_sigma_m, sentences
+from groundsbot.offline.report.tables import tables
+from tests.support.data.maps import made_component, made_map
+
+
+def words_of(**changes: Any) -> str:
+    return " ".join(sentences(map_as_json(made_map()) | changes))
+
+
+def test_doubts_are_said() -> None:
+    document = map_as_json(made_map())
+    calm = words_of(warnings=[])
+    assert "Nothing in it contradicts anything else" in calm
+    assert "comes with 1 warning" in words_of()
+    (check,) = document["checks"]
+    told = words_of(checks=[check | {"sigmas": 7.2}])
+    assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
+    suspect = {"tag_id": 3, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
+    assert "1 tag does not belong: 3 (moved)" in words_of(suspect_tags=[suspect])
+    (alignment,) = document["alignments"]
+    told = words_of(alignments=[alignment | {"is_sure": False}])
+    assert "1 alignment could not be told for sure and was left out: red_one with blue_two" in told
+    tags = [tag | {"n_observations": 2} for tag in document["tags"]]
+    assert "3 tags were read less than 3 times: 3, 7 and 3" in words_of(tags=tags)
+    taped = document["measurements"][0] | {"contradicts": True}
+    assert "1 measurement by hand does not fit to the rest" in words_of(measurements=[taped])
+
+
+def test_unknown_numbers_are_not_said() -> None:
+    unknown = replace(made_component(), joint_covariance=np.full((12, 12), np.nan))
+    tags = tuple(replace(tag, covariance=np.full((2, 2), np.nan)) for tag in unknown.tags)
+    document = map_as_json(made_map(replace(unknown, tags=tags)))
+    assert largest_sigma_m(document["tags"][0]["covariance"]) is None
+    assert "nan" not in " ".join(sentences(document))
+    (shown,) = [table for table in tables(document) if table.key == "tags"]
+    assert not any("nan" in cell for row in shown.rows for cell in row)
+
+
+def test_tags_without_which_runs_fall_apart() -> None:
+    document = map_as_json(made_map())
+    assert [tag["tag_id"] for tag in essential_tags(document, 0)] == [7, 3]
+    more = [tag | {"runs": ["red_one", "blue_two"]} for tag in document["tags"]]
+    assert essential_tags(document | {"tags": more}, 0) == []
+
+
+def test_fitted_noise_is_told() -> None:
+    document = map_as_json(made_map())
+    parameters = [
+        {"name": "sigma_corner_px", "value": 0.31, "low": 0.28, "high": 0.35, "redundancy": 200.0, "kept": ""},
+        {"name": "sigma_range_m", "value": 0.02, "low": None, "high": None, "redundancy": 0.0, "kept": "no reading"},
+    ]
+    fit = {"parameters": parameters, "runs": ["a_one"], "shared_range": 0.0, "shared_bearing": 0.0, "contradicting": []}
+    (noise,) = [table for table in tables(document | {"noise_fit": fit}) if table.key == "noise"]
+    rows = {row[0]: row for row in noise.rows}
+    assert rows["sigma_corner_px"][2:] == ("0.28 to 0.35", "fitted")
+    assert rows["sigma_range_m"][2:] == ("", "no reading")
+    assert "a_one" in noise.note

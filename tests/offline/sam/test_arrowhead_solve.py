@@ -1,0 +1,122 @@
+"""The solve as a whole: where it ends, why it stops, and that neither order nor frame matters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.solver import Losses, Problem, solve
+from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet
+from tests.support.data.graphs import made_graph, reordered
+
+PLAIN = Losses(SQUARES, SQUARES)
+
+
+def our_start(fleet: Fleet) -> State:
+    sigma = np.tile(SIGMA_START, (fleet.n_robots, 1))
+    sigma[0] = 1e-6
+    return fleet.problem.skeleton.starting_values(fleet.dead_reckoned, sigma)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_long_drives_end_in_the_optimum_that_is_reached_from_the_truth(seed: int) -> None:
+    fleet = made_fleet(seed, 3, 3000, 60)
+    found = solve(fleet.problem, our_start(fleet), losses=PLAIN, relaxed_steps=2)
+    best = solve(fleet.problem, fleet.truth, losses=PLAIN)
+    assert found.converged
+    assert found.cost == pytest.approx(best.cost, rel=1e-9)
+    np.testing.assert_allclose(found.state.tags, best.state.tags, atol=1e-6)
+    np.testing.assert_allclose(found.state.poses[:, :2], best.state.poses[:, :2], atol=1e-6)
+
+
+def test_start_is_nearer_than_dead_reckoning() -> None:
+    fleet = made_fleet(7, 2, 4000, 60)
+    start = our_start(fleet)
+    error, before = (
+        float(np.median(np.linalg.norm(state.tags - fleet.truth.tags, axis=1)))
+        for state in (start, fleet.dead_reckoned)
+    )
+    assert error < 0.5 * before
+
+
+def test_costs_fall_and_the_reason_is_given() -> None:
+    fleet = made_fleet(2, 2, 500, 30)
+    found = solve(fleet.problem, our_start(fleet), losses=PLAIN)
+    assert found.reason == "converged"
+    assert all(after < before for before, after in zip(found.costs, found.costs[1:], strict=False))
+    assert found.n_linearised >= len(found.costs)
+    assert found.untied.n_directions == 0
+    assert found.rank == fleet.problem.columns.n
+    assert found.condition() > 1.0
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=8, deadline=None)
+def test_order_of_readings_does_not_matter(seed: int) -> None:
+    fleet = made_fleet(seed, 2, 400, 12)
+    problem, truth = fleet.problem, fleet.truth
+    one = solve(problem, truth)
+    other = solve(reordered(problem, np.random.default_rng(seed)), truth)
+    np.testing.assert_allclose(other.state.tags, one.state.tags, atol=1e-6)
+    np.testing.assert_allclose(se2.between(one.state.poses, other.state.poses), 0.0, atol=1e-6)
+
+
+@given(seed=st.integers(0, 10**6), turn=st.floats(-3.0, 3.0))
+@settings(max_examples=8, deadline=None)
+def test_frame_does_not_matter(seed: int, turn: float) -> None:
+    fleet = made_fleet(seed, 2, 400, 12)
+    problem, truth = fleet.problem, fleet.truth
+    T = np.array([30.0, -12.0, turn])
+    moved = State(se2.compose(T, truth.poses), se2.apply(T, truth.tags), truth.calibration)
+    one, other = solve(problem, truth), solve(problem, moved)
+    np.testing.assert_allclose(other.state.tags, se2.apply(T, one.state.tags), atol=1e-6)
+    np.testing.assert_allclose(se2.between(se2.compose(T, one.state.poses), other.state.poses), 0.0, atol=1e-6)
+
+
+def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
+    problem, truth = made_graph(3, [40, 40], 3, calibrated=False)
+    only_first = problem.readings.pose < 40
+    readings = replace(
+        problem.readings,
+        **{name: getattr(problem.readings, name)[only_first] for name in problem.readings.__dataclass_fields__},
+    )
+    loose = Problem(problem.odometry, readings, problem.prior, problem.columns, np.zeros(3, dtype=np.int64))
+    found = solve(loose, truth)
+    assert found.untied.chains == (1,)
+    assert found.rank == problem.columns.n - 3
+    assert np.isfinite(found.state.poses).all()
+    sigma = np.sqrt(found.covariance(problem.columns.poses[60]).diagonal())
+    assert (sigma > 1e3).all()
+
+
+@pytest.mark.parametrize("loss", [huber(3.0), cauchy(3.0), graduated(3.0, 1.0)], ids=["huber", "cauchy", "graduated"])
+def test_robust_losses_bound_what_a_wrong_reading_does(loss: Loss) -> None:
+    fleet = made_fleet(5, 1, 400, 20)
+    value = fleet.problem.readings.value.copy()
+    value[::25, 0] += 1.5
+    wrong = replace(fleet.problem, readings=replace(fleet.problem.readings, value=value))
+    clean = solve(fleet.problem, fleet.truth, losses=PLAIN).state.tags
+    bent = np.abs(solve(wrong, fleet.truth, losses=PLAIN).state.tags - clean).max()
+    robust = np.abs(solve(wrong, fleet.truth, losses=Losses(SQUARES, loss)).state.tags - clean).max()
+    assert robust < 0.5 * bent
+
+
+def test_other_weights_on_the_same_factors_solve_like_a_new_problem() -> None:
+    problem, truth = made_graph(6, [60, 40], 6, calibrated=True)
+    rng = np.random.default_rng(0)
+    problem = reordered(problem, rng)
+    odometry = problem.odometry.whitening * rng.uniform(0.5, 2.0, (len(problem.odometry.first), 1, 1))
+    readings = problem.readings.whitening * rng.uniform(0.5, 2.0, (len(problem.readings.tag), 1, 1))
+    anew = replace(
+        problem,
+        odometry=replace(problem.odometry, whitening=odometry),
+        readings=replace(problem.readings, whitening=readings),
+    )
+    found, expected = solve(problem.reweighed(odometry, readings), truth), solve(anew, truth)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    np.testing.assert_allclose(found.state.tags, expected.state.tags, atol=1e-9)

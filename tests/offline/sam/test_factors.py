@@ -1,0 +1,161 @@
+"""Every Jacobian block agrees with finite differences, and the gradient is that of the cost."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
+from groundsbot.offline.sam.factors.planar import Linearised, State, whitening
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
+from tests.benchmarks.speed.plain_solver import plain_normal_equations
+from tests.support.data.problems import CALIBRATION_SIGMA, N_CALIBRATION, made_problem, random_state
+
+KINDS = ("odometry", "readings", "prior")
+SEEDS = range(5)
+
+
+def dense(kind: Linearised, n_columns: int) -> FloatArray:
+    """(m n, columns): the blocks where they belong; blocks on the same columns add up."""
+    jacobian = np.zeros((*kind.residual.shape, n_columns + 1))
+    for columns, derivative in kind.blocks:
+        assert columns.shape == (derivative.shape[0], derivative.shape[2])
+        for row in range(len(columns)):
+            for k, column in enumerate(columns[row]):
+                jacobian[row, :, column] += derivative[row, :, k]
+    return jacobian[..., :n_columns].reshape(-1, n_columns)
+
+
+def numeric(residual: Callable[[State], FloatArray], problem: Problem, state: State, h: float = 1e-6) -> FloatArray:
+    """The same by central differences in the tangent space."""
+    columns = []
+    for step in h * np.eye(problem.columns.n):
+        ahead, behind = residual(problem.moved(state, step)), residual(problem.moved(state, -step))
+        columns.append((ahead - behind).reshape(-1) / (2 * h))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_jacobian_blocks_agree_with_finite_differences(kind: str, seed: int) -> None:
+    """Anywhere, far from where the measurements are met: nothing may be left out because it is small at the truth."""
+    problem = made_problem(seed).problem
+    factors, state = getattr(problem, kind), random_state(seed + 100)
+    linearised = factors.linearise(state, problem.columns)
+    np.testing.assert_array_equal(linearised.residual, factors.residual(state))
+    expected = numeric(factors.residual, problem, state)
+    # A reading may sit where its bearing changes fast: compare in units of what each row holds.
+    scale = np.maximum(np.abs(expected).max(axis=1, keepdims=True), 1.0)
+    np.testing.assert_allclose(dense(linearised, problem.columns.n) / scale, expected / scale, atol=2e-7)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_block_of_every_kind_is_felt(seed: int) -> None:
+    """Otherwise the test above could pass on columns of zeros."""
+    problem = made_problem(seed).problem
+    state = random_state(seed + 100)
+    felt = sum(
+        np.abs(dense(getattr(problem, kind).linearise(state, problem.columns), problem.columns.n)).sum(axis=0)
+        for kind in ("odometry", "readings")
+    )
+    assert (np.asarray(felt) > 0.0).all()
+
+
+@pytest.mark.parametrize("n_outliers", [0, 8])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
+    made = made_problem(seed, n_outliers=n_outliers)
+    state = random_state(seed, made.truth, spread=0.02)
+    if n_outliers:
+        lengths = np.linalg.norm(made.problem.readings.residual(state), axis=-1)
+        assert (lengths > HUBER_THRESHOLD).sum() >= n_outliers
+    _, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
+    h = 1e-6
+    expected = [
+        (made.problem.cost(made.problem.moved(state, step)) - made.problem.cost(made.problem.moved(state, -step)))
+        / (2 * h)
+        for step in h * np.eye(made.problem.columns.n)
+    ]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-4 * float(np.abs(gradient).max()))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_residuals_vanish_at_the_truth_of_exact_measurements(seed: int) -> None:
+    made = made_problem(seed, noise=0.0)
+    np.testing.assert_allclose(made.problem.odometry.residual(made.truth), 0.0, atol=1e-9)
+    np.testing.assert_allclose(made.problem.readings.residual(made.truth), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_readings_put_their_tag_where_it_is(seed: int) -> None:
+    made = made_problem(seed, noise=0.0)
+    readings = made.problem.readings
+    np.testing.assert_allclose(readings.places_in_map(made.truth), made.truth.tags[readings.tag], atol=1e-12)
+
+
+def test_moving_the_whole_map_changes_no_residual() -> None:
+    """Odometry and readings are relative: only the held start says where the map lies."""
+    made = made_problem(0)
+    anywhere = np.array([3.0, -7.0, 2.8])
+    state = random_state(1, made.truth, spread=0.05)
+    moved = State(se2.compose(anywhere, state.poses), se2.apply(anywhere, state.tags), state.calibration)
+    for factors in (made.problem.odometry, made.problem.readings):
+        np.testing.assert_allclose(factors.residual(moved), factors.residual(state), atol=1e-8)
+
+
+def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
+    """Scale is a gauge that only priors hold: were residuals to shrink with the map, thousands of them would outvote
+    the priors, and every map would come out too small."""
+    problem = made_problem(0).problem
+    straight, by_wheels = problem.odometry.motion * [1.0, 0.0, 0.0], np.zeros_like(problem.odometry.jacobian)
+    by_wheels[:, 0, 0] = straight[:, 0]
+    odometry = replace(problem.odometry, motion=straight, jacobian=by_wheels)
+    at_base, no_mount = np.zeros_like(problem.readings.mount), np.zeros_like(problem.readings.mount_parameters)
+    scaled = 7 + problem.readings.tag % 2
+    readings = replace(problem.readings, mount=at_base, mount_parameters=no_mount, scale_parameter=scaled)
+
+    nominal = random_state(1)
+    state = State(nominal.poses, nominal.tags, np.zeros(N_CALIBRATION))
+    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0])
+    shrunk = State(0.9 ** np.array([1, 1, 0]) * state.poses, 0.9 * state.tags, change)
+    np.testing.assert_allclose(odometry.residual(shrunk), odometry.residual(state), atol=1e-8)
+    np.testing.assert_allclose(readings.residual(shrunk), readings.residual(state), atol=1e-8)
+
+
+def test_the_prior_is_in_sigmas_and_holds_what_has_none() -> None:
+    made = made_problem(0)
+    state = State(made.truth.poses, made.truth.tags, 2.0 * CALIBRATION_SIGMA)
+    np.testing.assert_allclose(made.problem.prior.residual(state)[:, 0], [0.0, *[2.0] * (N_CALIBRATION - 1)])
+
+
+def test_whitening_makes_unit_covariances() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((20, 3, 3))
+    covariance = root @ root.swapaxes(-1, -2)
+    W = whitening(covariance)
+    np.testing.assert_allclose(W @ covariance @ W.swapaxes(-1, -2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-6)
+
+
+def test_huber_is_square_then_linear() -> None:
+    length = np.linspace(0.01, 20.0, 500)
+    loss, _ = losses_and_weights(huber(3.0), length[:, None] * [0.6, -0.8])
+    inside = length <= 3.0
+    np.testing.assert_allclose(loss[inside], length[inside] ** 2)
+    np.testing.assert_allclose(np.diff(loss[~inside]), 6.0 * np.diff(length[~inside]))
+
+
+@pytest.mark.parametrize("loss", [SQUARES, huber(3.0), cauchy(2.0), graduated(3.0, 2.0), truncated(5.0)], ids=repr)
+def test_weights_are_the_slopes_of_the_losses(loss: Loss) -> None:
+    square = np.setdiff1d(np.geomspace(1e-4, 1e4, 300), [loss.threshold**2])
+    h = 1e-6 * square
+
+    def at(square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return losses_and_weights(loss, np.sqrt(square)[:, None] * [0.6, -0.8])
+
+    slope = (at(square + h)[0] - at(square - h)[0]) / (2 * h)
+    np.testing.assert_allclose(at(square)[1], slope, rtol=1e-4)
+    assert (np.diff(at(square)[0]) > 0.0).all()
+    assert (at(square)[0] <= square * (1 + 1e-12)).all()

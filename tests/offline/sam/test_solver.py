@@ -1,0 +1,234 @@
+"""The solve: the same optimum as plain dense algebra, from any start nearby, with covariances and scale to believe."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2, wheels
+from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.sam.factors.losses import cauchy, losses_and_weights
+from groundsbot.offline.sam.factors.planar import OdometryFactors, State
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
+from tests.benchmarks.speed.plain_solver import plain_normal_equations
+from tests.support.data.drives import FAMILY, START_NS, made_positions, made_robot, made_run
+from tests.support.data.problems import CHAINS, N_TAGS, made_problem, random_state
+
+SEEDS = range(3)
+ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
+
+
+def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+    """H and g from finite differences of the residuals alone."""
+
+    def residual(at: State) -> FloatArray:
+        weight = np.sqrt(losses_and_weights(DEFAULT_LOSSES.readings, problem.readings.residual(state))[1])[:, None]
+        kinds = (problem.odometry.residual(at), weight * problem.readings.residual(at), problem.prior.residual(at))
+        return np.concatenate([kind.reshape(-1) for kind in kinds])
+
+    h = 1e-6
+    columns = [
+        (residual(problem.moved(state, step)) - residual(problem.moved(state, -step))) / (2 * h)
+        for step in h * np.eye(problem.columns.n)
+    ]
+    jacobian = np.array(columns).T
+    return jacobian.T @ jacobian, jacobian.T @ residual(state)
+
+
+def distance(problem: Problem, a: State, b: State) -> float:
+    """Between two states in sigmas, roughly: the largest change of any pose, tag or calibration number."""
+    poses = se2.log(se2.between(a.poses, b.poses))
+    return float(max(np.abs(poses).max(), np.abs(a.tags - b.tags).max(), np.abs(a.calibration - b.calibration).max()))
+
+
+@pytest.mark.parametrize("n_outliers", [0, 4])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_normal_equations_are_those_of_dense_algebra(seed: int, n_outliers: int) -> None:
+    made = made_problem(seed, n_outliers=n_outliers)
+    state = random_state(seed, made.truth, spread=0.02)
+    hessian, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
+    expected_hessian, expected_gradient = dense_normal_equations(made.problem, state)
+    np.testing.assert_allclose(hessian.toarray(), expected_hessian, rtol=1e-5, atol=1e-6 * expected_hessian.max())
+    np.testing.assert_allclose(gradient, expected_gradient, atol=1e-5 * float(np.abs(expected_gradient).max()))
+
+
+@pytest.mark.parametrize("n_outliers", [0, 4])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_optimum_is_where_dense_gauss_newton_ends(seed: int, n_outliers: int) -> None:
+    made = made_problem(seed, n_outliers=n_outliers)
+    start = random_state(seed, made.truth, spread=0.05)
+    solution = solve(made.problem, start)
+    assert solution.converged
+    assert list(solution.costs) == sorted(solution.costs, reverse=True)
+    state = start
+    for _ in range(40):
+        hessian, gradient = dense_normal_equations(made.problem, state)
+        step = np.asarray(-np.linalg.solve(hessian, gradient), dtype=np.float64)
+        state = made.problem.moved(state, step)
+        if np.abs(step).max() < 1e-7:
+            break
+    assert distance(made.problem, solution.state, state) < 1e-5
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
+    made = made_problem(seed)
+    solution = solve(made.problem, made.truth)
+    hessian, _ = dense_normal_equations(made.problem, solution.state)
+    columns = made.problem.columns
+    wanted = np.concatenate([columns.poses[[0, 5, 15]].reshape(-1), columns.tags.reshape(-1), columns.calibration])
+    found = solution.covariance(wanted)
+    expected = np.zeros_like(found)
+    free = np.flatnonzero(wanted >= 0)
+    expected[np.ix_(free, free)] = np.linalg.inv(hessian)[np.ix_(wanted[free], wanted[free])]
+    sigma = np.sqrt(np.maximum(np.diag(expected), 1e-12))
+    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-4)
+    held = np.flatnonzero(wanted < 0)
+    assert len(held) == 4
+    assert not found[held].any()
+    np.testing.assert_array_equal(found, found.T)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_start_nearby_leads_to_the_same_optimum(seed: int) -> None:
+    made = made_problem(seed, n_outliers=2)
+    reference = solve(made.problem, made.truth)
+    for start_seed in range(5):
+        start = random_state(start_seed, made.truth, spread=0.15)
+        solution = solve(made.problem, start)
+        assert solution.converged
+        assert solution.cost == pytest.approx(reference.cost, abs=1e-8)
+        assert distance(made.problem, solution.state, reference.state) < 1e-4
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    """Chi-square over 60 problems: measurements with Gaussian noise, so nothing but the solve can spoil it."""
+    total, n = 0.0, 0
+    for seed in range(60):
+        made = made_problem(seed)
+        solution = solve(made.problem, made.truth)
+        columns = made.problem.columns
+        error = (solution.state.tags - made.truth.tags).reshape(-1)
+        covariance = solution.covariance(columns.tags.reshape(-1))
+        total += float(error @ np.linalg.solve(covariance, error))
+        n += len(error)
+    # 720 dimensions: the standard deviation of the mean is 0.053.
+    assert total / n == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
+    made = made_problem(seed, noise=0.0, true_calibration=True)
+    solution = solve(made.problem, random_state(seed, made.truth, spread=0.1))
+    assert solution.cost < 1e-12
+    assert distance(made.problem, solution.state, made.truth) < 1e-7
+
+
+@pytest.mark.parametrize("losses", [DEFAULT_LOSSES, PLAIN_SQUARES, Losses(cauchy(3.0), cauchy(3.0))], ids=str)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
+    """One linearisation, no step: by the linear model there is nothing left to win."""
+    made = made_problem(seed, n_outliers=4)
+    found = solve(made.problem, made.truth, losses=losses)
+    assert found.converged
+    again = solve(made.problem, found.state, losses=losses)
+    assert (again.reason, again.converged, again.costs, again.n_linearised) == ("converged", True, (found.cost,), 1)
+    np.testing.assert_array_equal(again.state.poses, found.state.poses)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_truth_of_exact_measurements_is_left_alone(seed: int) -> None:
+    made = made_problem(seed, noise=0.0, true_calibration=True)
+    found = solve(made.problem, made.truth)
+    assert found.converged
+    assert found.n_linearised == 1
+
+
+def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
+    made = made_problem(0)
+    value = made.problem.readings.value.copy()
+    value[3] = np.nan
+    spoilt = replace(made.problem, readings=replace(made.problem.readings, value=value))
+    found = solve(spoilt, made.truth)
+    assert not found.converged
+    assert found.reason == "the cost is no number at the start"
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_neither_order_of_chains_nor_of_tags_matters(seed: int) -> None:
+    """The same factors and the same held pose, everything numbered anew."""
+    made = made_problem(seed, n_outliers=2)
+    problem, truth = made.problem, made.truth
+    rng = np.random.default_rng(seed)
+    n_first, n_poses = CHAINS[0], sum(CHAINS)
+    new_pose = np.concatenate([np.arange(n_first) + n_poses - n_first, np.arange(n_poses - n_first)])
+    new_tag = rng.permutation(N_TAGS)
+    old_pose, old_tag = np.argsort(new_pose), np.argsort(new_tag)
+    order = np.argsort(new_pose[problem.odometry.first])
+    odometry = OdometryFactors(**{name: getattr(problem.odometry, name)[order] for name in ODOMETRY_FIELDS})
+    readings = problem.readings
+    mixed = Problem(
+        replace(odometry, first=new_pose[odometry.first]),
+        replace(readings, pose=new_pose[readings.pose], tag=new_tag[readings.tag]),
+        problem.prior,
+        replace(problem.columns, poses=problem.columns.poses[old_pose], tags=problem.columns.tags[old_tag]),
+        new_pose[problem.anchor[old_tag]],
+    )
+    start = random_state(seed, truth, spread=0.1)
+    one = solve(problem, start)
+    other = solve(mixed, State(start.poses[old_pose], start.tags[old_tag], start.calibration))
+    assert one.converged
+    assert other.converged
+    back = State(other.state.poses[new_pose], other.state.tags[new_tag], other.state.calibration)
+    assert distance(problem, one.state, back) < 1e-6
+
+
+# An eight past twelve tags, true to its calibration. Readings are so sharp that they show the wheels' noise: what is
+# seen of it is what a shrunken map would make smaller.
+READING_SIGMA_M = 0.003
+TAGS_M = np.array([[x, y] for x in (-1.5, 1.5, 4.5) for y in (-3.5, -1.0, 1.0, 3.5)])
+
+
+def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> LocalMap:
+    """Wheels and readings with exactly the noise that the estimator believes in, calibration exactly as it says."""
+    rng = np.random.default_rng(seed)
+    noise = NoiseParameters()
+    turn_rad = 2.0 * np.pi / 200 * np.where(np.arange(n_steps) % 400 < 200, 1.0, -1.0)
+    left_m, right_m = step_m - 0.25 * turn_rad, step_m + 0.25 * turn_rad
+    heading_variance = noise.sigma_heading_rad_per_sqrt_m**2 * step_m
+    heading_variance += noise.sigma_heading_rad_per_sqrt_rad**2 * abs(turn_rad[0])
+    root_m = np.sqrt(step_m)
+    sigma = [noise.sigma_distance_m_per_sqrt_m * root_m, noise.sigma_lateral_m_per_sqrt_m * root_m]
+    disturbance = se2.exp(np.array([*sigma, np.sqrt(heading_variance)]) * rng.standard_normal((n_steps, 3)))
+    true = chained(se2.compose(wheels.advance(left_m, right_m, 0.5), disturbance), np.zeros(3))
+    stamps_ns = START_NS + 50_000_000 * np.arange(n_steps + 1, dtype=np.int64)
+    counted_left_m, counted_right_m = (np.concatenate([[0.0], np.cumsum(each)]) for each in (left_m, right_m))
+    track = WheelTrack(stamps_ns, counted_left_m, counted_right_m)
+    pose, tag = (index.reshape(-1) for index in np.mgrid[0 : n_steps + 1, 0 : len(TAGS_M)])
+    place = se2.apply(se2.inverse(true[pose]), TAGS_M[tag])
+    near = np.linalg.norm(place, axis=1) < 4.0
+    read = place[near] + READING_SIGMA_M * rng.standard_normal((int(near.sum()), 2))
+    keys = [TagKey(FAMILY, i) for i in range(len(TAGS_M))]
+    run = made_run(
+        [track],
+        robot=made_robot(),
+        tags=keys,
+        positions=made_positions(stamps_ns[pose[near]], tag[near], read, READING_SIGMA_M),
+    )
+    (chain,) = chains_of(run, noise)
+    return solve_local_map(chain)
+
+
+def test_true_calibration_is_found_without_bias() -> None:
+    """Were residuals to shrink with the map, wheels and tags would come out several of their sigmas too small."""
+    estimates = [{p.name: v for p, v in noisy_local_map(seed).calibration.items()} for seed in range(20)]
+    for name in ("wheel_scale", "tag_scale"):
+        values = np.array([estimate[name] for estimate in estimates])
+        standard_error = values.std(ddof=1) / np.sqrt(len(values))
+        assert abs(values.mean()) < 3.0 * standard_error, name

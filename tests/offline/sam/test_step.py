@@ -1,0 +1,79 @@
+"""Steps taken motion by motion, and parts of steps: what long drives past few tags need to arrive."""
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.arrowhead.system import Arrowhead
+from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
+from groundsbot.offline.sam.step import Before, take_step
+from tests.support.data.graphs import made_graph
+from tests.support.data.long_drives import made_long_drive
+
+
+def both_ways(step: float) -> tuple[Arrowhead, State, State, State, FloatArray]:
+    """A random step of some size: before, pose by pose, motion by motion, and the step."""
+    problem, state = made_graph(3, [40, 25], 6)
+    random = step * np.random.default_rng(1).standard_normal(problem.columns.n)
+    ordered = problem.arrowhead.in_order(random)
+    moved = problem.arrowhead.moved(state, ordered, problem.anchor)
+    return problem.arrowhead, state, moved, problem.arrowhead.rolled(state, ordered, problem.anchor, moved), ordered
+
+
+def difference(one: State, other: State) -> float:
+    return float(
+        max(np.abs(se2.between(one.poses, other.poses)).max(), np.abs(one.tags - other.tags).max())
+        + np.abs(one.calibration - other.calibration).max()
+    )
+
+
+def test_both_ways_agree_to_first_order() -> None:
+    coarse, fine = (difference(*both_ways(step)[2:4]) for step in (1e-3, 1e-4))
+    assert 0.0 < coarse < 1.0
+    assert fine == pytest.approx(0.01 * coarse, rel=0.2)  # of second order
+
+
+def test_motion_by_motion_each_motion_takes_its_own_part_of_the_step_alone() -> None:
+    """However far the chain as a whole is carried, what a motion changes by is what its two ends disagree in."""
+    arrowhead, before, _, after, step = both_ways(0.5)
+    poses = step[: 3 * len(before.poses)].reshape(-1, 3)
+    for first, last in zip(arrowhead.tree.chain_start[:-1], arrowhead.tree.chain_start[1:], strict=True):
+        motion = se2.between(before.poses[first : last - 1], before.poses[first + 1 : last])
+        carried = np.einsum("nij,nj->ni", se2.adjoint(se2.inverse(motion)), poses[first : last - 1])
+        own = poses[first + 1 : last] - carried
+        now = se2.between(after.poses[first : last - 1], after.poses[first + 1 : last])
+        np.testing.assert_allclose(se2.between(se2.compose(motion, se2.exp(own)), now), 0.0, atol=1e-12)
+
+
+def test_a_step_too_long_is_taken_in_part() -> None:
+    problem, truth = made_graph(3, [40, 25], 6)
+    arrowhead = problem.arrowhead
+    system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
+    step = -arrowhead.factorise(system).solve_in_order(system.gradient)
+    for times, share in ((1.0, 1.0), (2.5, 0.5), (6.0, 0.2)):
+        taken = take_step(
+            arrowhead,
+            PLAIN_SQUARES,
+            problem.anchor,
+            Before(truth, cost, False),
+            times * step,
+            1.0,
+            arrowhead.empty_system(),
+        )
+        assert taken.share == share
+        assert taken.cost < cost
+    uphill = take_step(
+        arrowhead, PLAIN_SQUARES, problem.anchor, Before(truth, cost, False), -step, 1.0, arrowhead.empty_system()
+    )
+    assert uphill.cost == np.inf
+
+
+def test_a_long_drive_past_few_tags_arrives_in_few_steps() -> None:
+    drive = made_long_drive(25, 500.0)
+    graph = build_graph([drive.chain])
+    solution = solve(graph.problem, drive.true_state(graph))
+    assert solution.converged
+    assert solution.n_linearised < 40

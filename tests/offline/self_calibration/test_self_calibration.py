@@ -1,0 +1,338 @@
+"""Self-calibration frees what drives tell and robot.yaml has wrong, and nothing else; `calibrate` writes it down."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.camera.file import read_camera_yaml
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS
+from groundsbot.calib.robot.robot import Robot, read_robot_yaml, write_robot_yaml
+from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.worlds.world import load_world
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.parameter_results import CalibrationChoice
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
+from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
+from groundsbot.offline.self_calibration.robot import LIMITS, Learnt, Owned, all_open, corrected, opened
+from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose
+from groundsbot.offline.self_calibration.words import DRIVES, freed_lines
+from groundsbot.onboard.log.reading.reader import find_logs
+from tests.benchmarks.accuracy.accuracy import with_wide_priors
+from tests.support.data.drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
+from tests.support.programs import Run as Program
+
+NOISE = NoiseParameters()
+AUTO = Calibrate(is_on=True)
+# To and fro in a room, with whole turns on the spot to either side.
+LEGS = [(0.5, 0.52, 6.0), (-0.3, 0.3, 7.9), (0.5, 0.5, 6.0), (0.3, -0.3, 7.8)] * 2
+TAGS = [
+    MadeTag(3 * i + j, (x, y, 0.3 + 0.2 * j), yaw)
+    for i, (x, y, yaw) in enumerate(
+        [
+            (7.0, 0.0, np.pi),
+            (7.0, 3.0, np.pi),
+            (-4.0, 0.5, 0.0),
+            (-4.0, 3.0, 0.0),
+            (2.0, -4.0, np.pi / 2),
+            (2.0, 7.0, -np.pi / 2),
+        ]
+    )
+    for j in range(2)
+]
+
+
+def driven(folder: Path, name: str, legs: Sequence[tuple[float, float, float]]) -> Path:
+    drive = made_drive([0.0, 0.0, 0.0], legs)
+    pictures_ns = picture_stamps(drive, 3.7)
+    return write_drive(folder, drive, TAGS, made_robot(name), corner_sigma_px=0.2, pictures_ns=pictures_ns)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive")
+    return driven(folder, "a", LEGS)
+
+
+@pytest.mark.parametrize("corners", [False, True])
+def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners: bool) -> None:
+    (chain,) = chains_of(load_run(log), NOISE)
+    found = solve_local_map(chain)
+    bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
+    readings = replace(chain.readings, corner_bias_px=np.tile(bias_px, (len(chain.readings), 1)))
+    biased = replace(found, chain=replace(chain, readings=readings))
+    plain, less = (told_by([each], NOISE, [Effort(1e11, 1e11, 1e9)], corners=corners) for each in (found, biased))
+    (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
+    assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
+
+
+def mistaken(**changes: float) -> Robot:
+    """The robot's file with some numbers wrong: of wheels by a share, of the mount as they are."""
+    robot = made_robot("a")
+    wheels = {name: getattr(robot.wheels, name) * (1.0 + off) for name, off in changes.items() if "radius" in name}
+    if "track_m" in changes:
+        wheels["track_m"] = robot.wheels.track_m * (1.0 + changes["track_m"])
+    mount = {name: getattr(robot.mount, name) + changes[name] for name in changes if hasattr(robot.mount, name)}
+    return robot.model_copy(
+        update={"wheels": robot.wheels.model_copy(update=wheels), "mount": robot.mount.model_copy(update=mount)}
+    )
+
+
+def mapped(log: Path, robot: Robot, calibrate: Calibrate = AUTO, *, corners: bool = False) -> MapResult:
+    files = {"a": RobotFile(robot, CAMERA)}
+    return build_map(read_runs([log], files), NOISE, corners=corners, calibrate=calibrate)
+
+
+def freed(result: MapResult) -> set[str]:
+    return {each.name for each in result.choices if each.is_freed}
+
+
+def value_of(result: MapResult, name: str) -> float:
+    return next(each.value for each in result.calibration if each.name == name)
+
+
+def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
+    result = mapped(log, made_robot("a"))
+    assert {each.name for each in result.choices} == set(NAMES) - {FOCAL_SCALE}
+    assert freed(result) == set()
+    assert all(each.reason for each in result.choices)
+    off = mapped(log, made_robot("a"), Calibrate())
+    assert off.choices == ()
+    for a, b in zip(off.components[0].tags, result.components[0].tags, strict=True):
+        np.testing.assert_allclose(a.position_m, b.position_m, atol=1e-9)
+
+
+def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
+    wrong = mistaken(track_m=0.08, yaw_rad=0.06)
+    result = mapped(log, wrong)
+    assert freed(result) == {"track_scale", "mount_yaw_rad"}
+    assert value_of(result, "track_scale") == pytest.approx(1.0 / 1.08 - 1.0, abs=2e-3)
+    assert value_of(result, "mount_yaw_rad") == pytest.approx(-0.06, abs=3e-3)
+    prior = {each.name: each.prior_sigma for each in result.calibration}
+    assert prior["track_scale"] == LIMITS["track_scale"]
+    assert prior["mount_x_m"] == wrong.mount.x_m_sigma
+
+
+def test_a_camera_that_is_late_is_found_where_turns_tell_it(log: Path) -> None:
+    result = mapped(log, made_robot("a").model_copy(update={"time_offset_s": -0.02}))
+    assert freed(result) == {"time_offset_s"}
+    assert value_of(result, "time_offset_s") == pytest.approx(0.02, abs=2e-3)
+
+
+def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(tmp_path: Path) -> None:
+    drives = tmp_path / "drives"
+    simulate(with_wide_priors(load_world("nsh")), 1001, drives, ["hallway"], render=False)
+    result = build_map(read_runs(find_logs([drives])), NOISE, calibrate=AUTO)
+    (truth,) = json.loads((drives / TRUTH_FILE).read_text())["runs"].values()
+    (found,) = (each for each in result.calibration if each.name == "time_offset_s")
+    assert found.sigma < 0.005  # of 0.02 that robot.yaml leaves open
+    assert found.value == pytest.approx(truth["parameters"]["time_offset_s"], abs=3.3 * found.sigma)
+
+
+def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_the_scale(log: Path) -> None:
+    long_wheels = mistaken(radius_left_m=0.05, radius_right_m=0.05)
+    assert freed(mapped(log, long_wheels)) == {
+        TAG_SCALE,
+        "track_scale",
+    }  # robot.yaml trusts wheels to 0.35 %, tags to 0.5 %
+    sure = [each.model_copy(update={"sigma_size_m": 1e-4}) for each in long_wheels.tags]
+    result = mapped(log, long_wheels.model_copy(update={"tags": sure}))
+    assert freed(result) == {"wheel_scale"}
+    assert value_of(result, "wheel_scale") == pytest.approx(1.0 / 1.05 - 1.0, abs=3e-3)
+    (metre,) = result.metres
+    assert metre.shares["tags"] > 0.9
+
+
+def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path) -> None:
+    result = mapped(log, made_robot("a"), Calibrate(is_on=True, names=("wheel_ratio", "wheel_scale")))
+    assert freed(result) == {"wheel_ratio"}
+    reasons = {each.name: each.reason for each in result.choices}
+    assert reasons["wheel_scale"] == TELLS_LESS
+    freed_line, refused_line = freed_lines(result)
+    assert freed_line.startswith("freed: wheel_ratio of a")
+    assert refused_line.startswith("not freed: wheel_scale of a: held by robot.yaml's sigma")
+    assert "--distance" in refused_line
+    assert reasons["track_scale"] == "it was not asked for"
+
+
+def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> None:
+    camera = replace(CAMERA, fx_px=CAMERA.fx_px / 1.03, fy_px=CAMERA.fy_px / 1.03)
+    robot = mistaken(pitch_rad=0.06).model_copy(update={"focal_scale_sigma": 0.002})
+    files = {"a": RobotFile(robot, camera)}
+    result = build_map(read_runs([log], files), NOISE, corners=True, calibrate=AUTO)
+    assert freed(result) >= {FOCAL_SCALE, "mount_pitch_rad"}
+    assert value_of(result, FOCAL_SCALE) == pytest.approx(0.03, abs=3e-3)
+    assert value_of(result, "mount_pitch_rad") == pytest.approx(-0.06, abs=1e-3)
+    assert "mount_z_m" not in {each.name for each in result.choices}
+    assert result.warnings == ()
+
+
+def told(values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]) -> Told:
+    """Stretches that each tell of each number on its own."""
+    information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
+    vector = np.einsum("sij,sj->si", information, np.array(values))
+    return Told(tuple(Parameter("r", name, (), sigma) for name, sigma in priors.items()), information, vector)
+
+
+def choice(
+    values: list[float], sigmas: list[float], prior: float = 0.01, name: str = "track_scale"
+) -> CalibrationChoice:
+    (found,) = choose(told([[each] for each in values], [[each] for each in sigmas], {name: prior}))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("values", "sigmas", "name", "reason"),
+    [
+        ([0.05, 0.051, 0.049], [0.001] * 3, "track_scale", ""),
+        ([0.02, 0.021, 0.019], [0.001] * 3, "track_scale", "agrees"),
+        ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "tell less"),
+        ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "foretell the others"),
+        ([0.25, 0.251, 0.249], [0.001] * 3, "track_scale", "no error of calibration"),
+        ([0.05, 0.0], [0.001, 9.0], "track_scale", "single stretch"),
+        ([0.05, 0.051, 0.049], [0.001] * 3, "time_offset_s", ""),
+    ],
+)
+def test_each_condition_holds_a_number_back(values: list[float], sigmas: list[float], name: str, reason: str) -> None:
+    found = choice(values, sigmas, name=name)
+    assert found.is_freed == (not reason)
+    assert reason in found.reason
+
+
+def test_what_is_told_is_the_weighed_mean_and_how_far_it_is_from_the_file() -> None:
+    found = choice([0.05, 0.06], [0.001, 0.002])
+    assert found.value == pytest.approx((0.05 + 0.06 / 4) / 1.25)
+    assert found.sigma == pytest.approx(0.001 / np.sqrt(1.25))
+    assert found.off_sigmas == pytest.approx(found.value / np.hypot(0.01, found.sigma))
+    # By hand: each from N(the other; both variances), against N(0; its own and the prior's).
+    apart, both = 0.01**2, 0.001**2 + 0.002**2
+    gain = -(apart / both + np.log(both))
+    gain += sum(0.5 * (x**2 / (s**2 + 1e-4) + np.log(s**2 + 1e-4)) for x, s in ((0.05, 0.001), (0.06, 0.002)))
+    assert found.held_out_gain == pytest.approx(gain)
+
+
+def test_a_file_that_is_right_is_called_wrong_once_in_a_hundred_maps() -> None:
+    rng = np.random.default_rng(5)
+    sigmas = [0.002 * rng.uniform(0.5, 2.0, len(NAMES)) for _ in range(4)]
+    n_freed = 0
+    for _ in range(400):
+        true = 0.01 * rng.standard_normal(len(NAMES))
+        values = [(true + each * rng.standard_normal(len(NAMES))).tolist() for each in sigmas]
+        choices = choose(told(values, [each.tolist() for each in sigmas], dict.fromkeys(NAMES, 0.01)))
+        n_freed += any(each.is_freed for each in choices)
+    assert n_freed <= 11  # of 400 at 1 %: more happens once in 500 times
+
+
+def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
+    wrong = mistaken(track_m=0.08, radius_left_m=0.02, yaw_rad=0.06, pitch_rad=-0.01)
+    result = mapped(log, wrong)
+    learnt = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in result.calibration}
+    better = corrected(wrong, learnt)
+    assert better.wheels.radius_left_m == pytest.approx(0.1, rel=1e-2)
+    assert better.wheels.radius_left_m / better.wheels.radius_right_m == pytest.approx(1.0, rel=2e-3)
+    assert better.wheels.track_m == pytest.approx(0.5, rel=1e-2)
+    again = mapped(log, better, Calibrate())
+    for each in again.calibration:
+        assert abs(each.value) < each.sigma, each  # the same drive tells it once more
+        assert each.prior_sigma == pytest.approx(learnt[Owned(each.owner, each.name)].sigma, rel=1e-2)
+
+
+def test_what_was_learnt_of_edges_is_written() -> None:
+    robot = made_robot("a", edge_shift_px=0.02)
+    better = corrected(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
+    assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
+    assert all_open(robot).edge_shift_px_sigma == LIMITS["edge_shift_px"]
+
+
+def test_every_number_that_may_be_freed_can_be_opened() -> None:
+    assert set(NAMES) == set(LIMITS) == set(DRIVES)
+    robot = made_robot("a")
+    everything = all_open(robot)
+    sigmas = dict(zip(WHEEL_PARAMETERS, [each.sigma for each in parameters_of_wheels(everything)], strict=True))
+    assert sigmas == pytest.approx({name: LIMITS[name] for name in WHEEL_PARAMETERS})
+    assert everything.tags[0].relative_sigma == pytest.approx(LIMITS[TAG_SCALE])
+    assert everything.mount.roll_rad_sigma == LIMITS["mount_roll_rad"]
+    assert everything.mount.z_m_sigma == robot.mount.z_m_sigma
+    assert opened(robot, {}) == robot
+    assert opened(robot, {Owned("another", "track_scale"): 0.1}) == robot
+
+
+def test_a_name_that_is_none_is_refused() -> None:
+    assert parse_calibrate("off") == Calibrate()
+    assert parse_calibrate("track_scale, mount_yaw_rad").names == ("track_scale", "mount_yaw_rad")
+    with pytest.raises(OfflineError, match=r"--calibrate: 'track' is neither off nor auto .* track_scale"):
+        parse_calibrate("track")
+
+
+def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(log: Path, tmp_path: Path) -> None:
+    result = mapped(log, mistaken(track_m=0.08))
+    other = driven(tmp_path / "logs", "b", LEGS[:1])
+    write_map(result, tmp_path)
+    again = read_map(tmp_path)
+    assert again.choices == result.choices
+    with pytest.raises(OfflineError, match="--calibrate: a kept map has its calibration"):
+        build_map(read_runs([other]), extending=again, calibrate=AUTO)
+
+
+def test_the_command_writes_files_that_the_next_drive_is_mapped_with(log: Path, tmp_path: Path, run: Program) -> None:
+    wrong = tmp_path / "wrong.yaml"
+    write_robot_yaml(mistaken(track_m=0.08).model_copy(update={"camera": None}), wrong)
+    output = tmp_path / "new" / "robot.yaml"
+    found = run("calibrate", log, "--robot", wrong, "-o", output)
+    assert found.code == 0, found.err
+    assert "track_scale of a: -0.07" in found.out
+    assert "; freed" in found.out
+    assert "to tell it, give a measured --distance" in found.out
+    assert "scale: known to" in found.out
+    camera = read_robot_file(output).camera
+    assert camera is not None
+    assert replace(camera, name=CAMERA.name) == CAMERA
+    assert read_robot_yaml(output).wheels.track_m == pytest.approx(0.5, rel=1e-2)
+    refused = run("calibrate", log, "-o", output)
+    assert refused.code == 1
+    assert "is there already" in refused.err
+
+
+def test_robots_get_a_file_each_in_a_folder(log: Path, tmp_path: Path, run: Program) -> None:
+    other = driven(tmp_path, "b", LEGS[:2])
+    refused = run("calibrate", log, other, "-o", tmp_path / "robot.yaml")
+    assert refused.code == 1
+    assert "several robots (a, b)" in refused.err
+    assert not (tmp_path / "robot.yaml").exists()
+    found = run("calibrate", log, other, "-o", tmp_path / "learnt", "--model", "corners", "--json")
+    assert found.code == 0, found.err
+    document = json.loads(found.out)
+    assert sorted(Path(each).name for each in document["files"]) == [
+        "a.yaml",
+        "a_camera.yaml",
+        "b.yaml",
+        "b_camera.yaml",
+    ]
+    assert {each["owner"] for each in document["learnt"]} == {"a", "b", "default tag36h11"}
+    camera = read_camera_yaml(tmp_path / "learnt" / "a_camera.yaml")
+    assert replace(camera, name=CAMERA.name) == CAMERA
+
+
+def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) -> None:
+    wrong = tmp_path / "wrong.yaml"
+    write_robot_yaml(mistaken(track_m=0.08).model_copy(update={"camera": None}), wrong)
+    found = run("map", log, "--robot", wrong, "--calibrate", "auto", "-o", tmp_path / "map")
+    assert "freed: track_scale of a: -0.07" in found.out
+    document = json.loads((tmp_path / "map" / "map.json").read_text())
+    assert [each["name"] for each in document["choices"] if each["is_freed"]] == ["track_scale"]
+    assert "Self-calibration" in (tmp_path / "map" / "report.html").read_text()
+    off = run("map", log, "--calibrate", "none", "-o", tmp_path / "off")
+    assert (off.code, off.err.startswith("error: --calibrate: 'none'")) == (1, True)

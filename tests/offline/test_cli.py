@@ -1,0 +1,117 @@
+"""groundsbot-offline as a person meets it: text, JSON, exit codes."""
+
+import json
+import struct
+from pathlib import Path
+
+import pytest
+
+from groundsbot.offline.maps.files import write_map
+from tests.support.data.maps import made_component, made_map, made_truth
+from tests.support.programs import Run
+
+ODOMETRY = "t_s,left_m_s,right_m_s\n0,0,0\n1,1,1\n2,0.5,1\n"
+OBSERVATIONS = "t_s,tag_id,x_m,y_m\n0.5,7,3,1\n1.5,7,2,1\n1.5,9,4,-1\n"
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    (folder / "odometry.csv").write_text(ODOMETRY)
+    (folder / "observations.csv").write_text(OBSERVATIONS)
+    return folder
+
+
+@pytest.fixture
+def truth_file(tmp_path: Path) -> Path:
+    truth = made_truth(made_component())
+    data = {
+        "runs": {
+            name: {"poses": [[int(t), *map(float, pose)] for t, pose in zip(r.stamps_ns, r.T_world_base, strict=True)]}
+            for name, r in truth.runs.items()
+        },
+        "tags": [
+            {"family": family, "tag_id": tag_id, "position_m": [*map(float, place), 1.0], "quaternion_xyzw": None}
+            for (family, tag_id, _), place in truth.tags_m.items()
+        ],
+    }
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_a_folder_is_imported_and_described(run: Run, drive: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    outcome = run("import", drive, "-o", logs, "--track-width-m", "0.5")
+    assert outcome.code == 0
+    assert "3 odometry readings over 2.0 s and 1.75 m; 3 observations of 2 tags" in outcome.out
+    assert "each the mean since the row before" in outcome.out
+    assert f"wrote {logs / 'drive'}" in outcome.out
+    outcome = run("info", logs)
+    assert outcome.code == 0
+    assert "robot drive, run drive" in outcome.out
+    (described,) = json.loads(run("info", logs, "--json").out)
+    assert described["distance_m"] == pytest.approx(1.75)
+
+
+def test_a_bad_folder_is_one_line_and_exit_1(run: Run, drive: Path, tmp_path: Path) -> None:
+    (drive / "odometry.csv").write_text("t_s,left_m_s,right_m_s\n0,0,0\n1,nan,1\n")
+    outcome = run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err.startswith(f"error: {drive}/odometry.csv line 3, column left_m_s: 'nan'")
+    assert outcome.err.count("\n") == 1
+    assert not (tmp_path / "logs").exists()
+
+
+def test_info_describes_the_good_and_names_the_bad(run: Run, drive: Path, tmp_path: Path) -> None:
+    run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(b"nonsense")
+    outcome = run("info", tmp_path / "a.mcap", tmp_path / "logs", tmp_path / "b.mcap")
+    assert outcome.code == 1
+    assert "run drive" in outcome.out
+    assert [line.partition(": ")[0] for line in outcome.err.splitlines()] == ["error", "error"]
+    assert "a.mcap" in outcome.err.splitlines()[0]
+    assert "b.mcap" in outcome.err.splitlines()[1]
+    missing = run("info", tmp_path / "nowhere")
+    assert (missing.code, missing.out) == (1, "")
+    assert "nowhere" in missing.err
+
+
+def test_info_of_a_damaged_log_ends_with_exit_code_3(run: Run, drive: Path, tmp_path: Path) -> None:
+    run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
+    (file,) = (tmp_path / "logs").rglob("*.mcap")
+    whole = file.read_bytes()
+    data_end = whole.index(struct.pack("<BQ", 0x0F, 4))
+    file.write_bytes(whole[:data_end] + b"x" * 100 + whole[data_end:])
+    outcome = run("info", tmp_path / "logs")
+    assert outcome.code == 3
+    assert "lost: 1 damaged place of " in outcome.out
+    file.unlink()
+    file.with_name(file.name + ".active").write_bytes(whole[:data_end])
+    outcome = run("info", tmp_path / "logs")
+    assert outcome.code == 0
+    assert "was never finished" in outcome.out
+
+
+def test_compare_prints_figures_as_text_and_json(run: Run, truth_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    write_map(made_map(), folder)
+    outcome = run("compare", folder, "--truth", truth_file)
+    assert outcome.code == 0
+    assert "start of red_one to start of blue_two: 10.198 m found, 10.198 m true" in outcome.out
+    assert "tags RMSE, as the map stands: 0.000 m" in outcome.out
+    data = json.loads(run("compare", folder, "--truth", truth_file, "--json").out)
+    wanted = {"start_to_start_vector_error_m", "start_to_start_distance_error_m", "start_to_start_percent"}
+    wanted |= {"tags_rmse_m", "tags_rmse_aligned_m", "trajectory_rmse_m", "nees_tags_per_dim", "nees_start_per_dim"}
+    assert wanted <= set(data)
+    assert data["tags_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_compare_without_a_map_is_one_line_and_exit_1(run: Run, truth_file: Path, tmp_path: Path) -> None:
+    outcome = run("compare", tmp_path, "--truth", truth_file)
+    assert outcome.code == 1
+    assert "map.json: cannot be read" in outcome.err
+    assert run("compare", tmp_path).code == 2  # wrong usage

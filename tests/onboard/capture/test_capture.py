@@ -1,0 +1,379 @@
+"""Capturing pictures of the board: which are kept, what is said, and what is on the disk afterwards."""
+
+import errno
+import io
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.console import Console
+
+from groundsbot.calib.board.board import DEFAULT_BOARD
+from groundsbot.fixtures.recording.devices import PictureFolder
+from groundsbot.onboard import cli
+from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraLostError, Frame
+from groundsbot.onboard.capture.capture import Capture
+from groundsbot.onboard.capture.guide import Advice, CaptureGuide
+from groundsbot.onboard.capture.view import CaptureView
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.log.picture import Picture
+from groundsbot.onboard.process.clock import RunClock
+from tests.support.board_views import good_views, rendered
+from tests.support.devices.live_recording import PATIENCE_S, until
+from tests.support.programs import running
+
+MS = 1_000_000
+STEP_NS = 110 * MS
+EMPTY = np.full((480, 640), 120, np.uint8)
+
+
+def shown(guide: CaptureGuide, pictures: Sequence[NDArray[np.uint8]], start_ns: int = 0) -> list[Advice]:
+    return [guide.handle_frame(each, start_ns + index * STEP_NS) for index, each in enumerate(pictures)]
+
+
+def test_a_picture_is_taken_when_the_board_is_still_and_only_once() -> None:
+    guide = CaptureGuide(DEFAULT_BOARD, 30)
+    advice = shown(guide, [rendered()[0]] * 5)
+    assert [each.keep for each in advice] == [False, False, True, False, False]
+    assert [each.text for each in advice[:2]] == ["hold the board still"] * 2
+    assert advice[2].text.startswith("taken; show the board at the picture's")
+    assert advice[4].text.startswith("show the board at the picture's")
+    assert guide.kept == 1
+
+
+def test_nothing_is_taken_while_the_board_moves_or_is_away() -> None:
+    guide = CaptureGuide(DEFAULT_BOARD, 30)
+    start = rendered()[4]
+    moving = [np.roll(start, 3 * index, axis=1) for index in range(8)]  # 27 px/s
+    assert not any(each.keep for each in shown(guide, moving))
+    creeping = [np.roll(start, index // 2, axis=1) for index in range(8)]
+    assert sum(each.keep for each in shown(guide, creeping, 60_000 * MS)) == 1
+    gone = shown(guide, [rendered()[0], EMPTY] * 3, 120_000 * MS)
+    assert not any(each.keep for each in gone)
+    assert gone[1].text == "no board 7x9-25mm-18mm-5x5_100 in view; show more of it"
+    # Between pictures that far apart the board may have been anywhere.
+    assert not any(guide.handle_frame(rendered()[0], (200 + 5 * index) * 1000 * MS).keep for index in range(4))
+
+
+def test_it_is_enough_when_nothing_is_missing() -> None:
+    guide = CaptureGuide(DEFAULT_BOARD, 8)
+    for index, picture in enumerate(rendered()):
+        assert not guide.enough
+        taken = shown(guide, [picture] * 3, index * 10_000 * MS)[-1]
+        assert taken.keep, (index, taken)
+        assert (taken.text == "taken; that is enough") == guide.enough
+    assert guide.kept == len(good_views())
+    assert guide.missing == []
+    assert guide.enough
+    few = CaptureGuide(DEFAULT_BOARD, 8)
+    for picture in rendered()[:-2]:
+        assert few.remember(picture)
+    assert few.kept == 10
+    assert few.missing == ["bring the board nearer"]
+    assert not few.enough
+
+
+class Scripted(Camera):
+    """Gives its pictures one after the other, then ends."""
+
+    def __init__(self, pictures: Sequence[Picture]) -> None:
+        self._frames = [
+            Frame(each, index * STEP_NS, index * STEP_NS, StampSource.STAMP_SOURCE_CAMERA, index)
+            for index, each in enumerate(pictures)
+        ]
+        self.closed = False
+
+    def open(self) -> list[str]:
+        return ["camera_fps is 30, asked for 15"]
+
+    def read(self, timeout_s: float) -> list[Frame]:
+        if not self._frames:
+            raise CameraEndedError("video is over")
+        return [self._frames.pop(0)]
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Taken:
+    """A capture in this process."""
+
+    def __init__(self, folder: Path, pictures: Sequence[Picture], wanted: int = 30) -> None:
+        self.said: list[str] = []
+        self.advice: list[Advice] = []
+        self.folder = folder / "pictures"
+        self.looked_at = folder / "capture.jpg"
+        self.camera = Scripted(pictures)
+        self.guide = CaptureGuide(DEFAULT_BOARD, wanted)
+        capture = Capture(
+            self.camera,
+            RunClock(),
+            self.guide,
+            self.folder,
+            self.looked_at,
+            lambda advice, _: self.advice.append(advice),
+            self.said.append,
+        )
+        try:
+            capture.run(threading.Event())
+        finally:
+            assert self.camera.closed
+
+    @property
+    def names(self) -> list[str]:
+        return sorted(each.name for each in self.folder.iterdir()) if self.folder.exists() else []
+
+
+def jpeg(picture: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+
+def thrice(*indices: int) -> list[NDArray[np.uint8]]:
+    return [rendered()[index] for index in indices for _ in range(3)]
+
+
+def test_pictures_are_kept_as_they_came_or_without_loss(tmp_path: Path) -> None:
+    files = [jpeg(each) for each in thrice(0, 1)]
+    taken = Taken(tmp_path, [*files, *thrice(2)])
+    assert taken.said == ["camera_fps is 30, asked for 15", "video is over"]
+    assert taken.names == ["0001.jpg", "0002.jpg", "0003.png"]
+    assert (taken.folder / "0002.jpg").read_bytes() == files[3]
+    np.testing.assert_array_equal(cv2.imread(str(taken.folder / "0003.png"), cv2.IMREAD_GRAYSCALE), rendered()[2])
+    looked_at = cv2.imread(str(taken.looked_at))
+    assert looked_at is not None
+    green = (looked_at[:, :, 1] > 150) & (looked_at[:, :, 0] < 120) & (looked_at[:, :, 2] < 120)
+    seen = taken.advice[-1].seen
+    assert seen is not None
+    x, y = np.rint(seen.pixels).astype(int).T
+    assert green[y, x].all()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["capture.jpg", "pictures"]
+
+
+def test_it_ends_when_there_are_enough(tmp_path: Path) -> None:
+    everything = [picture for picture in rendered() for _ in range(3)]
+    taken = Taken(tmp_path, [*everything, EMPTY], wanted=12)
+    assert taken.guide.enough
+    assert len(taken.names) == 12
+    assert taken.said == ["camera_fps is 30, asked for 15"]  # the last one was not asked for
+
+
+def test_a_capture_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
+    Taken(tmp_path, thrice(0, 1))
+    again = Taken(tmp_path, thrice(1, 2))
+    assert again.guide.kept == 3
+    assert again.names == ["0001.png", "0002.png", "0003.png"]
+
+
+def test_a_picture_that_came_broken_is_passed_over(tmp_path: Path) -> None:
+    whole = jpeg(rendered()[0])
+    taken = Taken(tmp_path, [whole, whole[: len(whole) // 2], whole, whole])
+    assert "cut short" in taken.advice[1].text
+    assert taken.names == ["0001.jpg"]
+
+
+def test_no_picture_no_folder(tmp_path: Path) -> None:
+    assert Taken(tmp_path, [EMPTY] * 3).names == []
+    assert [each.name for each in tmp_path.iterdir()] == ["capture.jpg"]
+
+
+def test_what_is_in_the_folder_must_fit(tmp_path: Path) -> None:
+    Taken(tmp_path, thrice(0))
+    small = [np.ascontiguousarray(each[:400]) for each in thrice(1)]
+    with pytest.raises(OnboardError, match=r"is for pictures of 640x480 px but the camera gives 640x400 px; name"):
+        Taken(tmp_path, small)
+    stranger = tmp_path / "pictures" / "map.json"
+    stranger.write_text("{}")
+    with pytest.raises(OnboardError, match=r"map\.json: is no picture of an earlier capture; name a new folder"):
+        Taken(tmp_path, thrice(1))
+    stranger.unlink()
+    (tmp_path / "pictures" / "0002.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(OnboardError, match=r"0002\.jpg: cannot be used \(.*cut short.*\); remove it"):
+        Taken(tmp_path, thrice(1))
+    assert sorted(each.name for each in (tmp_path / "pictures").iterdir()) == ["0001.png", "0002.jpg"]
+
+
+def test_a_full_disk_ends_it_and_leaves_no_half_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Path.write_bytes
+
+    def fails_from_the_second_on(path: Path, data: bytes) -> int:
+        if "0002" in path.name:
+            write(path, data[:100])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fails_from_the_second_on)
+    with pytest.raises(OnboardError, match=r"0002\.png: cannot be written \(No space left on device\); make room"):
+        Taken(tmp_path, thrice(0, 1, 2))
+    assert [each.name for each in (tmp_path / "pictures").iterdir()] == ["0001.png"]
+
+
+def test_a_camera_that_falls_silent_is_not_waited_for_forever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent(Scripted):
+        def read(self, timeout_s: float) -> list[Frame]:
+            return []
+
+    monkeypatch.setattr("groundsbot.onboard.capture.capture._SILENT_NS", 50 * MS)
+    camera = Silent([])
+    guide, said = CaptureGuide(DEFAULT_BOARD, 3), list[object]()
+    capture = Capture(
+        camera, RunClock(), guide, tmp_path / "p", tmp_path / "c.jpg", lambda *each: said.append(each), said.append
+    )
+    with pytest.raises(CameraLostError, match=r"gave no picture for"):
+        capture.run(threading.Event())
+    assert camera.closed
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_cannot_be_written_to_costs_only_the_picture_to_look_at(tmp_path: Path) -> None:
+    (tmp_path / "capture.jpg").mkdir()
+    taken = Taken(tmp_path, thrice(0, 1))
+    assert taken.names == ["0001.png", "0002.png"]
+    assert sum("capture.jpg: cannot be written (Is a directory); --picture names" in each for each in taken.said) == 1
+
+
+def test_a_terminal_shows_what_is_missing_and_rings_for_each_picture() -> None:
+    screen = io.StringIO()
+    guide, view = CaptureGuide(DEFAULT_BOARD, 30), CaptureView(Console(file=screen, force_terminal=True, width=120))
+    with view.shown():
+        for index, picture in enumerate([*thrice(0, 4), EMPTY]):
+            view.show(guide.handle_frame(picture, index * STEP_NS), guide)
+    last = screen.getvalue().rpartition("groundsbot capture")[2]
+    assert screen.getvalue().count("\a") == 2
+    assert "2 of 30 pictures" in last
+    assert "no board 7x9-25mm-18mm-5x5_100 in view" in last
+    regions = [re.findall("[■·]", line) for line in last.splitlines() if "·" in line]
+    assert regions == [["■", "■", "·"], ["■", "■", "·"], ["·", "·", "·"]]
+    assert "missing: show the board at the picture's top right" in last
+
+
+ROBOT = """
+robot_id: gb1
+wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}
+camera: camera.yaml
+devices: {camera: camera}
+"""
+
+
+@contextmanager
+def program(folder: Path, *options: str) -> Iterator["subprocess.Popen[str]"]:
+    """`groundsbot-onboard capture` of a robot whose camera is a folder; it has no calibration yet."""
+    (folder / "robot.yaml").write_text(ROBOT)
+    command = [sys.executable, "-m", "groundsbot.onboard.cli", "capture", "--robot", str(folder / "robot.yaml")]
+    command += ["--output", str(folder / "pictures"), *options]
+    with running(command) as process:
+        yield process
+
+
+def hold_up(camera: PictureFolder, pictures: Path, process: "subprocess.Popen[str]", which: Iterable[int]) -> None:
+    """Holds up one view after the other, each until it was taken."""
+    for before, index in enumerate(which, start=len(list(pictures.glob("0*")))):
+        picture = jpeg(rendered()[index])
+
+        def taken(picture: bytes = picture, before: int = before) -> bool:
+            camera.show(picture)
+            time.sleep(0.05)
+            return process.poll() is not None or len(list(pictures.glob("0*"))) > before
+
+        until(taken, "a picture taken")
+
+
+def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> None:
+    camera, pictures = PictureFolder(tmp_path / "camera", keep=20), tmp_path / "pictures"
+    pictures.mkdir()
+    for number, picture in enumerate(rendered()[:-2], start=1):  # of an earlier time
+        (pictures / f"{number:04}.jpg").write_bytes(jpeg(picture))
+    with program(tmp_path, "--views", "8") as process:
+        hold_up(camera, pictures, process, [10, 11])
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    lines = said.splitlines()
+    assert "11 of 8: taken; bring the board nearer" in lines
+    assert lines[-2:] == [f"{pictures}: 12 pictures", f"next: groundsbot-calib camera {pictures} -o camera.yaml"]
+    assert sorted(each.name for each in pictures.iterdir()) == [f"{number:04}.jpg" for number in range(1, 13)]
+    for path in (pictures / "0012.jpg", tmp_path / "capture.jpg"):
+        assert cv2.imread(str(path)) is not None
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_whoever_ends_it_keeps_what_there_is(tmp_path: Path, ending: signal.Signals) -> None:
+    camera = PictureFolder(tmp_path / "camera", keep=20)
+    with program(tmp_path) as process:
+        hold_up(camera, tmp_path / "pictures", process, range(2))
+        process.send_signal(ending)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 3, said
+    assert f"{tmp_path / 'pictures'}: 2 pictures" in said
+    assert "still missing: show the board at the picture's" in said
+    assert sorted(each.name for each in (tmp_path / "pictures").iterdir()) == ["0001.jpg", "0002.jpg"]
+
+
+def test_without_any_picture_it_fails(tmp_path: Path) -> None:
+    camera = PictureFolder(tmp_path / "camera", keep=20)
+    with program(tmp_path) as process:
+
+        def looked() -> bool:
+            camera.show(jpeg(EMPTY))
+            time.sleep(0.05)
+            return (tmp_path / "capture.jpg").exists()
+
+        until(looked, "a look")
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert f"{tmp_path / 'pictures'}: no picture was taken" in said
+    assert not (tmp_path / "pictures").exists()
+
+
+@pytest.mark.parametrize(
+    ("robot", "options", "said"),
+    [
+        (None, [], "robot.yaml: cannot be read (No such file or directory)"),
+        ("robot_id: gb1", [], "robot.yaml: wheels is missing"),
+        (ROBOT.replace("{camera: camera}", "{encoder_port: wheels}"), [], "devices names no camera; give one"),
+        (ROBOT, [], "is neither a folder of pictures, a video file nor under /dev"),
+        (ROBOT.replace("{camera: camera}", "{camera: /dev/video77}"), [], "camera /dev/video77 is absent"),
+        (
+            ROBOT.replace("{camera: camera}", "{camera: robot.yaml}"),
+            [],
+            "robot.yaml cannot be opened; give a file that",
+        ),
+        (ROBOT.replace("camera: camera.yaml", "camera: robot.yaml"), [], "image_width is missing"),
+        (ROBOT, ["--board", "7x9"], "board is '7x9' but must read like 7x9-25mm-18mm-5x5_100"),
+        (ROBOT, ["--views", "0"], "--views is 0 but must be at least 1"),
+        (ROBOT, ["--size", "big"], "--size is 'big' but must read like 1280x720"),
+        (ROBOT, ["--size", "0x720"], "--size is '0x720' but"),
+    ],
+)
+@pytest.mark.usefixtures("signals_back")
+def test_what_cannot_begin_is_one_line_and_nothing_written(
+    tmp_path: Path,
+    robot: str | None,
+    options: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "robot.yaml"
+    if robot is not None:
+        path.write_text(robot)
+    words = ["capture", "--robot", str(path), "--output", str(tmp_path / "pictures"), *options]
+    monkeypatch.setattr(sys, "argv", ["groundsbot-onboard", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    told = capsys.readouterr()
+    assert ended.value.code == 1
+    assert told.err.startswith("error: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert {each.name for each in tmp_path.iterdir()} <= {"robot.yaml"}

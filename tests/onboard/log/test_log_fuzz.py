@@ -1,0 +1,42 @@
+"""The log reader given broken files: a short, seeded form of `tests.benchmarks.faults.fuzz_log_reader`."""
+
+from itertools import islice
+
+import pytest
+
+from groundsbot.onboard.log.reading import chunks as chunk_reader
+from tests.support.guided_fuzz import fuzz
+from tests.support.log_reader_fuzz import LONGEST_BYTES, MODULES, MUTATIONS, check, seeds
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_broken_file_gives_a_wrong_message(seed: int) -> None:
+    done = fuzz(check, seeds(), MODULES, seed=seed, runs=150, mutations=MUTATIONS, longest=LONGEST_BYTES)
+    assert len(done.corpus) > len(seeds())  # it got somewhere
+
+
+def test_the_judge_sees_a_checksum_that_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = next(islice(seeds(), 1, None))
+    at = plain.index(b"recording_started")
+    check(plain)
+    changed = plain[:at] + b"R" + plain[at + 1 :]
+    check(changed)
+    monkeypatch.setattr(chunk_reader, "zlib", _NoChecksums)
+    with pytest.raises(AssertionError, match="no whole chunk holds"):
+        check(changed)
+
+
+class _NoChecksums:
+    @staticmethod
+    def crc32(_data: bytes, _before: int = 0) -> "_Any":
+        return _Any()
+
+
+class _Any(int):
+    def __eq__(self, _other: object) -> bool:
+        return True
+
+    def __ne__(self, _other: object) -> bool:
+        return False
+
+    __hash__ = int.__hash__

@@ -1,0 +1,200 @@
+"""A recorder's status: what it says, that it is there whole, and what the command makes of it."""
+
+import json
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from typer.testing import CliRunner
+
+from groundsbot.fixtures.recording.devices import PictureFolder
+from groundsbot.onboard.cli import app
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.monitoring.housekeeping import Housekeeper
+from groundsbot.onboard.monitoring.status import Look, Rates, Status, is_alive, read_status, write_status
+from groundsbot.onboard.process.systemd import Notifier
+from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
+from tests.support.devices.recorder_cores import START_NS, S
+
+
+def look(second: float, lines: int, written_bytes: int = 0) -> Look:
+    now_ns = START_NS + round(second * S)
+    return Look(now_ns, {"/wheels": lines}, {"/wheels": now_ns - S // 4}, written_bytes)
+
+
+def test_rates_are_of_the_last_seconds_and_growth_of_the_last_minutes() -> None:
+    rates = Rates()
+    for second in range(300):
+        rates.add(look(second, 100 * min(second, 250) + 10 * max(0, second - 250), 1_000_000 * second))
+    wheels = rates.device("/wheels", "port", expected=True)
+    assert wheels.rate_hz == 10.0
+    assert wheels.age_s == 0.25
+    assert rates.bytes_per_s() == 1_000_000
+    assert len(rates._looks) <= 122  # however long the day
+    camera = rates.device("/tags/detections", "camera", expected=True)
+    assert (camera.rate_hz, camera.age_s) == (0.0, None)
+    assert Rates().bytes_per_s() is None
+
+
+def test_the_status_of_a_recording(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
+    camera, path = PictureFolder(tmp_path / "pictures"), tmp_path / "logs" / "gb1.status.json"
+    seen: list[Status] = []
+    said: list[str] = []
+
+    def shows(lines: int) -> bool:
+        camera.show(tag_jpeg())
+        time.sleep(0.05)
+        if path.exists():
+            seen.append(read_status(tmp_path / "logs"))  # at any moment whole
+        return bool(seen) and seen[-1].counts.get("/wheels", 0) > lines and bool(seen[-1].tags_in_view)
+
+    with Driver(tmp_path / "wheels") as driver:
+        driver.plug_in()
+        with recording(robot, tmp_path / "logs") as made:
+            keeper = Housekeeper(made.recorder, path, Notifier(), said.append, period_s=0.1)
+            keeper.start()
+            until(lambda: shows(100), "a status")
+            driver.unplug()
+            made.wait_for(EventKind.PORT_LOST)
+            keeper.note(made.events[-1])
+            until(lambda: shows(0) and bool(seen[-1].problems), "a problem")
+        keeper.end()
+    assert (seen[-1].robot_id, seen[-1].pid, seen[-1].state) == ("gb1", os.getpid(), "recording")
+    assert any(each.wheels.rate_hz > 0.0 for each in seen)
+    assert all(each.counts.get("/wheels", 0) <= driver.sent for each in seen)
+    assert seen[-1].tags_in_view == ["tag36h11 9"]
+    assert "no wheel readings for 3 s" in seen[-1].problems  # a machine that is held up may have others
+    assert "port_lost" in seen[-1].last_events[-1]
+    assert seen[-1].disk.free_bytes > 0
+    last = read_status(path)
+    assert last.state == "stopped"
+    assert not is_alive(last)
+    assert sorted(each.name for each in (tmp_path / "logs").iterdir() if "status" in each.name) == [path.name]
+
+
+def made_status(**changes: object) -> Status:
+    device = {"name": "port", "rate_hz": 100.0, "age_s": 0.0, "expected": True}
+    disk = {"free_bytes": 10**9, "bytes_per_s": 1e4, "hours_left": 27.8, "waiting_bytes": 0, "problem": None}
+    values: dict[str, object] = {
+        "robot_id": "gb1", "run_id": "run1", "folder": "logs/run1", "pid": 1, "state": "recording",
+        "updated_ns": time.time_ns(), "recording_s": 3723.0, "wheels": device, "camera": device,
+        "tags_in_view": ["tag36h11 4"], "counts": {}, "losses": {}, "disk": disk, "clock_synchronised": True,
+        "stalled_s": 0.0, "problems": [], "last_events": [],
+    }  # fmt: skip
+    return Status.model_validate({**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "words"),
+    [
+        ({}, 0, ["recording, 1:02:03", "100.0 lines/s", "tag36h11 4", "lost: nothing", "enough for 27.8 h"]),
+        ({"losses": {"pictures": 3}}, 3, ["lost: 3 pictures"]),
+        ({"problems": ["disk: full"]}, 3, ["problem: disk: full"]),
+        ({"updated_ns": 0}, 1, ["gone: no sign of life"]),
+        ({"state": "stopped"}, 1, ["recorder: stopped"]),
+    ],
+)
+def test_the_command_says_it_in_plain_lines(
+    tmp_path: Path, changes: dict[str, object], code: int, words: list[str]
+) -> None:
+    assert write_status(made_status(**changes), tmp_path / "gb1.status.json") is None
+    said = CliRunner().invoke(app, ["status", "--once", str(tmp_path)])
+    assert said.exit_code == code
+    assert [word for word in words if word not in said.output] == []
+
+
+def test_without_a_status_the_command_says_so(tmp_path: Path) -> None:
+    with pytest.raises(OnboardError, match="no recorder has left a status"):
+        read_status(tmp_path)
+    (tmp_path / "x.status.json").write_text(json.dumps({"format_version": 1}))
+    with pytest.raises(OnboardError, match="is no status"):
+        read_status(tmp_path)
+
+
+def test_a_status_is_never_written_through_a_link(tmp_path: Path) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "gb1.status.json"
+    victim.write_text("precious")
+    path.symlink_to(victim)
+    (tmp_path / f".{path.name}.{os.getpid()}.partial").symlink_to(victim)
+    assert write_status(made_status(), path) is None
+    assert victim.read_text() == "precious"
+    assert read_status(path).robot_id == "gb1"
+
+
+def test_a_disk_that_will_not_have_the_status_does_not_stop_the_recorder(tmp_path: Path) -> None:
+    assert write_status(made_status(), tmp_path / "absent" / "gb1.status.json") == "No such file or directory"
+
+
+class FakeRecorder:
+    """As much of a recorder as decides what systemd is told."""
+
+    def __init__(self) -> None:
+        self.begun = threading.Event()
+        self.begun.set()
+        self.is_stopping = False
+        self.stalled_s = 0.0
+        self.log = self
+
+
+class FakeNotifier:
+    """Notes what systemd is told."""
+
+    watchdog_s: float | None = 0.02  # so that looks come every 5 ms
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def ready(self) -> None:
+        self.said.append("ready")
+
+    def alive(self, _text: str) -> None:
+        self.said.append("alive")
+
+    def troubled(self, _text: str) -> None:
+        self.said.append("troubled")
+
+    def stopping(self) -> None:
+        self.said.append("stopping")
+
+
+def test_only_a_log_that_stands_still_keeps_the_watchdog_from_its_food(tmp_path: Path) -> None:
+    recorder, notifier, notices = FakeRecorder(), FakeNotifier(), list[str]()
+    keeper = Housekeeper(cast(Any, recorder), tmp_path / "x.json", cast(Any, notifier), notices.append)
+    keeper.start()  # each look fails: this recorder has no core
+    until(lambda: notifier.said.count("alive") >= 3, "food")
+    recorder.stalled_s = 100.0
+    until(lambda: "troubled" in notifier.said, "trouble")
+    assert len(notices) == 1
+    assert "status: cannot be told (AttributeError" in notices[0]
+    recorder.is_stopping = True
+    until(lambda: "stopping" in notifier.said, "the end")
+    recorder.stalled_s = 0.0
+    n_looks = len(notifier.said)
+    time.sleep(0.05)  # some looks more
+    keeper.end()
+    assert notifier.said[n_looks:] == []
+    assert notifier.said[-1] == "stopping"
+
+
+def test_a_status_that_cannot_be_written_is_told_of_once(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
+    said: list[str] = []
+    output = tmp_path / "logs\udcff"  # no UTF-8
+    with recording(robot, output) as made:
+        keeper = Housekeeper(made.recorder, tmp_path / "absent" / "x.json", Notifier(), said.append, period_s=0.01)
+        status = [keeper._write("recording") for _ in range(3)][-1]
+    assert said == [f"status: {tmp_path / 'absent' / 'x.json'} cannot be written (No such file or directory)"]
+    assert status is not None
+    assert "logs\\xff" in status.folder
+    assert write_status(status, tmp_path / "x.json") is None
+
+
+def test_a_status_that_is_a_link_to_nothing_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.status.json").symlink_to("gone")
+    with pytest.raises(OnboardError, match="no recorder has left a status"):
+        read_status(tmp_path)

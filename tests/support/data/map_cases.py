@@ -1,0 +1,75 @@
+"""Logs for `map`: two short drives past four tags, and copies of them in which something is changed."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import Message
+
+from groundsbot.onboard.log.head import log_head
+from groundsbot.onboard.log.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.writing.writer import LogWriter
+from tests.support.data.drives import FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
+
+TAGS = [
+    MadeTag(0, (6.0, 1.0, 0.5), np.pi),
+    MadeTag(1, (6.0, 2.0, 0.4), np.pi),
+    MadeTag(2, (6.0, -1.0, 0.6), np.pi - 0.2),
+    MadeTag(3, (5.0, 3.0, 0.45), -2.2),
+]
+AHEAD = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
+DRIVES = {"a": made_drive([0.0, 0.0, 0.2], AHEAD), "b": made_drive([0.5, 1.0, -0.1], AHEAD)}
+
+
+def made_logs(folder: Path) -> dict[str, Path]:
+    """Both drives, by robot."""
+    return {name: write_drive(folder, drive, TAGS, made_robot(name)) for name, drive in DRIVES.items()}
+
+
+def rewritten(
+    log: Path, folder: Path, change: Callable[[Message], object], head: Mapping[str, Message] | None = None
+) -> Path:
+    """A copy of a log with each message changed in place; those for which `change` is False are left out."""
+    entries = list(read_log(log))
+    heads: dict[str, Message] = {}
+    for entry in entries:
+        if change(entry.message) is not False and entry.topic in ("/run", "/camera/calibration", "/tf"):
+            heads[entry.topic] = entry.message
+    copy = folder / log.name
+    with LogWriter(copy, heads | dict(head or {}), START_NS, durable=False) as writer:
+        for entry in entries:
+            if entry.topic not in heads and change(entry.message) is not False:
+                writer.write(entry.topic, entry.message, entry.log_time_ns, entry.publish_time_ns)
+    return copy
+
+
+def imported_log(folder: Path, odometry_m: float = 0.2, place_m: float = 3.0) -> Path:
+    robot = made_robot("i")
+    head = log_head(robot, robot.model_dump_json(), None, "one", START_NS, 0)
+    log = folder / "one"
+    with LogWriter(log, head, START_NS, durable=False) as writer:
+        for i, left_m in enumerate((0.0, 0.1, odometry_m, 0.3, 0.4)):
+            at = START_NS + i * S
+            distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=0.1 * i)
+            writer.write("/odometry", PlanarOdometry(stamp_ns=at, wheels=distances), at, at)
+            places = [TagObservation.Cartesian(x_m=place_m if i == 2 else 3.0 - 0.1 * i, y_m=y) for y in (1.0, -1.0)]
+            seen = [TagObservation(family=FAMILY, tag_id=j, cartesian=place) for j, place in enumerate(places)]
+            writer.write("/tags/observations", TagObservations(stamp_ns=at, frame="base", observations=seen), at, at)
+    return log
+
+
+def spliced(parts: list[Path], folder: Path) -> Path:
+    """Pictures in turn from several versions of one drive: something in them moves."""
+    per_part = [list(read_log(part)) for part in parts]
+    pictures = [i for i, entry in enumerate(per_part[0]) if isinstance(entry.message, TagDetections)]
+    entries = list(per_part[0])
+    for n, i in enumerate(pictures):
+        entries[i] = per_part[n * len(parts) // len(pictures)][i]
+    heads = {entry.topic: entry.message for entry in entries if entry.topic in ("/run", "/camera/calibration", "/tf")}
+    log = folder / "one"
+    with LogWriter(log, heads, START_NS, durable=False) as writer:
+        for entry in entries:
+            if entry.topic not in heads:
+                writer.write(entry.topic, entry.message, entry.log_time_ns, entry.publish_time_ns)
+    return log
