@@ -33,7 +33,7 @@ class _CameraMatrix(_Matrix):
 class CameraEstimate(BaseModel):
     """What a calibration says of its own errors.
 
-    `parameters` are in the order of `lens_parameters`, `covariance` is theirs, row by row.
+    `parameters` are in the order of `calib.camera.parameters`, `covariance` is theirs, row by row.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)

@@ -1,6 +1,6 @@
 """Bundle adjustment: the intrinsics of one camera and where the board is in each of its pictures.
 
-The unknowns are the camera's vector b (`lens_parameters`) and for each view a pose T_camera_board, turned and shifted
+The unknowns are the camera's vector b (`camera.parameters`) and for each view a pose T_camera_board, turned and shifted
 from the left: R <- exp(w) R, t <- t + d. Residuals are whitened corners. Poses touch their own view only, so they are
 eliminated: what is left is the n x n system of the intrinsics, and its matrix is their information once all poses are
 unknown. Levenberg-Marquardt; Jacobians exact.

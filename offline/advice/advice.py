@@ -1,8 +1,8 @@
 """Where one more drive, or one more tag, would help a map most: candidates judged by what they do to its worst tag.
 
 The figure is the largest sigma of any tag, along its worst direction, as it would be with the candidate's measurements
-too: worked out from the solved map's joint covariance, without another solve (`advice_gain`). A candidate of each kind
-is told, the best first: a pass (`advice_passes`), and a tag that the same drives would have read (`advice_tags`).
+too: worked out from the solved map's joint covariance, without another solve (`information_gain`). A candidate of each
+kind is told, the best first: a pass (`passes`), and a tag that the same drives would have read (`new_tags`).
 """
 
 from collections.abc import Sequence

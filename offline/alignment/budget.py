@@ -2,7 +2,7 @@
 
 Each pair of drives that share tags is a search of its own. Which tags fit together is soon found where most do; where
 none do, each pair of tags may lead somewhere. What a map may take for all its pairs grows with the square of what was
-recorded, as the number of pairs does. Counted is as in `effort`: some ten thousand million take a second.
+recorded, as the number of pairs does. Counted is as in `sam.budget`: some ten thousand million take a second.
 """
 
 from dataclasses import dataclass

@@ -75,7 +75,7 @@ class Looks:
         mount_parameters: (M, 6), time_parameter: (M,), scale_parameter: (M,), focal_parameter: (M,), edge_parameter:
             (M,): indices into the calibration.
         outward: (M, 4, 2) how far corners move per pixel by which the tag's sides are seen further out
-            (`corner_sides`).
+            (`edge_directions`).
     """
 
     pose: IntArray

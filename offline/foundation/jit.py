@@ -118,11 +118,14 @@ def compilation_announced(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 def _kernel_hash() -> str:
-    """Of all files with compiled functions: numba's cache looks only at the file of the function called."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    """Of all files of the package with compiled functions: numba's cache looks only at the file of the function called.
+
+    How they are compiled, which this file says, counts too.
+    """
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         source = path.read_bytes()
-        if b"groundsbot.offline.foundation.jit" in source:
+        if _COMPILED.search(source):
             digest.update(source)
     return digest.hexdigest()[:16]
 

@@ -1,10 +1,10 @@
 """Do runs that fit together each by itself fit together as one map?
 
 From windows to runs and from runs to the map, more and more numbers become one. What each of these conditions costs is
-chi-square, and so is what all of them cost (nested linear models, see `goodness`). What the first part cost, the checks
-of the runs alone have found; what the second does is the rise from the costs of the runs' own solves to that of the
-joint one, which are both known where the noise has been fitted. So nothing has to be solved again. Where sigmas are
-those that somebody told, or a tape holds the map too, the windows of all runs are fitted anew.
+chi-square, and so is what all of them cost (nested linear models, see `local_map.goodness_of_fit`). What the first part
+cost, the checks of the runs alone have found; what the second does is the rise from the costs of the runs' own solves
+to that of the joint one, which are both known where the noise has been fitted. So nothing has to be solved again. Where
+sigmas are those that somebody told, or a tape holds the map too, the windows of all runs are fitted anew.
 """
 
 from collections.abc import Sequence

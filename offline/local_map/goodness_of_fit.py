@@ -6,7 +6,7 @@ readings is. The whole is the same problem under conditions: windows join, and a
 cost, in squared sigmas of the noise so fitted, is chi-square with as many degrees of freedom as there are conditions
 (the test of nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise
 is fitted. A reading that is simply wrong costs the same on either side. Errors that neighbouring readings of a tag
-share are invisible one by one, but not where a tag is met again; `shared_errors` fits how large they are.
+share are invisible one by one, but not where a tag is met again; `correlated_errors` fits how large they are.
 """
 
 from dataclasses import dataclass, replace

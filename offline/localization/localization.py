@@ -1,7 +1,7 @@
 """A new run in a finished map, which stays as it is: where it started, its trajectory, and which tags were moved since.
 
 Each stretch alone, as for a map; its place from the tags that it shares with the map; then all stretches in one solve
-in which the map's tags and calibration are known as the map knows them (`held_run`).
+in which the map's tags and calibration are known as the map knows them (`solve_in_map`).
 """
 
 from collections.abc import Sequence

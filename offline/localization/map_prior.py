@@ -1,8 +1,8 @@
 """A finished map as what is known beforehand: where its tags are and what the calibration is, jointly.
 
-Errors are taken in map axes here, where `condensed` takes those of a local map along its drive. A run that is placed in
-the map sees its tags from near by, and is itself free to turn with them; what is turned by a degree against the map's
-axes makes tags 2 m apart come out 0.3 mm nearer.
+Errors are taken in map axes here, where `alignment.condensed_map` takes those of a local map along its drive. A run
+that is placed in the map sees its tags from near by, and is itself free to turn with them; what is turned by a degree
+against the map's axes makes tags 2 m apart come out 0.3 mm nearer.
 """
 
 from collections.abc import Mapping, Sequence

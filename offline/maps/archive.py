@@ -1,6 +1,6 @@
 """What a finished map keeps for later runs: to place them in it, and to solve them together with its own.
 
-Plain arrays and texts, as map.npz holds them; `kept_maps` makes local maps of them again.
+Plain arrays and texts, as map.npz holds them; `local_map.archive` makes local maps of them again.
 """
 
 from dataclasses import dataclass, fields

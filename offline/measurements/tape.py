@@ -97,7 +97,7 @@ class Measurements:
         return len(self.starts) + len(self.distances)
 
     def placements(self, runs: Sequence[str]) -> dict[tuple[int, int], Placement]:
-        """What starts say of pairs of runs, by their indices, for `merge.merge`."""
+        """What starts say of pairs of runs, by their indices, for `alignment.merging.merge`."""
         index = {name: i for i, name in enumerate(runs)}
         return {(index[self.frame], index[start.run]): start.placement for start in self.starts}
 

@@ -5,7 +5,7 @@ wheels than a single drive can tell. It is fitted to the runs whose readings fit
 says nothing of noise, and is believed no more than before, nor more than the others: of each sigma it gets the larger.
 
 A detector's bias repeats from picture to picture. One by one such readings look good, so what neighbouring readings of
-a tag share is fitted too (`shared_errors`), and a reading that has many neighbours counts for less.
+a tag share is fitted too (`local_map.correlated_errors`), and a reading that has many neighbours counts for less.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from groundsbot.offline.sam import State, solve, whitening
 
 _NO_RUN: Final = "no run has tag readings that fit together"
 _NOT_APART: Final = "too few readings tell how much of their errors they share"
-# Over so much of the way readings of a tag are taken to share an error; as in `goodness`.
+# Over so much of the way readings of a tag are taken to share an error; as in `local_map.goodness_of_fit`.
 _SHARED_OVER_M: Final = 2.5
 # Cells that tell what is shared, as many as leave a variance uncertain by a half.
 _LEAST_CELLS: Final = 8.0

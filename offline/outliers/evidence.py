@@ -7,7 +7,7 @@ exact joint information of all readings, for all hypotheses at once.
 
 A tag is moved by more than a lean of its board or the remains of a lens shift it: each sighting may be off by a
 centimetre, which the form carries: (L^-1 + s^2)^-1. For that each place gets a prior of a centimetre about where the
-solve has it; one factorisation with each sighting's tag apart then tells all (`suspects_information`).
+solve has it; one factorisation with each sighting's tag apart then tells all (`joint_information`).
 """
 
 from collections.abc import Sequence

@@ -29,7 +29,7 @@ class Sightings:
     Attributes:
         ids: N ids that were read, sorted, no instances told apart.
         of_reading: (M,) the sighting of each reading, in the order of the chains' readings one after the other.
-        passing: (M,) the same, before passings were taken together (`suspects_passings`).
+        passing: (M,) the same, before passings were taken together (`grouping`).
         id: (S,) index into `ids`; chain: (S,) index of the chain.
         first_ns, last_ns: (S,) when it began and ended.
         n_readings: (S,)

@@ -29,7 +29,7 @@ def solve_graduated(problem: Problem, start: State, losses: Losses) -> Solution:
     Args:
         problem: the factors.
         start: values to begin from.
-        losses: of each kind of factor; `robust.truncated` and `robust.graduated(threshold, 1.0)` are approached
+        losses: of each kind of factor; `factors.losses.truncated` and `robust.graduated(threshold, 1.0)` are approached
             gradually, squares, Huber's and Cauchy's stay as they are throughout.
 
     Returns:

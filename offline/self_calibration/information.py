@@ -2,8 +2,9 @@
 
 A drive is cut into a few stretches. Each is solved with a start and a place for each tag of its own, and with every
 number that might be freed open as far as it could be off at all. What it tells of the calibration is the information of
-that estimate less what it was given: no map is needed, no alignment, and a tag moved in between spoils nothing.
-The noise is the one that windows of the drive leave over (`goodness`), so that it matters little what was told of it.
+that estimate less what it was given: no map is needed, no alignment, and a tag moved in between spoils nothing. The
+noise is the one that windows of the drive leave over (`local_map.goodness_of_fit`), so that it matters little what was
+told of it.
 """
 
 from collections.abc import Sequence

@@ -183,6 +183,7 @@ def test_a_robot_without_the_printing_library_says_so(
     calib: Run, tmp_path: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (
+        "groundsbot.calib.printing",
         "groundsbot.calib.printing.sheet",
         "groundsbot.calib.printing.board",
         "groundsbot.calib.printing.tags",

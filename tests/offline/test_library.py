@@ -1,4 +1,4 @@
-"""`import offline` gives what docs/library.md tells of, and does so at once."""
+"""`import groundsbot` gives what docs/library.md tells of, and does so at once."""
 
 import re
 import subprocess
@@ -61,6 +61,6 @@ def test_every_name_is_there_and_others_are_not() -> None:
 
 
 def test_importing_it_loads_nothing_heavy() -> None:
-    loaded = "import offline, sys; print(sorted({'numpy', 'numba', 'rosbags', 'scipy'} & set(sys.modules)))"
+    loaded = "import groundsbot, sys; print(sorted({'numpy', 'numba', 'rosbags', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

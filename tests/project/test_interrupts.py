@@ -18,13 +18,14 @@ LIMIT_S = 30.0  # only a program that hangs comes near
 # `map`, but the map never gets finished.
 ENDLESS_MAP = """
 import sys, time
-from offline import cli, map_command
+from groundsbot.offline import cli
+from groundsbot.offline.commands import map_drives
 def write(_result, folder):
     (folder / "map.json").write_text("half")
     time.sleep(60)
-map_command.find_logs = lambda logs: logs
-map_command.read_runs = map_command.build_map = lambda *_, **__: None
-map_command.write_map = write
+map_drives.find_logs = lambda logs: logs
+map_drives.read_runs = map_drives.build_map = lambda *_, **__: None
+map_drives.write_map = write
 cli.main()
 """
 

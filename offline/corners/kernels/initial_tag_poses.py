@@ -1,4 +1,4 @@
-"""Compiled parts of `corner_start`: which looks pose a tag, the poses that they allow, and how well looks fit these."""
+"""Compiled parts of `corners.initial_tag_poses`: which looks pose a tag, the poses they allow, their fit."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Compiled linearisation of `corner_factors` and of odometry: residuals and Jacobians, straight into the fronts."""
+"""Compiled linearisation of `factors` and of odometry: residuals and Jacobians, straight into the fronts."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Compiled: how one look at a tag fits, and by what that changes; see `corner_factors`.
+"""Compiled: how one look at a tag fits, and by what that changes; see `factors`.
 
 What `CornerFactors` writes as arrays over all looks is here for one of them with the same names; the tests hold both to
 each other. Derivatives stand in the order of `CornerFactors.columns`.
@@ -15,7 +15,7 @@ from groundsbot.offline.sam import series
 
 
 class LookArrays(NamedTuple):
-    """`corner_factors.Looks`, for compiled functions."""
+    """`factors.Looks`, for compiled functions."""
 
     pose: IntArray
     tag: IntArray
@@ -35,7 +35,7 @@ class LookArrays(NamedTuple):
 
 
 class SpatialValues(NamedTuple):
-    """`corner_factors.SpatialState`, for compiled functions."""
+    """`factors.SpatialState`, for compiled functions."""
 
     poses: FloatArray
     tags: FloatArray

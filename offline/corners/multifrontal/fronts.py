@@ -1,4 +1,4 @@
-"""A sparse symmetric system solved by fronts: the multifrontal method, on dense blocks (`front_kernels`).
+"""A sparse symmetric system solved by fronts: the multifrontal method, on dense blocks (`multifrontal.kernels`).
 
 Columns are eliminated at the nodes of a tree, children before parents. A node's front holds its own columns and those
 further up that its factors, or what its children left over, couple them with. Duff and Reid, "The multifrontal solution

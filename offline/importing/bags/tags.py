@@ -62,7 +62,7 @@ def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[L
     """One message of detections.
 
     Args:
-        msgtype: one of `bag_topics.TAGS`.
+        msgtype: one of `bags.topics.TAGS`.
         content: the message.
         stamp_ns: its time.
         family: of the tags, where the message does not say.

@@ -81,7 +81,7 @@ class OnlineRoot:
 
     @property
     def step(self) -> FloatArray:
-        """(3 + n,) of pose and border, from the points, in the drive's own frame; see `online_turn`."""
+        """(3 + n,) of pose and border, from the points, in the drive's own frame; see `online.moving_frame`."""
         if self._step is None:
             n = self.prior.n
             z = np.zeros(n)

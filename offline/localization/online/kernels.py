@@ -27,7 +27,7 @@ BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
 
 
 class Motions(NamedTuple):
-    """`factors.OdometryFactors`, each from a pose to the next.
+    """`sam.OdometryFactors`, each from a pose to the next.
 
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
@@ -42,7 +42,7 @@ class Motions(NamedTuple):
 
 
 class Sights(NamedTuple):
-    """`factors.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
+    """`sam.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
 
     pose: IntArray
     tag: IntArray
@@ -186,7 +186,7 @@ def _take_motion(
 
 @inner
 def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, out: FloatArray) -> None:
-    """Rows (pose, next pose, d, border) of a motion, see `factors.OdometryFactors` and `linearise_odometry`."""
+    """Rows (pose, next pose, d, border) of a motion, see `sam.OdometryFactors` and `sam.linearisation.odometry`."""
     first, second = values.poses[m], values.poses[m + 1]
     cos, sin = np.cos(first[2]), np.sin(first[2])
     dx, dy = second[0] - first[0], second[1] - first[1]

@@ -1,10 +1,10 @@
 """A robot in a finished map, one reading at a time, each answered after a bounded piece of work.
 
 Until it knows where in the map it is, the robot makes a small map of its own, in the frame of its start, and looks in
-it for tags that lie as the map has them (`online_start`). From then on everything is in the map's frame: each further
-tag of the map joins where the map foretells it from those that did already, with what is left of the map's joint
-covariance. So the map's uncertainty is in each pose, and a tag that comes again is not taken for new information. The
-whole drive is linearised anew and its tags judged anew all the while, a little at each call (`online_smoother`).
+it for tags that lie as the map has them (`online.start_search`). From then on everything is in the map's frame: each
+further tag of the map joins where the map foretells it from those that did already, with what is left of the map's
+joint covariance. So the map's uncertainty is in each pose, and a tag that comes again is not taken for new information.
+The whole drive is linearised anew and its tags judged anew all the while, a little at each call (`online.smoother`).
 """
 
 from dataclasses import dataclass
@@ -162,7 +162,7 @@ class OnlineLocalizer:
     def _is_in_doubt(self) -> bool:
         """Whether the tags that contradict since all was judged may as well be those that stayed.
 
-        As of two groups of tags in `alignment`, one that moved as one and one that stayed.
+        As of two groups of tags in `alignment.pairwise`, one that moved as one and one that stayed.
         """
         others = len(set(self._contradicting()) - self._judged)
         return others > 1 and len(self._smoother.held) < GROUP_MARGIN * others

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the online estimate: what its square root information matrix says. See `online_kernels`."""
+"""Compiled inner loops of the online estimate: what its square root information matrix says. See `online.kernels`."""
 
 from typing import Final
 
@@ -61,7 +61,7 @@ def carried(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> Float
 def snooped(
     border: Border, pose: FloatArray, prior: FloatArray, off: FloatArray, n: int, at: int, unmodelled: float
 ) -> float:
-    """Squared sigmas of a tag that holds against all else, as of `held_run`.
+    """Squared sigmas of a tag that holds against all else, as of `solve_in_map`.
 
     Args:
         border: S.
@@ -165,7 +165,7 @@ def substituted(
 
 @jitted
 def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray) -> None:
-    """Sets a pose (3,) to where a step (3,) takes it of which a twist (5,) is common to all, see `online_turn`."""
+    """Sets a pose (3,) to where a step (3,) takes it of which a twist (5,) is common to all, see `moving_frame`."""
     turn, dx, dy, cx, cy = twist[0], twist[1], twist[2], twist[3], twist[4]
     cos, sin = np.cos(point[2]), np.sin(point[2])
     vx, vy = dx - turn * (point[1] - cy), dy + turn * (point[0] - cx)

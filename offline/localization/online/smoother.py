@@ -173,7 +173,7 @@ class Smoother:
 
 
 def _place_m(sights: Sights, pose: FloatArray, calibration: FloatArray) -> FloatArray:
-    """(2,) where the first reading puts its tag; see `factors.ReadingFactors`."""
+    """(2,) where the first reading puts its tag; see `sam.ReadingFactors`."""
     numbers = calibration[sights.parameters[0]]
     first, second = sights.value[0] + sights.by_camera[0] @ numbers[4:]
     at = np.array([first * np.cos(second), first * np.sin(second)] if sights.polar[0] else [first, second])

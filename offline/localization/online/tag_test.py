@@ -1,4 +1,4 @@
-"""Which of the map's tags hold a robot online: judged again at each round, as `held_run` does, a slice at a time."""
+"""Which of the map's tags hold a robot online: judged again at each round as `solve_in_map` does, in slices."""
 
 from collections.abc import Iterable, Iterator
 from functools import lru_cache

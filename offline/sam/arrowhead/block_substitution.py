@@ -1,6 +1,6 @@
 """Compiled inner loops of the arrowhead system: substitute for many vectors at once.
 
-What `arrowhead_substitution` does for one vector, here over the rows of a matrix: a block of R is read once for all of
+What `arrowhead.substitution` does for one vector, here over the rows of a matrix: a block of R is read once for all of
 them, and inner loops run along rows. Sixteen vectors take as long as two or three one by one.
 """
 

@@ -1,4 +1,4 @@
-"""Cuts chains into nested pieces; see `arrowhead_tree`."""
+"""Cuts chains into nested pieces; see `arrowhead.tree`."""
 
 from typing import Final, NamedTuple
 
@@ -17,7 +17,7 @@ class Pieces(NamedTuple):
     """The tree before tags.
 
     Attributes:
-        level, parent, chain, first, end, left, right: (N,) as in `arrowhead_tree.Tree`.
+        level, parent, chain, first, end, left, right: (N,) as in `arrowhead.tree.Tree`.
         pose_level: (P,) at which each pose is eliminated.
     """
 

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the arrowhead system: eliminate. See `arrowhead_tree` for the order.
+"""Compiled inner loops of the arrowhead system: eliminate. See `arrowhead.tree` for the order.
 
 Fronts are square, their upper triangles used. What is eliminated leaves rows of R, with R^T R = H: the square root
 information matrix. The poses of a leaf leave only their own 3 x 3 blocks; their coupling to the border is taken from

@@ -1,4 +1,4 @@
-"""What each node of the elimination tree holds, in which order: see `arrowhead_tree`."""
+"""What each node of the elimination tree holds, in which order: see `arrowhead.tree`."""
 
 from typing import NamedTuple
 

@@ -5,7 +5,7 @@ Where R = [R1 R2] are the rows that a node leaves of its front, and C22 is the c
     C12 = -R1^-1 R2 C22,    C11 = R1^-1 R1^-T - C12 (R1^-1 R2)^T,
 
 and C22 is part of the front of its parent. Takahashi, Fagan and Chen, "Formation of a sparse bus impedance matrix"
-(1973), by fronts instead of by entries. All poses together cost a few eliminations, where `arrowhead_covariance` goes
+(1973), by fronts instead of by entries. All poses together cost a few eliminations, where `arrowhead.covariance` goes
 up to the top for each.
 """
 

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the arrowhead system: substitute. See `arrowhead_kernels` for what elimination leaves."""
+"""Compiled inner loops of the arrowhead system: substitute. See `arrowhead.elimination` for what elimination leaves."""
 
 import numpy as np
 

@@ -2,7 +2,7 @@
 
 Linearise all factors, eliminate every piece of every chain on its own, meet in the small border, substitute back.
 Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissection along the chains, see
-`arrowhead_tree`.
+`arrowhead.tree`.
 """
 
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What is known from elsewhere, as factors in the form of `factors`: what a person measured, what a map holds."""
+"""What is known from elsewhere, as factors in the form of `planar`: what a person measured, what a map holds."""
 
 from dataclasses import dataclass, replace
 from typing import Final

@@ -1,6 +1,7 @@
-"""Compiled linearisation: the residuals and Jacobians of `factors`, straight into the blocks of the arrowhead system.
+"""Compiled linearisation: residuals and Jacobians of `factors.planar`, straight into blocks of the arrowhead system.
 
-What `factors` writes as arrays over all factors is here a loop with the same names; the tests hold both to each other.
+What `factors.planar` writes as arrays over all factors is here a loop with the same names; the tests hold both to each
+other.
 """
 
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from groundsbot.offline.sam.linearisation.blocks import System
 
 
 class Values(NamedTuple):
-    """Of all variables, as in `factors.State`, and what is free of them (1.0, or 0.0 where held)."""
+    """Of all variables, as in `factors.planar.State`, and what is free of them (1.0, or 0.0 where held)."""
 
     poses: FloatArray
     tags: FloatArray
@@ -38,7 +39,7 @@ class Free(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """`factors.OdometryFactors` by rising pose.
+    """`factors.planar.OdometryFactors` by rising pose.
 
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
@@ -56,7 +57,7 @@ class Odometry(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """`factors.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
+    """`factors.planar.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
 
     pose: IntArray
     tag: IntArray

@@ -1,4 +1,4 @@
-"""Compiled linearisation of odometry; see `linearise_kernels`.
+"""Compiled linearisation of odometry; see `linearisation.kernels`.
 
 With e = log(M(c)^-1 o T_i^-1 o T_j) and L its information: J_j = Jr^-1(e) and J_i = -J_j A with A the adjoint of
 T_j^-1 o T_i, so that H_jj = J_j^T L J_j, H_ij = -A^T H_jj, H_ii = A^T H_jj A, g_j = J_j^T L e, g_i = -A^T g_j.

@@ -1,4 +1,4 @@
-"""Compiled linearisation of tag readings and calibration priors; see `linearise_kernels`."""
+"""Compiled linearisation of tag readings and calibration priors; see `linearisation.kernels`."""
 
 from typing import Final
 
@@ -90,7 +90,7 @@ def _add_calibration(
 def reading_factor(
     readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
-    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `factors.ReadingFactors`."""
+    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
     theta = values.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)

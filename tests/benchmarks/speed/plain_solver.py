@@ -46,7 +46,7 @@ def plain_step(hessian: sparse.csc_array, gradient: FloatArray, damping: float) 
 def plain_normal_equations(
     problem: Problem, state: State, losses: Losses = PLAIN_SQUARES
 ) -> tuple[sparse.csc_array, FloatArray]:
-    """H = J^T J (n, n) and g = J^T r (n,) at a state, weights of robust losses included, from `factors` alone."""
+    """H = J^T J (n, n) and g = J^T r (n,) at a state, robust losses' weights included, from `factors.planar` alone."""
     kinds = (
         _reweighted(problem.odometry.linearise(state, problem.columns), losses.odometry),
         _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),

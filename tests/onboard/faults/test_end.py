@@ -42,7 +42,7 @@ import os, signal, time
 from groundsbot.onboard.wheels.port import EncoderPort
 from groundsbot.onboard.camera.folder import FolderCamera
 from functools import partial
-from onboard import live_recorder
+from groundsbot.onboard.recorder import live_recorder
 reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}
 def blocking(device):
     given = False  # what the devices gave last is still under way then

@@ -24,7 +24,7 @@ CORNERS = np.array([[50.0, 30.0], [110.0, 32.0], [108.0, 92.0], [52.0, 90.0]])
 PATIENCE_S = 120.0  # only what hangs comes near
 # For a recorder's process: whatever the devices still hold is taken in, however long a busy machine takes for it.
 PATIENT = """
-from onboard import live_recorder, recorder, waiting_detections
+from groundsbot.onboard.recorder import live_recorder, recorder, waiting_detections
 from groundsbot.onboard.camera.folder import FolderCamera
 live_recorder._END_LIMIT_NS = 120_000_000_000
 FolderCamera.patience_s = 120.0

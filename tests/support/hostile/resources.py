@@ -85,7 +85,7 @@ OTHER_FORMS: Final = {
 _MEASURE = """
 import contextlib, importlib, io, json, re, resource, shutil, sys, tempfile
 from pathlib import Path
-from offline import cli
+from groundsbot.offline import cli
 for name in sys.argv[1].split(","):
     importlib.import_module(name)
 resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))  # who measures shall not be taken down by it
