@@ -1,5 +1,5 @@
 from .factors import SpatialState
-from .graph import corner_graph, has_corners
+from .graph import corner_graph
 from .initial_tag_poses import hung_otherwise
 from .multifrontal.fronts import NotPositiveError
 from .refinement import Refined, refine
@@ -13,7 +13,6 @@ __all__ = [
     "SpatialState",
     "check_upright",
     "corner_graph",
-    "has_corners",
     "hung_otherwise",
     "refine",
     "solve_corners",

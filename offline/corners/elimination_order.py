@@ -1,14 +1,14 @@
 """In which order an estimate on corners is eliminated: each chain by nested dissection, then what chains share."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.corners.factors import SpatialColumns
 from groundsbot.offline.corners.multifrontal.fronts import Fronts, build_fronts, common_ancestor
-
-if TYPE_CHECKING:
-    from groundsbot.offline.corners.problem import CornerProblem
+from groundsbot.offline.sam import Measured, OdometryFactors
 
 # Poses that one leaf eliminates, between two separators, and leaves or branches that meet in a branch.
 _LEAF: Final = 12
@@ -17,22 +17,35 @@ _FAN: Final = 6
 _BLIND: Final = 8
 
 
-def corner_order(problem: "CornerProblem") -> Fronts:
-    """Poses in leaves and separators, tags where all who saw them meet, calibration and starts at the root."""
-    columns, kinds = problem.columns, problem.kinds()
-    pose = np.concatenate([problem.corners.looks.pose, problem.readings.pose])
-    tag = np.concatenate([problem.corners.looks.tag, problem.readings.tag])
-    starts, distances = problem.measured.starts, problem.measured.distances
+def corner_order(
+    columns: SpatialColumns,
+    kinds: Sequence[IntArray],
+    odometry: OdometryFactors,
+    measured: Measured,
+    pose: IntArray,
+    tag: IntArray,
+) -> Fronts:
+    """Poses in leaves and separators, tags where all who saw them meet, calibration and starts at the root.
+
+    Args:
+        columns: of all variables.
+        kinds: the columns (M, k) of each kind of factor.
+        odometry: which poses follow each other.
+        measured: starts, distances and tags that are known from elsewhere.
+        pose: (M,) which sees a tag, of looks and readings.
+        tag: (M,) the tag that it sees.
+    """
+    starts, distances = measured.starts, measured.distances
     ends = np.concatenate([starts.pose, distances.pose_a, distances.pose_b])
     ends = ends[ends >= 0]
-    pose_node, parent = _chains(problem, np.concatenate([pose, ends]), ends)
+    pose_node, parent = _chains(len(columns.poses), odometry, np.concatenate([pose, ends]), ends)
     root = len(parent) - 1
     seen = np.unique(tag * (root + 1) + pose_node[pose])
     nodes_of: list[list[int]] = [[] for _ in columns.tags]
     for key in seen.tolist():
         nodes_of[key // (root + 1)].append(key % (root + 1))
     tag_node = np.array([common_ancestor(nodes, parent) if nodes else root for nodes in nodes_of], dtype=np.int64)
-    tag_node[problem.measured.tags] = root
+    tag_node[measured.tags] = root
     node_of = np.full(columns.n, root, dtype=np.int64)
     for variable, node in (
         (columns.poses, pose_node[:, None]),
@@ -45,14 +58,13 @@ def corner_order(problem: "CornerProblem") -> Fronts:
     return build_fronts(columns.n, node_of, parent, kinds)
 
 
-def _chains(problem: "CornerProblem", seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
+def _chains(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
     """(P,) node of each pose and (N,) parent of each node; starts of chains are at the root, and the `ends`.
 
     First come nodes of poses in a row that saw nothing, then each chain's others by nested dissection.
     """
-    n_poses = len(problem.columns.poses)
     begins = np.ones(n_poses, dtype=np.bool_)
-    begins[problem.odometry.first + 1] = False
+    begins[odometry.first + 1] = False
     is_blind = ~begins
     is_blind[seeing] = False
     at = np.arange(n_poses)

@@ -48,11 +48,6 @@ class CornerGraph:
         return self.parameters.index(height) if height in self.parameters else None
 
 
-def has_corners(graph: Graph) -> bool:
-    """Whether any reading of the graph came from corners that the log still has."""
-    return any(_from_corners(chain).any() for chain in graph.chains)
-
-
 def corner_graph(
     graph: Graph, state: State, wobble_sigma: FloatArray | None = None, upright_sigma_rad: float | None = None
 ) -> tuple[CornerGraph, SpatialState]:
@@ -64,7 +59,7 @@ def corner_graph(
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
         upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
     """
-    chains, masks = graph.chains, [_from_corners(chain) for chain in graph.chains]
+    chains, masks = graph.chains, [chain.readings.from_corners for chain in graph.chains]
     seeing = [chain for chain, mask in zip(chains, masks, strict=True) if mask.any()]
     of_corners = sorted({each for chain in seeing for each in (_height_parameter(chain), _focal_parameter(chain))})
     parameters = (*graph.parameters, *of_corners)
@@ -98,11 +93,6 @@ def corner_graph(
     problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
     vars(problem)["motions"] = floor.arrowhead.odometry  # where the property has it: they rise by pose in a graph
     return CornerGraph(problem, graph, parameters), start
-
-
-def _from_corners(chain: Chain) -> BoolArray:
-    """(M,) which of a chain's readings have corners."""
-    return np.asarray(np.isfinite(chain.readings.corners_px).all((-1, -2)))
 
 
 def _looks(

@@ -84,7 +84,9 @@ class CornerProblem:
     @cached_property
     def order(self) -> Fronts:
         """The order of elimination, settled once."""
-        return corner_order(self)
+        looks, readings = self.corners.looks, self.readings
+        pose, tag = np.concatenate([looks.pose, readings.pose]), np.concatenate([looks.tag, readings.tag])
+        return corner_order(self.columns, self.kinds(), self.odometry, self.measured, pose, tag)
 
     @cached_property
     def look_order(self) -> IntArray:

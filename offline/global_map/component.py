@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from groundsbot.offline.alignment import Group
-from groundsbot.offline.corners import Refined, has_corners, refine
+from groundsbot.offline.corners import Refined, refine
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map import LocalMap
@@ -55,7 +55,7 @@ def solved_component(
     if keep_suspects and suspects:
         graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
     solved = SolvedComponent(members, graph, solution, suspects)
-    if not corners or not has_corners(graph):
+    if not corners or not graph.has_corners:
         return solved
     with stages.stage("refining on tag corners"):
         refined, told = refine(graph, solution, upright_sigma_rad)

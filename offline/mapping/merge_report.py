@@ -4,7 +4,6 @@ from collections.abc import Collection, Sequence
 from math import degrees
 
 from groundsbot.offline.alignment import Alignment, Group, Merge, PairAlignment, why_not_joined
-from groundsbot.offline.corners import has_corners
 from groundsbot.offline.global_map import TagJoin
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import AlignmentResult, RivalResult
@@ -61,7 +60,7 @@ def reason_apart(
         why = _why_not_joined(maps, nearest, names)
         if len(nearest.shared) > 1:
             return why
-        if not_joined is None and all(has_corners(maps[m].graph) for m in (nearest.a, nearest.b)):
+        if not_joined is None and all(maps[m].graph.has_corners for m in (nearest.a, nearest.b)):
             return f"{why}, and --model corners may do with the one"
         tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
         return tried[0] if tried else why

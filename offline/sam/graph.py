@@ -47,6 +47,11 @@ class Graph:
     tags: tuple[TagKey, ...]
     parameters: tuple[Parameter, ...]
 
+    @property
+    def has_corners(self) -> bool:
+        """Whether any reading came from corners that the log still has."""
+        return any(chain.readings.from_corners.any() for chain in self.chains)
+
     def poses_of(self, state: State, chain: int) -> FloatArray:
         """(K, 3) of one chain."""
         first = int(self.first_pose[chain])

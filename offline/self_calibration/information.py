@@ -15,7 +15,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import FOCAL_SCALE, NoiseParameters, Robot
-from groundsbot.offline.corners import CornerSolution, corner_graph, has_corners, solve_corners
+from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fitted_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
 from groundsbot.offline.noise import in_cell, spread_of_corners
@@ -120,7 +120,7 @@ def _told_by_stretch(
     effort.spend(on_floor)
     solution: Solution | CornerSolution = on_floor
     parameters = graph.parameters
-    if corners and has_corners(graph):
+    if corners and graph.has_corners:
         on_corners, spatial = corner_graph(graph, on_floor.state)
         solution, parameters = solve_corners(on_corners.problem, spatial), on_corners.parameters
     if not solution.converged:

@@ -2,13 +2,13 @@
 
 import importlib
 import importlib.metadata
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.support.installed import checkout_sources, install, printed
 from tests.support.paths import ROOT
 
 HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf", "reportlab")
@@ -94,53 +94,19 @@ def test_every_command_is_among_those_whose_help_is_tested() -> None:
     assert registered == {command for command in COMMANDS if len(command) == 2}
 
 
-def test_simulate_works_from_an_installed_wheel_in_an_empty_folder(tmp_path: Path) -> None:
-    built, installed, empty = tmp_path / "built", tmp_path / "installed", tmp_path / "empty"
-    empty.mkdir()
-    _run(
-        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(built), str(_sources(tmp_path))],
-        empty,
-    )
-    (wheel,) = built.glob("groundsbot-*.whl")
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(installed)]
-    _run([*pip, str(wheel)], empty)
-    where = _run([sys.executable, "-c", "import groundsbot.fixtures as f; print(f.__file__)"], empty, installed)
+def test_a_wheel_works_beside_a_project_that_has_a_package_offline(tmp_path: Path) -> None:
+    installed = install(checkout_sources(tmp_path / "sources"), tmp_path / "installed")
+    (tmp_path / "project" / "offline").mkdir(parents=True)
+    project = tmp_path / "project"
+    (project / "offline" / "__init__.py").write_text("raise ImportError('not yours')")
+
+    def run(*words: str) -> str:
+        return printed([sys.executable, *words], project, installed)
+
+    where = run("-c", "import groundsbot.fixtures as package; print(package.__file__)")
     assert Path(where.strip()).is_relative_to(installed)
-
-    simulate = [
-        sys.executable,
-        "-m",
-        "groundsbot.fixtures",
-        "simulate",
-        "--world",
-        "room",
-        "--seed",
-        "0",
-        "--no-render",
-    ]
-    _run([*simulate, "--output", "logs"], empty, installed)
-    assert (empty / "logs" / "truth.json").is_file()
-    _run([sys.executable, "-m", "groundsbot.offline.cli", "map", "logs", "-o", "map"], empty, installed)
-    assert (empty / "map" / "tags.csv").read_text().startswith("tag_id,")
-
-
-def _sources(tmp_path: Path) -> Path:
-    """What git would ship, copied, so that a build leaves nothing behind in the tree."""
-    sources = tmp_path / "sources"
-    for name in _run(["git", "ls-files", "--cached", "--others", "--exclude-standard"], ROOT).splitlines():
-        source, target = ROOT / name, sources / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_symlink():
-            target.symlink_to(source.readlink())
-        elif source.is_file():
-            target.write_bytes(source.read_bytes())
-    return sources
-
-
-def _run(command: list[str], folder: Path, first_on_path: Path | None = None) -> str:
-    environment = dict(os.environ)
-    if first_on_path is not None:
-        environment["PYTHONPATH"] = str(first_on_path)
-    found = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    return found.stdout
+    assert sorted(path.name for path in installed.iterdir() if path.suffix != ".dist-info") == ["bin", "groundsbot"]
+    run("-m", "groundsbot.fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render", "--output", "logs")
+    assert (project / "logs" / "truth.json").is_file()
+    run("-m", "groundsbot.offline.cli", "map", "logs", "-o", "map")
+    assert (project / "map" / "tags.csv").read_text().startswith("tag_id,")

@@ -47,6 +47,11 @@ class Readings:
         """Number of readings."""
         return len(self.tag)
 
+    @property
+    def from_corners(self) -> BoolArray:
+        """(M,) which of them came from corners that the log still has."""
+        return np.asarray(np.isfinite(self.corners_px).all((-1, -2)))
+
     def where(self, mask: BoolArray | IntArray) -> "Readings":
         """Those of a mask, or of indices."""
         return Readings(
