@@ -93,11 +93,6 @@ def right_jacobian(xi: ArrayLike) -> FloatArray:
     return _affine(along, across, odd * x - even * y, -across, along, even * x + odd * y)
 
 
-def left_jacobian(xi: ArrayLike) -> FloatArray:
-    """`[..., 3, 3]` with exp(xi + d) = exp(left_jacobian(xi) d) o exp(xi) to first order."""
-    return right_jacobian(-np.asarray(xi, dtype=np.float64))
-
-
 def right_jacobian_inverse(xi: ArrayLike) -> FloatArray:
     """`[..., 3, 3]` matrices J(xi): log(T o exp(d)) = log(T) + J(log(T)) d to first order.
 

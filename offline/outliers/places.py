@@ -153,9 +153,3 @@ def _batches(parts: Sequence[IntArray]) -> Iterator[list[IntArray]]:
             batch = []
     if batch:
         yield batch
-
-
-def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:
-    """What it brings to give some sightings (indices) a place of their own, in squared sigmas; and its information."""
-    inner, own = places.stiffness.together(members), places.pull[members].sum(axis=0)
-    return float(own @ np.linalg.solve(inner + NOWHERE * np.eye(2), own)), inner

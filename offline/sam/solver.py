@@ -188,10 +188,6 @@ class Solution:
         """Covariance (k, 3, 3) of each of k poses, in its own axes; as `covariance`, but quick for many."""
         return self.factorisation.pose_covariances(poses)
 
-    def condition(self) -> float:
-        """Estimate of H's condition number at the end."""
-        return self.factorisation.condition()
-
     def relative_error(self) -> float:
         """Estimate of what rounding, and the floor, do to covariances, as a share."""
         return self.factorisation.relative_error()

@@ -117,7 +117,7 @@ def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
     inputs = made[0].folder
     _add_inputs(inputs)
     robots = sorted(path.name for path in (inputs / "nsh").iterdir() if path.is_dir())
-    commands = _COMMANDS + (_PAPER if RECORDINGS.is_dir() else "")
+    commands = _COMMANDS.rstrip() + (_PAPER if RECORDINGS.is_dir() else "")
     words = {
         "INPUTS": str(inputs),
         "FIRST": robots[0],

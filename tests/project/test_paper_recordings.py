@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from groundsbot.offline.cli import app
-from groundsbot.onboard.log.reading.reader import find_logs, read_run_info
+from groundsbot.onboard.log.reading.reader import find_logs
+from tests.support.data.logs import run_info_of
 from tests.support.paper_recordings import RECORDINGS, needs_recordings
 from tests.support.paths import ROOT
 
@@ -73,7 +74,7 @@ def test_readme_quotes_the_distance_with_the_size_of_tags_open_too(logs: Path, t
     given: list[object] = []
     for log in find_logs([logs]):
         robot = tmp_path / f"{log.name}.yaml"
-        robot.write_text(read_run_info(log).robot_yaml + "imported_tag_scale_sigma: 0.3\n")
+        robot.write_text(run_info_of(log).robot_yaml + "imported_tag_scale_sigma: 0.3\n")
         given += ["--robot", robot]
     _succeeds("map", logs, "-o", tmp_path / "map", *given)
     found: dict[str, Any] = json.loads((tmp_path / "map" / "map.json").read_text())

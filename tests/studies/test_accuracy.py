@@ -1,4 +1,4 @@
-"""The study of accuracy in small: tests/benchmarks/accuracy/accuracy.py."""
+"""The study of accuracy in small: tests/benchmarks/accuracy/against_bound.py."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,8 @@ from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import Noise, load_world
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from tests.benchmarks.accuracy.accuracy import (
+from tests.benchmarks.accuracy.accuracy_study import Figures, figures_of
+from tests.benchmarks.accuracy.against_bound import (
     METHODS,
     Drives,
     Method,
@@ -25,7 +26,6 @@ from tests.benchmarks.accuracy.accuracy import (
     study_worlds,
     with_wide_priors,
 )
-from tests.benchmarks.accuracy.accuracy_study import Figures, figures_of
 from tests.benchmarks.accuracy.cramer_rao_world import bound_of
 from tests.benchmarks.accuracy.from_truth import most_likely_from_truth
 

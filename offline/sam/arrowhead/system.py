@@ -7,7 +7,6 @@ Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissec
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from scipy import linalg
@@ -30,8 +29,6 @@ from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation import readings as linearise_readings
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Readings, Values
-
-_CONDITION_STEPS: Final = 12
 
 
 class UnderDeterminedError(ValueError):
@@ -244,20 +241,6 @@ class Factorisation:
         marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, self.top, wanted)[poses]
         free = self.arrowhead.free.poses[poses]
         return marginals * (free[:, :, None] * free[:, None, :])
-
-    def condition(self) -> float:
-        """Estimate, from below, of the ratio of H's largest and smallest eigenvalue: power iteration on both ends."""
-        rng = np.random.default_rng(0)
-        held = np.ones(len(self.system.gradient))
-        held[self.arrowhead.tangent] = 0.0
-        largest = smallest = rng.standard_normal(len(held)) * (1.0 - held)
-        up = down = 1.0
-        for _ in range(_CONDITION_STEPS):
-            largest = self.arrowhead.product(self.system, largest)
-            smallest = self.solve_in_order(smallest)
-            up, down = float(np.linalg.norm(largest)), float(np.linalg.norm(smallest))
-            largest, smallest = largest / up, smallest / down
-        return up * down
 
     def relative_error(self) -> float:
         """What rounding does to solutions, as a share: the length of one step of iterative refinement.

@@ -78,26 +78,6 @@ def read_log(
     yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
 
 
-def read_run_info(path: Path) -> RunInfo:
-    """The `/run` message of a log file or run folder, damaged or not.
-
-    Raises:
-        LogError: it is missing, or not to be found in any file.
-    """
-    core, pictures = _files_of(path)
-    files, allowance = [*core, *pictures], Allowance()
-    for file in files:
-        try:
-            found = _run_info(file, allowance)
-        except LogError:
-            if len(files) == 1:
-                raise
-            continue
-        if found is not None:
-            return found
-    raise LogError(f"{path}: the beginning, which says whose run it is, is damaged; choose another log")
-
-
 def files_of(path: Path) -> list[Path]:
     """The files of a log, a file itself or those of a run folder, finished or not.
 

@@ -29,7 +29,8 @@ from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, wheel_line
 from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
-from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from tests.support.data.logs import run_info_of
 from tests.support.tag_pictures import draw_tag
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
@@ -213,7 +214,7 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
 
 def _judged(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict[str, Any]:
     (log,) = find_logs([logs])
-    epoch_ns = read_run_info(log).run_epoch_ns
+    epoch_ns = run_info_of(log).run_epoch_ns
     wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
     frames = [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
     kept = sum(1 for _ in read_log(log, ["/camera/image"])) if load.keep else 0

@@ -26,8 +26,8 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.self_calibration.option import Calibrate
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.accuracy.accuracy import study_worlds
 from tests.benchmarks.accuracy.accuracy_study import figures_of
+from tests.benchmarks.accuracy.against_bound import study_worlds
 from tests.benchmarks.command_line import say, seeds_of
 
 MOST_RMSE: Final = 1.05

@@ -19,7 +19,7 @@ from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
 from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.accuracy.accuracy import rough
+from tests.benchmarks.accuracy.against_bound import rough
 from tests.support.data.drives import CAMERA, FAMILY, MadeTag, made_drive, made_robot, made_run, seen_corners_px
 
 ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4})

@@ -24,14 +24,14 @@ from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
-from groundsbot.offline.outliers.places import NOWHERE, gain_of, settled
+from groundsbot.offline.outliers.places import NOWHERE, settled
 from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
 from groundsbot.offline.outliers.split import Searched, split_together
 from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
-from tests.support.data.moved_tags import made_scene
+from tests.support.data.moved_tags import gain_of, made_scene
 
 HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(8)}
 STARTS = {"a": [0.0, 0.0, 0.0], "b": [5.0, 1.0, 2.0], "c": [9.0, -1.0, -3.0], "d": [4.0, 0.0, 1.0]}

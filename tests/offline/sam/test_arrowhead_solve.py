@@ -52,7 +52,6 @@ def test_costs_fall_and_the_reason_is_given() -> None:
     assert found.n_linearised >= len(found.costs)
     assert found.untied.n_directions == 0
     assert found.rank == fleet.problem.columns.n
-    assert found.condition() > 1.0
 
 
 @given(seed=st.integers(0, 10**6))

@@ -31,7 +31,7 @@ from groundsbot.offline.self_calibration.robot import LIMITS, Learnt, Owned, all
 from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose
 from groundsbot.offline.self_calibration.words import DRIVES, freed_lines
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.accuracy.accuracy import with_wide_priors
+from tests.benchmarks.accuracy.against_bound import with_wide_priors
 from tests.support.data.drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
 from tests.support.programs import Run as Program
 

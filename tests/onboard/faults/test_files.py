@@ -13,8 +13,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.messages import TOPICS, nanoseconds
-from groundsbot.onboard.log.reading.reader import read_log, read_run_info
-from tests.support.data.logs import HEADS, ChunkPlace, Seen, chunks_of, drive, read_all, write_log
+from groundsbot.onboard.log.reading.reader import read_log
+from tests.support.data.logs import HEADS, ChunkPlace, Seen, chunks_of, drive, read_all, run_info_of, write_log
 from tests.support.programs import Run
 
 PAGE_BYTES = 4096
@@ -159,7 +159,7 @@ def test_row_06_the_other_file_says_whose_run_it_is(large: Path, tmp_path: Path)
     core = folder / "0000.core.mcap"
     first, *rest = chunks_of(core)
     damaged(core, folder, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
-    assert read_run_info(folder).run_id == "run1"
+    assert run_info_of(folder).run_id == "run1"
     found, losses = read_all(folder)
     assert [each for each in found if each[0] != "/camera/image"] == messages_of(rest)
     assert losses.n_places == 1

@@ -28,8 +28,9 @@ from groundsbot.onboard.log.messages import (
     timestamp,
 )
 from groundsbot.onboard.log.reading.decoder import LogMessage
-from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
+from tests.support.data.logs import run_info_of
 
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000
@@ -80,8 +81,8 @@ def test_each_file_opens_alone(tmp_path: Path) -> None:
     run = write_run(tmp_path)
     for name in ("0000.core.mcap", "0000.camera.mcap"):
         assert [each.topic for each in read_log(run / name)][:3] == ["/run", "/camera/calibration", "/tf"]
-        assert read_run_info(run / name).robot_yaml == ROBOT_YAML
-    assert read_run_info(run).run_id == "run1"
+        assert run_info_of(run / name).robot_yaml == ROBOT_YAML
+    assert run_info_of(run).run_id == "run1"
 
 
 def test_only_the_topics_asked_for(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ import pytest
 
 from groundsbot.fixtures.recording.devices import PtyPort, paced, wheel_line
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
-from groundsbot.onboard.log.reading.reader import find_logs, read_log, read_run_info
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.recorder.pictures import PictureSchedule
+from tests.support.data.logs import run_info_of
 from tests.support.devices.live_recording import CORNERS, PATIENCE_S, PATIENT, robot_yaml
 from tests.support.devices.recorder_cores import frames_of, wheels_of
 from tests.support.programs import running
@@ -114,7 +115,7 @@ def test_a_live_recording_has_every_line_and_picture_on_one_clock(
     assert process.returncode == (3 if refused else 0), said
 
     (log,) = find_logs([tmp_path / "logs"])
-    epoch_ns = read_run_info(log).run_epoch_ns
+    epoch_ns = run_info_of(log).run_epoch_ns
     wheels = wheels_of(log)
     assert [each.sequence for each in wheels] == [index for index, at_ns in enumerate(measured) if at_ns is not None]
     late_ns = np.array([each.stamp_ns - epoch_ns - (measured[each.sequence] or 0) for each in wheels])

@@ -19,12 +19,13 @@ from groundsbot.onboard.log.messages import (
     ClockAnchor,
     CompressedImage,
     Event,
+    RunInfo,
     TagDetection,
     TagDetections,
     WheelEncoders,
     timestamp,
 )
-from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.log.reading.reader import read_head, read_log
 from groundsbot.onboard.log.reading.record_bytes import RECORD_HEAD
 from groundsbot.onboard.log.writing.writer import LogWriter
 
@@ -150,3 +151,10 @@ def _places(data: bytes) -> Iterator[tuple[int, int]]:
         if opcode == Opcode.DATA_END:
             return
         position = end
+
+
+def run_info_of(log: Path) -> RunInfo:
+    """The `/run` message of a log file or run folder, damaged or not."""
+    info = read_head(log)["/run"]
+    assert isinstance(info, RunInfo)
+    return info

@@ -14,6 +14,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.outliers.places import NOWHERE, Places
 from tests.support.data.drives import FAMILY, S
 from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town
 
@@ -145,3 +146,9 @@ def _places(chain: Chain, own: BoolArray) -> FloatArray:
     """(M, 2) in the camera's axes; all readings of long drives are polar."""
     range_m, bearing_rad = chain.readings.value[own].T
     return np.stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)], axis=-1)
+
+
+def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:
+    """What it brings to give some sightings (indices) a place of their own, in squared sigmas; and its information."""
+    inner, own = places.stiffness.together(members), places.pull[members].sum(axis=0)
+    return float(own @ np.linalg.solve(inner + NOWHERE * np.eye(2), own)), inner

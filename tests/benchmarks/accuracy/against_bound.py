@@ -1,6 +1,6 @@
 """How accurate maps of simulated drives are, method by method, against what could be told at all.
 
-    python -m tests.benchmarks.accuracy.accuracy --worlds nsh,nsh_flat,room,nsh_rough --seeds 0-199
+    python -m tests.benchmarks.accuracy.against_bound --worlds nsh,nsh_flat,room,nsh_rough --seeds 0-199
 
 Drives without rendering, calibration drawn from the priors of robot.yaml; for methods that are to find the calibration,
 from wide ones: radii 2 %, track 3 %, yaw of the mount 1 degree, time offset 20 ms, tag sizes exact. A line a method and
