@@ -9,7 +9,16 @@ from .parameters import (
     TIME_OFFSET,
     WHEEL_PARAMETERS,
 )
-from .robot import R_LEVEL_OPTICAL, Mount, Robot, TagBatch, Wheels, parse_robot_yaml, read_robot_yaml, write_robot_yaml
+from .robot_yaml import (
+    R_LEVEL_OPTICAL,
+    Mount,
+    Robot,
+    TagBatch,
+    Wheels,
+    parse_robot_yaml,
+    read_robot_yaml,
+    write_robot_yaml,
+)
 
 __all__ = [
     "CAMERA_PARAMETERS",

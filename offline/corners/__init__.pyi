@@ -1,8 +1,8 @@
+from .bundle_adjustment import Refined, refine
 from .factors import SpatialState
 from .graph import corner_graph
 from .initial_tag_poses import hung_otherwise
 from .multifrontal.fronts import NotPositiveError
-from .refinement import Refined, refine
 from .solver import CornerSolution, solve_corners
 from .upright_prior import check_upright
 

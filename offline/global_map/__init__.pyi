@@ -1,7 +1,7 @@
-from .component import SolvedComponent, solved_component
 from .goodness_of_fit import joined_goodness
 from .joint_solve import calibration_of, component_of
 from .scale_checks import COMPARED, check_warnings, checks_of, metre_of
+from .solve_component import SolvedComponent, solved_component
 from .tag_joins.join import TagJoin, joined_over_tags
 from .tag_joins.report import join_results, join_warnings
 from .tape import judged, measurement_warnings, unused

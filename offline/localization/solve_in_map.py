@@ -2,9 +2,9 @@
 
 The map's tags are variables with the map's joint covariance as their prior, so the trajectory carries its uncertainty;
 what the run makes of them is not kept. A tag that was moved since is given a place of its own. It is looked for as in
-`outliers.split`, by what all else foretells for it: for a tag that is held, the prior's residual by what the estimate
-takes of it (data snooping: Baarda, "A testing procedure for use in geodetic networks", 1968), for one that is not, its
-place against that which the map foretells from the tags that are.
+`outliers.outliers`, by what all else foretells for it: for a tag that is held, the prior's residual by what the
+estimate takes of it (data snooping: Baarda, "A testing procedure for use in geodetic networks", 1968), for one that is
+not, its place against that which the map foretells from the tags that are.
 """
 
 from collections.abc import Sequence

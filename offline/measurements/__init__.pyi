@@ -1,15 +1,15 @@
 from .chain import Chain, chains_of
+from .coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
 from .covariance_components import CovarianceParts
-from .motion_model.odometry import GAP_NS, ODOMETRY_NOISE, ChainOdometry
+from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, ChainOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.stretches import wheel_distances
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
-from .sensor_model.observations import MAX_RANGE_M, SAME_SIZE_M, check_tag_sizes
 from .sensor_model.readings import Readings
+from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M, check_tag_sizes
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .sensor_model.tags import Detections, Positions, TagKey
-from .subsampling import coarse_keyframes, coarsened, refined, telling_keyframes
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
 

@@ -12,7 +12,7 @@ from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import moved_out
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.motion_model.stretches import WheelRow, stretches_of
 from groundsbot.offline.measurements.plausibility import check_file_name
 from groundsbot.offline.measurements.sensor_model.tag_messages import RunReadings

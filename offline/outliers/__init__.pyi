@@ -1,8 +1,8 @@
 from .duplicate_ids import told_apart
-from .local_maps import local_maps_of
+from .local_maps_without_outliers import local_maps_of
+from .outliers import joined, renamed, split_together, with_outliers_apart
 from .report import suspect_tags
 from .search import FALSE_ALARM
-from .split import joined, renamed, split_together, with_outliers_apart
 
 __all__ = [
     "FALSE_ALARM",

@@ -3,7 +3,7 @@
 An id hangs in one place, or so a solve takes it; and an average of two places is none. Within a picture quads that do
 not overlap are different tags. From picture to picture each reading belongs to the tag whose last reading is nearest,
 no two of one picture to one tag. Whoever passes by once more follows them anew: which of them is which, and whether one
-was a false detection, the evidence of all readings tells (`split`).
+was a false detection, the evidence of all readings tells (`outliers.outliers`).
 """
 
 from dataclasses import replace

@@ -20,8 +20,8 @@ from groundsbot.offline.outliers.kinds import (
     swapped_pairs,
     wrong_runs,
 )
+from groundsbot.offline.outliers.outliers import Searched
 from groundsbot.offline.outliers.search import FALSE_ALARM
-from groundsbot.offline.outliers.split import Searched
 
 _MOST_NAMED: Final = 4
 

@@ -5,8 +5,7 @@ from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
 from .budget import Effort, efforts_of
 from .damping import Damping
-from .factors.losses import Loss, huber, loss_and_weight, losses_and_weights
-from .factors.planar import (
+from .factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
     Linearised,
@@ -17,6 +16,7 @@ from .factors.planar import (
     whitening,
 )
 from .factors.priors import NOTHING_MEASURED, DistanceFactors, KnownPlaces, Measured, StartFactors, ends_of
+from .factors.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .graph import Graph, build_graph, unheld
 from .linearisation.kernels import Odometry, Values, advance, go_along, multiply, series, wrapped
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction

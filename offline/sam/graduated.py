@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, forgets, graduated
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, forgets, graduated
 from groundsbot.offline.sam.solver import Losses, Problem, Solution, solve
 
 # The control falls by this each time, as in the paper.

@@ -9,7 +9,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, MOUNT_PARAMETERS, Mount
 from groundsbot.offline.measurements import Chain, TagKey
-from groundsbot.offline.sam.factors.planar import (
+from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
     OdometryFactors,

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam.factors.planar import Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import Columns, OdometryFactors, ReadingFactors, State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors, ends_of
 
 # Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.

@@ -16,9 +16,15 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweighed
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
 from groundsbot.offline.sam.damping import Damping
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, huber, losses_and_weights
-from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+)
 from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber, losses_and_weights
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 from groundsbot.offline.sam.linearisation.kernels import diagonal_square
 from groundsbot.offline.sam.observability import Untied, untied_parts

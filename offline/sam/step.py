@@ -6,8 +6,8 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
-from groundsbot.offline.sam.factors.losses import Loss
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.robust_losses import Loss
 from groundsbot.offline.sam.linearisation.blocks import System
 
 # A step that brings less than this share of what the linear model says is also tried in the other way.

@@ -1,7 +1,7 @@
 """The recorder: bytes and pictures with their times in, a run log out, through every fault of docs/faults.md.
 
-`recorder.Recorder` is the core without threads or devices, `live_recorder` adds them, `disk/` keeps the log on a disk
-that may be slow, full or failing. In the paper: the robot that collects data.
+`recorder.RecorderCore` is the core without threads or devices, `live_recorder` adds them, `disk/` keeps the log on a
+disk that may be slow, full or failing. In the paper: the robot that collects data.
 """
 
 from lazy_loader import attach_stub

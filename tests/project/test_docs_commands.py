@@ -21,7 +21,7 @@ import yaml
 from markdown_it import MarkdownIt
 from typer.main import get_command
 
-from groundsbot.calib.robot.robot import write_robot_yaml
+from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.fixtures.worlds import world
 from tests.project.test_robot_page import blocks as blocks_of_robot_setup
 from tests.support.data.bags import BagOfLog

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.offline.measurements import chain
+from groundsbot.offline.measurements import keyframes
 from groundsbot.offline.measurements.run import Run, load_run
 from tests.benchmarks.speed import corners_bench, thinning_bench
 from tests.support.data.drives import HALL, made_drive, made_robot, write_drive
@@ -23,7 +23,7 @@ def test_what_thinning_loses_is_what_fewer_pictures_tell_less(slow: Run) -> None
     assert found["pictures"] > 3 * found["keyframes"]
     # With n times the looks of a tag nearly as much more is known, but for what the wheels add between keyframes.
     assert 0.2 < found["lost"] < 1.0 - found["keyframes"] / found["pictures"]
-    assert np.degrees(chain.KEYFRAME_TURN_RAD) == pytest.approx(1.0)  # as before
+    assert np.degrees(keyframes.KEYFRAME_TURN_RAD) == pytest.approx(1.0)  # as before
 
 
 def test_the_bench_of_corners_counts_solves_on_the_floor(slow: Run, tmp_path: Path) -> None:

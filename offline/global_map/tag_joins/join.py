@@ -16,7 +16,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import Group, Merge, size_rank
 from groundsbot.offline.corners import refine
 from groundsbot.offline.foundation import Stages
-from groundsbot.offline.global_map.component import SolvedComponent
+from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.verdict import Verdict, verdict
 from groundsbot.offline.global_map.tape import with_measurements
 from groundsbot.offline.local_map import LocalMap

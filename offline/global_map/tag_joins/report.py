@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.global_map.component import SolvedComponent
+from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.join import TagJoin
 from groundsbot.offline.maps import AlignmentResult, RivalResult
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.alignment import MARGIN_NATS, variance_factor
 from groundsbot.offline.corners import CornerSolution, NotPositiveError, Refined, hung_otherwise, solve_corners
-from groundsbot.offline.global_map.component import SolvedComponent
+from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.fit import HungTags, TagFit, fitted, hung_tags, radial_sigmas
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey

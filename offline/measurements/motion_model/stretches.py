@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray, counted
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances
 from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps
 from groundsbot.onboard.log import PlanarOdometry

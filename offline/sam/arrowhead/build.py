@@ -9,7 +9,12 @@ from groundsbot.offline.sam.arrowhead.preintegration import add_moments, compose
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, measured_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Skeleton
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
-from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, OdometryFactors, ReadingFactors
+from groundsbot.offline.sam.factors.odometry_and_readings import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+)
 from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
 from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Readings
 

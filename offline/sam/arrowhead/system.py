@@ -22,8 +22,8 @@ from groundsbot.offline.sam.arrowhead.prior_blocks import MeasuredBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import rolled
 from groundsbot.offline.sam.arrowhead.threads import eliminate_chains
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation import readings as linearise_readings

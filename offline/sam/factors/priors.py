@@ -1,4 +1,4 @@
-"""What is known from elsewhere, as factors in the form of `planar`: what a person measured, what a map holds."""
+"""What is known from elsewhere, as factors like those of measurements: what a person measured, what a map holds."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.planar import Columns, Linearised, State
+from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Compiled linearisation: residuals and Jacobians of `factors.planar`, straight into blocks of the arrowhead system.
+"""Compiled linearisation: residuals and Jacobians straight into blocks of the arrowhead system.
 
-What `factors.planar` writes as arrays over all factors is here a loop with the same names; the tests hold both to each
-other.
+What `factors.odometry_and_readings` writes as arrays over all factors is here a loop with the same names; the tests
+hold both to each other.
 """
 
 from typing import NamedTuple

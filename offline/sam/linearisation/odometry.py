@@ -9,7 +9,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import borrowed, inner, jitted
-from groundsbot.offline.sam.factors.losses import Loss, loss_and_weight
+from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import System
 from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
 

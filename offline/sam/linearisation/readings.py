@@ -7,7 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import borrowed, inlined, inner, jitted
-from groundsbot.offline.sam.factors.losses import Loss, loss_and_weight
+from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import System
 from groundsbot.offline.sam.linearisation.kernels import Free, Readings, Values
 

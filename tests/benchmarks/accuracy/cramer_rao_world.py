@@ -4,7 +4,7 @@ import numpy as np
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
-from groundsbot.calib.robot.robot import Robot
+from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.fixtures.drives.calibration import nominal_robot, true_tag_sizes_m
 from groundsbot.fixtures.pictures.visibility import sightings
 from groundsbot.fixtures.recording.session import Options, Session, prepare

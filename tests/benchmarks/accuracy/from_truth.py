@@ -7,14 +7,14 @@ import numpy as np
 
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.corners.refinement import refine
+from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.global_map.joint_solve import component_of
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Workings
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import solve
 

@@ -20,9 +20,9 @@ from typing import Any, Final
 
 from groundsbot.calib.foundation.files import written_whole
 from groundsbot.fixtures.simulate import simulate
+from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.corners.floor_noise import guessed_wobble
 from groundsbot.offline.corners.graph import corner_graph
-from groundsbot.offline.corners.refinement import refine
 from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.inputs import read_runs

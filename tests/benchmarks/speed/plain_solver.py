@@ -5,8 +5,8 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, losses_and_weights
-from groundsbot.offline.sam.factors.planar import Linearised, State, stacked
+from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, stacked
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Losses, Problem
 
 _MAX_ITERATIONS = 100
@@ -46,7 +46,7 @@ def plain_step(hessian: sparse.csc_array, gradient: FloatArray, damping: float) 
 def plain_normal_equations(
     problem: Problem, state: State, losses: Losses = PLAIN_SQUARES
 ) -> tuple[sparse.csc_array, FloatArray]:
-    """H = J^T J (n, n) and g = J^T r (n,) at a state, robust losses' weights included, from `factors.planar` alone."""
+    """H = J^T J (n, n) and g = J^T r (n,) at a state, robust weights included, from the factors' classes alone."""
     kinds = (
         _reweighted(problem.odometry.linearise(state, problem.columns), losses.odometry),
         _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),

@@ -30,7 +30,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.foundation.files import written_whole
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations, plain_solve, plain_step
 from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet

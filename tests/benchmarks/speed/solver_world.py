@@ -11,7 +11,7 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.geometry.se2 import chained
-from groundsbot.offline.sam.factors.planar import (
+from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
     OdometryFactors,

@@ -26,7 +26,7 @@ from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import Component
-from groundsbot.offline.measurements import chain
+from groundsbot.offline.measurements import keyframes
 from groundsbot.offline.measurements.run import Run
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say
@@ -41,12 +41,12 @@ _TURNED_RAD: Final = 2e-3
 @contextmanager
 def every_picture_a_keyframe() -> Iterator[None]:
     """As if the robot had always moved far enough, but where it stands: there errors of pictures are the same ones."""
-    before = chain.KEYFRAME_DISTANCE_M, chain.KEYFRAME_TURN_RAD
-    chain.KEYFRAME_DISTANCE_M, chain.KEYFRAME_TURN_RAD = _MOVED_M, _TURNED_RAD  # type: ignore[misc]
+    before = keyframes.KEYFRAME_DISTANCE_M, keyframes.KEYFRAME_TURN_RAD
+    keyframes.KEYFRAME_DISTANCE_M, keyframes.KEYFRAME_TURN_RAD = _MOVED_M, _TURNED_RAD  # type: ignore[misc]
     try:
         yield
     finally:
-        chain.KEYFRAME_DISTANCE_M, chain.KEYFRAME_TURN_RAD = before  # type: ignore[misc]
+        keyframes.KEYFRAME_DISTANCE_M, keyframes.KEYFRAME_TURN_RAD = before  # type: ignore[misc]
 
 
 def lost(runs: Sequence[Run], *, corners: bool) -> dict[str, Any]:

@@ -29,9 +29,9 @@ from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.outliers.outliers import Searched, split_alone, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import settled
 from groundsbot.offline.outliers.report import suspect_tags
-from groundsbot.offline.outliers.split import Searched, split_alone, split_together, with_outliers_apart
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say

@@ -15,7 +15,7 @@ from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.sensor_model.readings import joined
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from groundsbot.offline.report.sentences import advice_sentence
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.trust.advice_study import Scene, made_scene, trial

@@ -8,7 +8,7 @@ import pytest
 from google.protobuf.message import Message
 
 from groundsbot.calib.camera.file import write_camera_yaml
-from groundsbot.calib.robot.robot import write_robot_yaml
+from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.onboard.log.messages import WheelEncoders
 from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS, imported_log, rewritten

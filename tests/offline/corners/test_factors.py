@@ -22,7 +22,7 @@ from groundsbot.offline.corners.multifrontal.kernels import System
 from groundsbot.offline.corners.picture_tilt import pictures_at
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.solver import solve_corners
-from groundsbot.offline.sam.factors.planar import CalibrationPrior, OdometryFactors, ReadingFactors
+from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, OdometryFactors, ReadingFactors
 from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED
 
 CAMERAS = {

@@ -9,7 +9,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.calib.robot.robot import Robot
+from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.pipeline import build_map

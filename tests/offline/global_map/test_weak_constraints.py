@@ -23,7 +23,13 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
-from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import (
+    CalibrationPrior,
+    Columns,
+    OdometryFactors,
+    ReadingFactors,
+    State,
+)
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2, wheels
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.offline.importing.csv.forms import read_odometry
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions, WheelScale

@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.offline.local_map.correlated_errors import SharedErrors, fit_shared_errors
 from groundsbot.offline.local_map.goodness_of_fit import fitted_windows, in_windows
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve

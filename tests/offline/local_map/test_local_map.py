@@ -11,7 +11,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map import local_map
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.subsampling import coarse_keyframes, coarsened, refined
+from groundsbot.offline.measurements.coarse_chain import coarse_keyframes, coarsened, refined
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve

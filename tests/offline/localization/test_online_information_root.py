@@ -15,7 +15,7 @@ from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.online.moving_frame import Known, pose_among, turned
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
-from groundsbot.offline.sam.factors.planar import State, stacked
+from groundsbot.offline.sam.factors.odometry_and_readings import State, stacked
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD
 from tests.benchmarks.accuracy.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one

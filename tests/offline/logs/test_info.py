@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot.robot import Robot, Wheels
+from groundsbot.calib.robot.robot_yaml import Robot, Wheels
 from groundsbot.offline.logs.info import LogInfo, describe_log
 from groundsbot.onboard.log.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
 from groundsbot.onboard.log.writing.writer import LogWriter

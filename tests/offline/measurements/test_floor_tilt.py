@@ -14,8 +14,8 @@ from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
-from groundsbot.offline.measurements.sensor_model.observations import read_detections
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
+from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
 from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
 from groundsbot.onboard.log.reading.reader import find_logs

@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2
-from groundsbot.calib.robot.robot import write_robot_yaml
+from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.calib.tags.edges import outward
 from groundsbot.offline.measurements.motion_model.stretches import wheel_distances
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file

@@ -8,7 +8,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack, compose_odometry
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances, growth
 from groundsbot.onboard.log.messages import PlanarOdometry
 from tests.support.data.drives import S, made_drive

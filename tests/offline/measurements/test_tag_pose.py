@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray
-from groundsbot.calib.robot.robot import Robot
-from groundsbot.offline.measurements.sensor_model.observations import MAX_RANGE_SIGMA_PER_M
+from groundsbot.calib.robot.robot_yaml import Robot
+from groundsbot.offline.measurements.sensor_model.sensor_model import MAX_RANGE_SIGMA_PER_M
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
 from tests.support.data.drives import CAMERA, MadeTag, made_robot, seen_corners_px
 
@@ -54,7 +54,7 @@ def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAM
 
 
 def used(found: TagReadings) -> BoolArray:
-    """As groundsbot.offline.measurements.sensor_model.observations gates the range."""
+    """As groundsbot.offline.measurements.sensor_model.sensor_model gates the range."""
     gate = (MAX_RANGE_SIGMA_PER_M * found.range_bearing[:, 0]) ** 2
     return np.asarray(found.valid & (found.covariance[:, 0, 0] < gate))
 

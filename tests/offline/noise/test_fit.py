@@ -14,7 +14,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Workings
 from groundsbot.offline.maps.parameter_results import NOT_NEEDED
 from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.motion_model.odometry import ODOMETRY_NOISE
+from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.reweighing import fit_and_weigh, weighed_as

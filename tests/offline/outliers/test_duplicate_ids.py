@@ -11,7 +11,7 @@ from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
 from groundsbot.offline.outliers.duplicate_ids import told_apart
-from groundsbot.offline.outliers.split import split_alone
+from groundsbot.offline.outliers.outliers import split_alone
 from tests.support.data.drives import (
     CAMERA,
     FAMILY,

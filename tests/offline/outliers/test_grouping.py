@@ -12,8 +12,8 @@ from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from groundsbot.offline.outliers import grouping as suspects_passings
 from groundsbot.offline.outliers.grouping import few_of_each_tag
+from groundsbot.offline.outliers.outliers import split_alone
 from groundsbot.offline.outliers.sightings import sightings_of
-from groundsbot.offline.outliers.split import split_alone
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, S, made_drive, made_positions, made_run
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber, truncated
-from groundsbot.offline.sam.factors.planar import Linearised, State
+from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, cauchy, graduated, huber, truncated
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.graphs import made_graph, with_measured

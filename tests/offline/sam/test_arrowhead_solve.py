@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, cauchy, graduated, huber
 from groundsbot.offline.sam.solver import Losses, Problem, solve
 from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet
 from tests.support.data.graphs import made_graph, reordered

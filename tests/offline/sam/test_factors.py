@@ -8,8 +8,16 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.losses import SQUARES, Loss, cauchy, graduated, huber, losses_and_weights, truncated
-from groundsbot.offline.sam.factors.planar import Linearised, State, whitening
+from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, whitening
+from groundsbot.offline.sam.factors.robust_losses import (
+    SQUARES,
+    Loss,
+    cauchy,
+    graduated,
+    huber,
+    losses_and_weights,
+    truncated,
+)
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.problems import CALIBRATION_SIGMA, N_CALIBRATION, made_problem, random_state

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
-from groundsbot.offline.sam.factors.losses import SQUARES, huber, truncated
-from groundsbot.offline.sam.factors.planar import ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import ReadingFactors, State
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, huber, truncated
 from groundsbot.offline.sam.graduated import solve_graduated
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, Solution, solve
 from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet

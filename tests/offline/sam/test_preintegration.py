@@ -6,7 +6,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.arrowhead.system import Skeleton
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.benchmarks.speed.solver_world import made_fleet

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.sam.factors.planar import Columns, Linearised, State, stacked, whitening
+from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State, stacked, whitening
 from groundsbot.offline.sam.factors.priors import KnownPlaces
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.support.data.graphs import made_graph, with_measured

@@ -11,10 +11,10 @@ from groundsbot.calib.geometry.se2 import chained
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import chains_of
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.sensor_model.tags import TagKey
-from groundsbot.offline.sam.factors.losses import cauchy, losses_and_weights
-from groundsbot.offline.sam.factors.planar import OdometryFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, State
+from groundsbot.offline.sam.factors.robust_losses import cauchy, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.drives import FAMILY, START_NS, made_positions, made_robot, made_run

@@ -11,7 +11,7 @@ import pytest
 from groundsbot.calib.camera.file import read_camera_yaml
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS
-from groundsbot.calib.robot.robot import Robot, read_robot_yaml, write_robot_yaml
+from groundsbot.calib.robot.robot_yaml import Robot, read_robot_yaml, write_robot_yaml
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.errors import OfflineError

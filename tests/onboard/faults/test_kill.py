@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.fixtures.recording.devices import PtyPort
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource
 from groundsbot.onboard.log.reading.reader import find_logs, read_log

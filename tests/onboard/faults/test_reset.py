@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.geometry import se2
-from groundsbot.calib.robot.robot import Wheels
+from groundsbot.calib.robot.robot_yaml import Wheels
 from groundsbot.fixtures.drives.true_motion import Drive
 from groundsbot.fixtures.drives.wheel_controller import Controller, TimedLine
 from groundsbot.fixtures.recording import feed as simulated

@@ -13,7 +13,7 @@ from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.robot.robot import Mount, parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import Mount, parse_robot_yaml
 from groundsbot.onboard.errors import LogError, MessageRefusedError
 from groundsbot.onboard.log.head import camera_from_message, log_head, mount_message
 from groundsbot.onboard.log.messages import (

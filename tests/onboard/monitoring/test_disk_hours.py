@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraSettings, Frame
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.log.messages import StampSource

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.messages import StampSource, TagDetections, WheelEncoders
 from groundsbot.onboard.log.writing.segments import SegmentLimits

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetections

@@ -21,9 +21,9 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import wheels
 from groundsbot.calib.geometry.se2 import chained
-from groundsbot.calib.robot.robot import Mount
+from groundsbot.calib.robot.robot_yaml import Mount
 from groundsbot.offline.importing.bags.reader import DEFINITIONS
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.onboard.log.messages import TagDetections, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log

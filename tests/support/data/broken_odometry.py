@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import IntArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
-from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry
+from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
 from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town
 
 NOISE = NoiseParameters()

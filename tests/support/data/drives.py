@@ -12,8 +12,8 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chained
-from groundsbot.calib.robot.robot import Robot
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.calib.robot.robot_yaml import Robot
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log.head import log_head

@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.planar import OdometryFactors, ReadingFactors, State, whitening
+from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, ReadingFactors, State, whitening
 
 
 def odometry_of(

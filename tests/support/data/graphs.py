@@ -8,7 +8,7 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.sam.factors.planar import (
+from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
     OdometryFactors,

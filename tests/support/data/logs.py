@@ -12,7 +12,7 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.losses import LogLosses
 from groundsbot.onboard.log.messages import (

@@ -11,11 +11,11 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.calib.robot.robot import Robot
+from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.motion_model.odometry import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.sensor_model.tags import Positions, TagKey
-from groundsbot.offline.sam.factors.planar import State
+from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph
 from tests.support.data.drives import FAMILY, START_NS, S, made_robot, made_run
 

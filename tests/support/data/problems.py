@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.planar import CalibrationPrior, Columns, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, Columns, ReadingFactors, State
 from groundsbot.offline.sam.solver import Problem
 from tests.support.data.factors import odometry_of, readings_of
 

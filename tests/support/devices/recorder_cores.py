@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.robot.robot import parse_robot_yaml
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.log.losses import LogLosses
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log

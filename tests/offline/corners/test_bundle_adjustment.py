@@ -15,14 +15,14 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.tags.edges import outward
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.corners import refinement as corner_map
+from groundsbot.offline.corners import bundle_adjustment as corner_map
+from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.corners.edge_directions import facing_as_predicted
 from groundsbot.offline.corners.factors import SpatialState
 from groundsbot.offline.corners.floor_noise import fitted_wobble, guessed_wobble, with_wobble
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.initial_tag_poses import hung_otherwise, tags_rehung
 from groundsbot.offline.corners.problem import CornerProblem
-from groundsbot.offline.corners.refinement import refine
 from groundsbot.offline.corners.solver import CornerSolution, solve_corners
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import read_truth

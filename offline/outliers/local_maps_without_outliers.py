@@ -6,7 +6,7 @@ from groundsbot.offline.foundation import Stages
 from groundsbot.offline.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements import Chain
 from groundsbot.offline.outliers.odometry_breaks import split_where_broken
-from groundsbot.offline.outliers.split import RunsAlone
+from groundsbot.offline.outliers.outliers import RunsAlone
 from groundsbot.offline.sam import efforts_of
 
 

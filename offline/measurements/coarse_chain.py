@@ -8,7 +8,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chained, se2
 from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry
+from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
 
 # Keyframes at least this far apart where tags are read, and where none is. Turns count like arcs of half a metre.
 _READING_SPACING_M: Final = 0.25

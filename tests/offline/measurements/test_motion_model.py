@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chained
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.motion_model.odometry import ChainOdometry, WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
 from tests.support.data.drives import START_NS, MadeDrive, S, made_drive
 
 TRACK_M = 0.5

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.yaml_file import parse_mapping, validated
-from groundsbot.calib.robot.robot import (
+from groundsbot.calib.robot.robot_yaml import (
     Devices,
     Mount,
     RecorderOptions,

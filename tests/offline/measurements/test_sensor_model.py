@@ -10,12 +10,12 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.calib.robot.robot import Robot
+from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.calib.tags.edges import moved_out
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
-from groundsbot.offline.measurements.sensor_model.observations import check_tag_sizes, read_detections, read_positions
 from groundsbot.offline.measurements.sensor_model.readings import Readings
+from groundsbot.offline.measurements.sensor_model.sensor_model import check_tag_sizes, read_detections, read_positions
 from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
 from tests.support.data.drives import (
     CAMERA,

@@ -24,9 +24,9 @@ from groundsbot.offline.measurements.sensor_model.tags import TagKey
 from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
+from groundsbot.offline.outliers.outliers import Searched, split_together
 from groundsbot.offline.outliers.places import NOWHERE, settled
 from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
-from groundsbot.offline.outliers.split import Searched, split_together
 from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
