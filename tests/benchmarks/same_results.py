@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -113,7 +114,7 @@ def main() -> int:
 
 def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
     made = _run_both(installed, folder / "inputs", _INPUTS)
-    n_different = _report(made, relative)
+    n_different = report(made, relative)
     inputs = made[0].folder
     _add_inputs(inputs)
     robots = sorted(path.name for path in (inputs / "nsh").iterdir() if path.is_dir())
@@ -129,7 +130,7 @@ def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
         commands = commands.replace(word, value)
     if not RECORDINGS.is_dir():
         say("the paper's recordings are not in ../shared/data: left out")
-    return n_different + _report(_run_both(installed, folder / "results", commands), relative)
+    return n_different + report(_run_both(installed, folder / "results", commands), relative)
 
 
 def _add_inputs(inputs: Path) -> None:
@@ -154,7 +155,7 @@ def _run_both(installed: Sequence[Path], folder: Path, commands: str) -> list[Si
     return sides
 
 
-def _report(sides: Sequence[Side], relative: float) -> int:
+def report(sides: Sequence[Side], relative: float) -> int:
     """How many files differ by more than is allowed; says which, and how."""
     names = [{str(path.relative_to(side.folder)) for path in _files(side.folder)} for side in sides]
     n_different, n_same = len(names[0] ^ names[1]), 0
@@ -177,7 +178,7 @@ def relative_difference(old: Path, new: Path) -> float:
     """The largest of all numbers, by the larger of the two; inf where more than numbers differs."""
     try:
         (before, old_numbers), (after, new_numbers) = (_parted(path) for path in (old, new))
-    except (UnicodeDecodeError, ValueError):
+    except (UnicodeDecodeError, ValueError, McapError):
         return np.inf
     if before != after or len(old_numbers) != len(new_numbers):
         return np.inf

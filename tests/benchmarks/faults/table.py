@@ -13,7 +13,6 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import pytest
 
@@ -58,7 +57,7 @@ def with_results(page: str, results: Results) -> str:
         found = _ROW.match(line)
         if found:
             tests = results.get(found[1], {})
-            names = "<br>".join(f"`{Path(test).name.replace('.py::', ' ')}`" for test in sorted(tests))
+            names = "<br>".join(f"`{test.removeprefix('tests/').replace('.py::', ' ')}`" for test in sorted(tests))
             ends = "<br>".join(_told(tests[test]) for test in sorted(tests))
             line = f"| {' | '.join((*found.groups()[:3], names or 'none', ends or 'missing', found[6]))} |"
         lines.append(line)
