@@ -65,6 +65,7 @@ lock: $(READY)
 
 proto: $(READY)
 	$(BIN)/python -m grpc_tools.protoc --proto_path=. --python_out=. --pyi_out=. onboard/groundsbot.proto
+	sed -i "s/'onboard.groundsbot_pb2'/'groundsbot.onboard.groundsbot_pb2'/" onboard/groundsbot_pb2.py
 
 clean:
 	rm -rf build $(VENV)

@@ -28,7 +28,7 @@ DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18onboard/ground
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
-_builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'onboard.groundsbot_pb2', _globals)
+_builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'groundsbot.onboard.groundsbot_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_STAMPSOURCE']._serialized_start=1637

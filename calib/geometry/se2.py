@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import se2
 
 _SERIES_BELOW_RAD = 0.5  # (w - sin w) / w^2 loses digits below this; its series does not
 
@@ -189,7 +188,7 @@ def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
     cos, sin = np.cos(theta[:-1]), np.sin(theta[:-1])
     x = start[0] + np.concatenate([[0.0], np.cumsum(cos * motions[:, 0] - sin * motions[:, 1])])
     y = start[1] + np.concatenate([[0.0], np.cumsum(sin * motions[:, 0] + cos * motions[:, 1])])
-    return np.stack([x, y, se2.wrap_angle(theta)], axis=-1)
+    return np.stack([x, y, wrap_angle(theta)], axis=-1)
 
 
 def fit_transform(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -202,5 +201,5 @@ def fit_transform(a: FloatArray, b: FloatArray) -> FloatArray:
     dot = (from_a * from_b).sum()
     cross = (from_b[:, 0] * from_a[:, 1] - from_b[:, 1] * from_a[:, 0]).sum()
     turn = np.array([0.0, 0.0, np.arctan2(cross, dot)])
-    translation = centre_a - se2.apply(turn, centre_b)
+    translation = centre_a - apply(turn, centre_b)
     return np.array([translation[0], translation[1], turn[2]])

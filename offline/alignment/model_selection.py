@@ -26,7 +26,7 @@ from groundsbot.offline.alignment.ransac import Explanation, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, log_wrong
 
 # Sure is what explains the tags a hundred times better than anything else. Hardly any comes near: of 214 trials of
-# `tests.benchmarks.alignment_study` none was between this and 10,000 times.
+# `tests.benchmarks.trust.alignment_study` none was between this and 10,000 times.
 MARGIN_NATS: Final = log(100.0)
 # And so many times better than chance, of which less is known than of anything that tags say.
 CHANCE_NATS: Final = log(1e4)

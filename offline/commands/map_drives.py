@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from math import degrees
+from math import degrees, radians
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +12,6 @@ from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, counted, fo
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, metre_line, read_robot_files, say
-from groundsbot.offline.corners import check_upright
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import StageCost, Stages, compilation_announced
 from groundsbot.offline.mapping import Workings, build_map, read_runs
@@ -37,6 +36,9 @@ from groundsbot.offline.self_calibration import OFF, freed_lines, parse_calibrat
 from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
+# Of --upright-deg: a tag that is told to hang better than that, or worse, is a slip of the unit.
+_FINEST_DEG: Final = 0.01
+_COARSEST_DEG: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     Raises:
         GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
     """
-    upright_sigma_rad = check_upright(options.upright_deg, corners=options.corners)
+    upright_sigma_rad = _upright_sigma_rad(options.upright_deg, corners=options.corners)
     logs = find_logs(list(options.logs))
     check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
     extending = None if options.extend is None else _read_extended(options.extend, options)
@@ -238,3 +240,23 @@ def _advice_lines(result: MapResult) -> list[str]:
     several = len({tag.family for component in result.components for tag in component.tags}) > 1
     told = result.advice[:1] if len(result.components) == 1 else ()
     return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]
+
+
+def _upright_sigma_rad(upright_deg: float | None, *, corners: bool) -> float | None:
+    """The sigma in rad of what was given in degrees.
+
+    Raises:
+        OfflineError: one line that says what is wrong and what to write.
+    """
+    if upright_deg is None:
+        return None
+    if not corners:
+        raise OfflineError(
+            "--upright-deg: tags on the floor have no tilt to hold, and are taken for upright as it is; give "
+            "--model corners too, or leave it out"
+        )
+    if not _FINEST_DEG <= upright_deg <= _COARSEST_DEG:
+        raise OfflineError(
+            f"--upright-deg: the sigma is {upright_deg:g} deg, must be from {_FINEST_DEG:g} to {_COARSEST_DEG:g}"
+        )
+    return radians(upright_deg)

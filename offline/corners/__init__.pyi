@@ -4,14 +4,12 @@ from .graph import corner_graph
 from .initial_tag_poses import hung_otherwise
 from .multifrontal.fronts import NotPositiveError
 from .solver import CornerSolution, solve_corners
-from .upright_prior import check_upright
 
 __all__ = [
     "CornerSolution",
     "NotPositiveError",
     "Refined",
     "SpatialState",
-    "check_upright",
     "corner_graph",
     "hung_otherwise",
     "refine",

@@ -13,13 +13,10 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import SpatialColumns, SpatialState
-from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import Linearised
 
 # A level tells a hundredth of a degree at best; what leans by ten is not upright.
-_FINEST_DEG: Final = 0.01
-_COARSEST_DEG: Final = 10.0
 # A tag that hangs as its sigma says is named as leaning so rarely.
 _FALSE_ALARM: Final = 1e-4
 
@@ -72,23 +69,3 @@ class UprightFactors:
 
 
 NOTHING_UPRIGHT: Final = UprightFactors(np.zeros(0, dtype=np.int64), 1.0)
-
-
-def check_upright(upright_deg: float | None, *, corners: bool) -> float | None:
-    """The sigma in rad of what was given in degrees.
-
-    Raises:
-        OfflineError: one line that says what is wrong and what to write.
-    """
-    if upright_deg is None:
-        return None
-    if not corners:
-        raise OfflineError(
-            "--upright-deg: tags on the floor have no tilt to hold, and are taken for upright as it is; give "
-            "--model corners too, or leave it out"
-        )
-    if not _FINEST_DEG <= upright_deg <= _COARSEST_DEG:
-        raise OfflineError(
-            f"--upright-deg: the sigma is {upright_deg:g} deg, must be from {_FINEST_DEG:g} to {_COARSEST_DEG:g}"
-        )
-    return float(np.radians(upright_deg))

@@ -1,7 +1,7 @@
 """Compiled loops, stages with their costs, and small file helpers. Knows nothing of robots.
 
-In: nothing of ours but errors. Out: `jitted` and its kin (numba with a cache that follows edits), `Stages`, typed CSV
-tables, guarded .npz files, and what the logs of one command may cost together.
+In: files and functions. Out: `jitted` and its kin (numba with a cache that follows edits), `Stages`, typed CSV tables,
+guarded .npz files, and what the logs of one command may cost together. The paper has no such block.
 """
 
 from lazy_loader import attach_stub

@@ -1,15 +1,18 @@
-"""Runs that cannot go into one map, or not into a kept one, refused before anything is computed."""
+"""The runs of a map: read, and refused where they cannot go into one map, or not into a kept one."""
 
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from groundsbot.calib.errors import CalibError
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Inputs, Stages
 from groundsbot.offline.local_map import check_can_be_extended, check_sizes_in_map
 from groundsbot.offline.maps import MapResult
-from groundsbot.offline.measurements import RobotFile, Run, load_run
+from groundsbot.offline.measurements import SAME_SIZE_M, RobotFile, Run, load_run
 from groundsbot.offline.self_calibration import Calibrate
 from groundsbot.onboard.log import Allowance
 
@@ -101,3 +104,25 @@ def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> N
                 f"--robot: robot_id {robot_id!r} is in none of the logs (they are of {', '.join(sorted(recorded))}); "
                 "give the file of one of these robots"
             )
+
+
+def check_tag_sizes(runs: Sequence[Run]) -> None:
+    """Refuses detections whose tag has no size, and runs that disagree about a tag's size.
+
+    Raises:
+        GroundsbotError: naming the run, the tag and the sizes.
+    """
+    known: dict[tuple[str, int], tuple[float, Run]] = {}
+    for run in runs:
+        for index in np.unique(run.detections.tag):
+            key = run.tags[index]
+            try:
+                size_m = run.robot.tag_size_m(key.family, key.tag_id)[0]
+            except CalibError as error:
+                raise OfflineError(f"{run.log}: {error}") from error
+            other_m, other = known.setdefault(key, (size_m, run))
+            if abs(other_m - size_m) > SAME_SIZE_M:
+                raise OfflineError(
+                    f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
+                    f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"
+                )

@@ -19,7 +19,7 @@ from groundsbot.offline.global_map import (
 )
 from groundsbot.offline.local_map import LocalMap, kept_of, local_map_of, tags_of, tape_of
 from groundsbot.offline.mapping.findings import Found
-from groundsbot.offline.mapping.inputs import check_distinct, check_new
+from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
 from groundsbot.offline.mapping.workings import Workings
@@ -30,7 +30,6 @@ from groundsbot.offline.measurements import (
     Run,
     TapeOptions,
     chains_of,
-    check_tag_sizes,
     parse_measurements,
 )
 from groundsbot.offline.noise import fit_and_weigh, weighed_as

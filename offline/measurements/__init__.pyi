@@ -7,9 +7,9 @@ from .motion_model.stretches import wheel_distances
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
 from .sensor_model.readings import Readings
-from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M, check_tag_sizes
+from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M
 from .sensor_model.tag_pose import UNIT_CORNERS
-from .sensor_model.tags import Detections, Positions, TagKey
+from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
 
@@ -37,7 +37,6 @@ __all__ = [
     "TagKey",
     "TapeOptions",
     "chains_of",
-    "check_tag_sizes",
     "coarse_keyframes",
     "coarsened",
     "growth",

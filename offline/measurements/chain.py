@@ -16,7 +16,7 @@ from groundsbot.offline.measurements.motion_model.motion_model import ChainOdome
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, joined
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections, read_positions
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.motion_model.stretches import WheelRow, stretches_of
 from groundsbot.offline.measurements.plausibility import check_file_name
-from groundsbot.offline.measurements.sensor_model.tag_messages import RunReadings
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.tag_messages import RunReadings
+from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log import (
     Allowance,
     CameraCalibration,

@@ -15,7 +15,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 
 # No tape is longer, none is finer, and a measurement that says less says nothing; squares of these are still numbers.
 _FARTHEST_M: Final = 1e5

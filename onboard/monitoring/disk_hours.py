@@ -3,7 +3,7 @@
 from typing import Final, NamedTuple
 
 _S_PER_H: Final = 3600.0
-# Compressed, six tags in each picture, as measured from 20 to 1000 lines a second (tests/test_onboard_disk_hours.py).
+# Compressed, six tags in each picture, as measured from 20 to 1000 lines a second (test_disk_hours.py).
 _BYTES_A_LINE: Final = 34.0
 _BYTES_A_DETECTED_PICTURE: Final = 510.0
 _BYTES_A_SECOND: Final = 2000.0  # heads and indexes of the chunks, one for each time that the disk is waited for

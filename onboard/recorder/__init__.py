@@ -1,7 +1,8 @@
-"""The recorder: bytes and pictures with their times in, a run log out, through every fault of docs/faults.md.
+"""The recorder: wheels and camera into a run log, through every fault of docs/faults.md.
 
-`recorder.RecorderCore` is the core without threads or devices, `live_recorder` adds them, `disk/` keeps the log on a
-disk that may be slow, full or failing. In the paper: the robot that collects data.
+In: bytes of the wheel controller and pictures, each with its time. Out: a run log. `recorder.RecorderCore` is the core
+without threads or devices, `live_recorder` adds them, `disk/` keeps the log on a disk that may be slow, full or
+failing. In the paper: the robot that collects data.
 """
 
 from lazy_loader import attach_stub

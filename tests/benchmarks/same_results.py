@@ -26,18 +26,19 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from groundsbot.calib.foundation.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from tests.benchmarks.command_line import say
 from tests.support.data.bags import BagOfLog
 from tests.support.installed import checkout_sources, install, revision_sources
 from tests.support.paper_recordings import RECORDINGS
 
 # Run with both, compared, and REVISION's are what all below is run on.
-_INPUTS: Final = """
+INPUTS: Final = """
 fixtures demo --output demo
 fixtures simulate --world nsh --seed 1 --no-render --output nsh
 fixtures simulate --world room --seed 0 --no-render --output room
 """
-_COMMANDS: Final = """
+COMMANDS: Final = """
 calib board -o board.pdf
 calib tags --ids 0-5 --size-mm 100 -o tags.pdf
 offline info INPUTS/nsh --json
@@ -49,6 +50,10 @@ offline map INPUTS/nsh/FIRST -o first
 offline localize INPUTS/nsh/SECOND --map first -o second_in_first
 offline map --extend first/map.json INPUTS/nsh/SECOND -o extended
 offline calibrate INPUTS/room -o calibrated
+offline map INPUTS/room -o given --noise INPUTS/noise.yaml --keep-suspects --distance a_seed0,b_seed0=3,9
+offline map INPUTS/room -o recalibrated --robot calibrated/a.yaml
+offline import INPUTS/folder -o from_folder --track-width-m 0.3
+offline map from_folder -o folder_map
 offline compare demo --truth INPUTS/demo/logs/truth.json --json
 offline compare room --truth INPUTS/room/truth.json
 offline compare demo --survey first/tags.csv
@@ -63,12 +68,15 @@ offline map from_bag -o bag_map
 offline salvage INPUTS/cut.mcap -o salvaged.mcap
 offline detect INPUTS/demo/logs/DRIVE -o detected
 """
-_PAPER: Final = """
+PAPER: Final = """
 offline import RECORDINGS/hallway -o paper --state-rate-hz 4.2 --track-width-m 0.508
 offline import RECORDINGS/loop -o paper --state-rate-hz 4.2 --track-width-m 0.508
 offline map paper -o paper_map
 """
-_NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NUMBER: Final = re.compile(r"[-+]?(?:\d+\.\d*(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+)")
+
+
+DONE: Final = (f"exit {EXIT_DONE}", f"exit {EXIT_WITH_LOSSES}")
 
 
 class Side(NamedTuple):
@@ -102,6 +110,8 @@ def main() -> int:
     parser.add_argument("--relative", type=float, default=0.0, help="how far numbers may differ")
     parser.add_argument("--keep", type=Path, help="new folder for all files of both")
     arguments = parser.parse_args()
+    if arguments.keep and arguments.keep.exists():
+        parser.error(f"--keep {arguments.keep}: exists already; name a new folder")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sources = revision_sources(arguments.revision, folder / "old"), checkout_sources(folder / "new")
@@ -113,12 +123,12 @@ def main() -> int:
 
 
 def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
-    made = _run_both(installed, folder / "inputs", _INPUTS)
+    made = _run_both(installed, folder / "inputs", INPUTS)
     n_different = report(made, relative)
     inputs = made[0].folder
     _add_inputs(inputs)
     robots = sorted(path.name for path in (inputs / "nsh").iterdir() if path.is_dir())
-    commands = _COMMANDS.rstrip() + (_PAPER if RECORDINGS.is_dir() else "")
+    commands = COMMANDS.rstrip() + (PAPER if RECORDINGS.is_dir() else "")
     words = {
         "INPUTS": str(inputs),
         "FIRST": robots[0],
@@ -134,11 +144,18 @@ def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
 
 
 def _add_inputs(inputs: Path) -> None:
-    """A bag of a simulated drive, and a log that ends in the middle."""
+    """A bag of a simulated drive, a log that ends in the middle, a drive as CSV files, and a noise file."""
     log = inputs / "room" / _first_run(inputs / "room")
     BagOfLog.of(log).odometry().mount().camera_info().apriltag_msgs().write(inputs / "drive")
     whole = next(log.glob("*.core.mcap")).read_bytes()
     (inputs / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    folder = inputs / "folder"
+    folder.mkdir()
+    turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(100))
+    seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.03 * i:.2f},{0.5 * (i // 3 % 3)}\n" for i in range(0, 100, 3))
+    (folder / "odometry.csv").write_text("t_s,v_m_s,omega_rad_s\n" + turning, encoding="utf-8")
+    (folder / "observations.csv").write_text("t_s,tag_id,x_m,y_m\n" + seen, encoding="utf-8")
+    (inputs / "noise.yaml").write_text("sigma_corner_px: 0.3\n", encoding="utf-8")
 
 
 def _first_run(logs: Path) -> str:
@@ -167,15 +184,17 @@ def report(sides: Sequence[Side], relative: float) -> int:
             n_same += 1
             continue
         difference = relative_difference(old, new)
-        n_different += not difference <= relative
+        n_different += relative == 0.0 or not difference <= relative
         say(f"differs: {name}, numbers by {difference:.1e} relative")
-    codes = [line for path in sorted(sides[0].folder.glob("*.printed")) for line in _first_two(path)]
-    say(f"{n_same} files are the same, {n_different} are not; exit codes {' '.join(codes)}")
-    return n_different
+    failed = [line for path in sorted(sides[0].folder.glob("*.printed")) for line in _failed(path)]
+    for line in failed:
+        say(f"REVISION ends with {line}")
+    say(f"{n_same} files are the same, {n_different} are not")
+    return n_different + len(failed)
 
 
 def relative_difference(old: Path, new: Path) -> float:
-    """The largest of all numbers, by the larger of the two; inf where more than numbers differs."""
+    """The largest of all numbers with a fraction, by the larger of the two; inf where anything else differs."""
     try:
         (before, old_numbers), (after, new_numbers) = (_parted(path) for path in (old, new))
     except (UnicodeDecodeError, ValueError, McapError):
@@ -184,20 +203,26 @@ def relative_difference(old: Path, new: Path) -> float:
         return np.inf
     a, b = np.array(old_numbers, dtype=np.float64), np.array(new_numbers, dtype=np.float64)
     largest = np.maximum(np.abs(a), np.abs(b))
-    return float(np.max(np.abs(a - b) / np.where(largest > 0, largest, 1.0), initial=0.0, where=~(a == b)))
+    return float(np.max(np.abs(a - b) / np.where(largest > 0, largest, 1.0), initial=0.0))
 
 
 def _parted(path: Path) -> tuple[str, list[float]]:
-    """A file's text without its numbers, and its numbers."""
+    """A file's text, whole numbers (ids, counts, stamps) included, and its numbers with a fraction or an exponent."""
     if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            numeric = {name: arrays[name] for name in arrays.files if arrays[name].dtype.kind in "fiub"}
-            text = repr([(name, arrays[name].tolist()) for name in arrays.files if name not in numeric])
-        return text + repr([(name, array.shape) for name, array in numeric.items()]), [
-            float(value) for array in numeric.values() for value in np.nan_to_num(array).ravel()
-        ]
+        return _arrays_parted(path)
     text = "\n".join(_messages(path)) if path.suffix == ".mcap" else path.read_text(encoding="utf-8")
     return _NUMBER.sub("#", text), [float(number) for number in _NUMBER.findall(text)]
+
+
+def _arrays_parted(path: Path) -> tuple[str, list[float]]:
+    told, numbers = [], list[float]()
+    with np.load(path) as arrays:
+        for name in arrays.files:
+            array = arrays[name]
+            is_number = np.isfinite(array) if array.dtype.kind == "f" else np.zeros(array.shape, dtype=np.bool_)
+            numbers += array[is_number].tolist()
+            told.append((name, array.dtype.str, array.shape, is_number.tolist(), array[~is_number].tolist()))
+    return repr(told), numbers
 
 
 def _messages(path: Path) -> Iterator[str]:
@@ -211,8 +236,10 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_file()]
 
 
-def _first_two(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8").splitlines()[1].split()[1:]
+def _failed(path: Path) -> list[str]:
+    """The exit code and the command, where it did not do what it was to do."""
+    command, code, *_ = path.read_text(encoding="utf-8").splitlines()
+    return [] if code in DONE else [f"{code}: {command}"]
 
 
 def _without_times(printed: str) -> str:

@@ -1,7 +1,7 @@
 """Every command that README and docs show, as it stands there: run, or for a short list of reasons parsed only.
 
 The commands of docs/robot_setup.md are run by test_robot_page, with a robot that is simulated, and python blocks by
-test_offline_library. The others run here, page by page in their order, in a folder with small inputs under the names
+test_library. The others run here, page by page in their order, in a folder with small inputs under the names
 that the page uses.
 """
 

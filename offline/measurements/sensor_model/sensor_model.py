@@ -1,17 +1,14 @@
 """Detections and imported positions of one run -> tag readings in metres, each with its covariance."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy.special import chdtri
 
-from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import CAMERA_PARAMETERS, NoiseParameters, Robot
-from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
@@ -20,7 +17,6 @@ from groundsbot.offline.measurements.sensor_model.readings import Readings, no_r
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.stationary_corners import averaged
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions
 from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     FALSE_ALARM,
     UPRIGHT_DOF,
@@ -29,6 +25,7 @@ from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     level_of,
     with_common_turn,
 )
+from groundsbot.offline.measurements.tags import Detections, Positions
 
 # What the covariance of an imported position without one is made of.
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
@@ -263,25 +260,3 @@ def _position_parts(range_m: FloatArray, modelled: BoolArray, covariance: FloatA
     unit[1, modelled, 0, 0] = range_m[modelled] ** 2
     unit[2, modelled, 1, 1] = 1.0
     return CovarianceParts(POSITION_NOISE, unit, np.where(modelled[:, None, None], 0.0, covariance))
-
-
-def check_tag_sizes(runs: Sequence[Run]) -> None:
-    """Refuses detections whose tag has no size, and runs that disagree about a tag's size.
-
-    Raises:
-        GroundsbotError: naming the run, the tag and the sizes.
-    """
-    known: dict[tuple[str, int], tuple[float, Run]] = {}
-    for run in runs:
-        for index in np.unique(run.detections.tag):
-            key = run.tags[index]
-            try:
-                size_m = run.robot.tag_size_m(key.family, key.tag_id)[0]
-            except CalibError as error:
-                raise OfflineError(f"{run.log}: {error}") from error
-            other_m, other = known.setdefault(key, (size_m, run))
-            if abs(other_m - size_m) > SAME_SIZE_M:
-                raise OfflineError(
-                    f"{run.log}: tags: tag {key.tag_id} of {key.family} has size {size_m} m in the robot.yaml of "
-                    f"{run.name} but {other_m} m in that of {other.name}; give one robot.yaml with --robot"
-                )

@@ -21,7 +21,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 
 # The paper's solver: odometry's x, y, then heading; a tag reading's x and y.
 ODOMETRY_VARIANCE: Final = (2.5e-5, 2.5e-5, 2.5e-6)

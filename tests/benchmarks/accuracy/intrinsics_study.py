@@ -1,8 +1,8 @@
 """How near a calibration comes to the camera that took the pictures, and what its own statements are worth.
 
-    python -m tests.benchmarks.accuracy.intrinsics_study                      both comparisons python -m
-    tests.benchmarks.accuracy.intrinsics_study --parts given        the model given, 30 good views python -m
-    tests.benchmarks.accuracy.intrinsics_study --parts plain        a tenth of them spoilt, OpenCV's way beside ours
+    python -m tests.benchmarks.accuracy.intrinsics_study                  both comparisons
+    python -m tests.benchmarks.accuracy.intrinsics_study --parts given    the model given, 30 good views
+    python -m tests.benchmarks.accuracy.intrinsics_study --parts plain    a tenth of them spoilt, OpenCV's beside ours
 
 Each seed draws 30 views of the board, pictures rendered with noise, blur and a shaking hand; both comparisons look at
 the same ones, except for those that are spoilt. chi2 is that of the whole parameter vector; errors are root mean

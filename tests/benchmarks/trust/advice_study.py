@@ -32,7 +32,7 @@ from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.sensor_model.readings import joined
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import say, seeds_of

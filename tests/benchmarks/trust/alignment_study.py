@@ -29,7 +29,7 @@ from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
 from groundsbot.offline.alignment.model_selection import GROUP_MARGIN
 from groundsbot.offline.alignment.pairwise import Alignment, align
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.support.data.long_drives import Town, made_long_drive, made_town
 

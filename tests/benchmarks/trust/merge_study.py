@@ -25,7 +25,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import merge_warnings
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from tests.benchmarks.command_line import say
 from tests.support.data.long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town
 

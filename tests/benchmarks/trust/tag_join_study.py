@@ -25,7 +25,7 @@ from groundsbot.offline.evaluation.truth import Truth, read_truth
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.offline.measurements.tags import Detections
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import seeds_of
 

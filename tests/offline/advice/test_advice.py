@@ -13,7 +13,7 @@ from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
 from groundsbot.offline.advice.visibility import expected_sigmas_m, seen_shares
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.sensor_model.readings import joined
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.report.sentences import advice_sentence
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph, build_graph

@@ -14,7 +14,7 @@ from groundsbot.offline.alignment.merging import Merge, merge
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import alignment_results, merge_warnings
 from groundsbot.offline.measurements.chain import chains_of
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import Placement
 from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
 

@@ -15,7 +15,7 @@ from groundsbot.calib.geometry.se2 import fit_transform
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.model_selection import MARGIN_NATS
 from groundsbot.offline.alignment.pairwise import Alignment, align, covariance_union
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import Placement
 
 ANY = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)

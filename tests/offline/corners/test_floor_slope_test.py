@@ -15,7 +15,7 @@ from groundsbot.offline.commands.map_drives import as_json, summary
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.offline.measurements.tags import Detections
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.drives import HALL, MadeTag, S, made_drive, made_robot, write_drive
 

@@ -61,7 +61,7 @@ def test_start_figures_are_those_worked_out_by_hand() -> None:
 
 
 def test_nees_of_small_errors_is_that_worked_out_by_hand() -> None:
-    """Of large ones lengths and directions count (test_offline_nees)."""
+    """Of large ones lengths and directions count (test_nees)."""
     component = made_component()
     off, d = 1e-4 * np.array([[3.0, 4.0], [0.0, 0.0], [0.0, -12.0]]), 1e-4 * np.array([3.0, -4.0])
     errors = evaluate(made_map(moved(component, off, d)), made_truth(component)).components[0]

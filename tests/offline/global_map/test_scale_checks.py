@@ -13,7 +13,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.warnings import calibration_warnings
 from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
 from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
 

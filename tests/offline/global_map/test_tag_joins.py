@@ -15,7 +15,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.sensor_model.tags import Detections
+from groundsbot.offline.measurements.tags import Detections
 from groundsbot.offline.measurements.tape import TapeOptions
 from groundsbot.offline.report.tables import tables
 from tests.benchmarks.trust.tag_join_study import study_seed

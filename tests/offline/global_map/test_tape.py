@@ -15,7 +15,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
 from tests.support.data.drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.support.programs import Outcome

@@ -22,7 +22,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,

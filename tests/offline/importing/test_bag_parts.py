@@ -24,7 +24,7 @@ from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, IMAGE, BagOp
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.importing.run_writer import ImportReport
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from tests.support.data.bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
 from tests.support.data.drives import CAMERA as LENS
 from tests.support.data.drives import HALL, PINHOLE, made_drive, made_robot, write_drive

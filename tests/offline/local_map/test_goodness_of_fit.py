@@ -16,7 +16,7 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import local_maps_without_outliers as local_maps
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph

@@ -15,7 +15,7 @@ from groundsbot.offline.localization.localization import localize
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from tests.support.data.drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
 from tests.support.programs import Run as Program
 

@@ -14,7 +14,7 @@ from groundsbot.offline.localization.online.information_root import OnlineRoot
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.online.moving_frame import Known, pose_among, turned
 from groundsbot.offline.localization.online.prior import OnlinePrior
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State, stacked
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD

@@ -8,7 +8,7 @@ import pytest
 
 from groundsbot.offline.localization.online.information_root import Lifted, OnlineRoot
 from groundsbot.offline.localization.online.tag_test import TagJudge
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 
 TAGS = [TagKey("tag36h11", i) for i in range(6)]
 HELD = {i: TAGS[i] for i in range(4)}

@@ -8,7 +8,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.keyframes import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from tests.support.data.drives import FAMILY, START_NS, MadeDrive, S, made_drive, made_positions, made_run
 
 NOISE = NoiseParameters()

@@ -17,7 +17,7 @@ from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_r
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
-from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
+from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import rough
 from tests.support.data.drives import CAMERA, FAMILY, MadeTag, made_drive, made_robot, made_run, seen_corners_px

@@ -15,7 +15,7 @@ from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.calib.tags.edges import outward
 from groundsbot.offline.measurements.motion_model.stretches import wheel_distances
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import (
     CameraCalibration,

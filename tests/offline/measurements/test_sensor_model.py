@@ -12,11 +12,12 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.calib.tags.edges import moved_out
+from groundsbot.offline.mapping.inputs import check_tag_sizes
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
 from groundsbot.offline.measurements.sensor_model.readings import Readings
-from groundsbot.offline.measurements.sensor_model.sensor_model import check_tag_sizes, read_detections, read_positions
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections, read_positions
+from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from tests.support.data.drives import (
     CAMERA,
     FAMILY,

@@ -6,7 +6,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import (
     MeasuredDistance,
     Measurements,

@@ -9,7 +9,7 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import Detections, TagKey
+from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.offline.outliers.duplicate_ids import told_apart
 from groundsbot.offline.outliers.outliers import split_alone
 from tests.support.data.drives import (

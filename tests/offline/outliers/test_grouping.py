@@ -9,7 +9,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import grouping as suspects_passings
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.outliers import split_alone

@@ -11,7 +11,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import Grown
 from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary

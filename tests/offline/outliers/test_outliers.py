@@ -20,7 +20,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of

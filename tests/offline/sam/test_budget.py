@@ -62,7 +62,7 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
 ) -> None:
     log = written(observed(4000, 10), tmp_path)
     assert len(load_run(log).positions.tag) == 8000
-    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_READINGS", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_READINGS", 0)
     most = log.stat().st_size // 10
     assert most < 8000
     assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
@@ -71,7 +71,7 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
 def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
     log = written(observed(2000, 10), tmp_path)
     size = log.stat().st_size
     every = -(-4000 // (size // 64))
@@ -89,7 +89,7 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
 def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("groundsbot.offline.measurements.sensor_model.tag_messages._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
     run = load_run(written(resets(1, 3, 500), tmp_path))
     assert 0 < len(run.picture_stamps_ns) < 500
     assert len(run.detections.tag) == 3 * len(run.picture_stamps_ns)

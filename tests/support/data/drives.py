@@ -15,7 +15,7 @@ from groundsbot.calib.geometry.se2 import chained
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import TagDetection, TagDetections, WheelEncoders
 from groundsbot.onboard.log.writing.writer import LogWriter

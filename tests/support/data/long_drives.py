@@ -14,7 +14,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
-from groundsbot.offline.measurements.sensor_model.tags import Positions, TagKey
+from groundsbot.offline.measurements.tags import Positions, TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph
 from tests.support.data.drives import FAMILY, START_NS, S, made_robot, made_run

@@ -13,7 +13,7 @@ from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.sensor_model.tags import TagKey
+from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.places import NOWHERE, Places
 from tests.support.data.drives import FAMILY, S
 from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town

@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.sensor_model.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.detection import REFINED_CORNERS
 from groundsbot.onboard.log import TagDetections, TagObservations
 
