@@ -20,7 +20,7 @@ $(READY): requirements.lock pyproject.toml
 
 demo: $(READY)
 	rm -rf $(DEMO)
-	$(BIN)/python -m fixtures demo --output $(DEMO)
+	$(BIN)/python -m groundsbot.fixtures demo --output $(DEMO)
 
 test: $(READY)
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
@@ -47,14 +47,13 @@ pictures: demo
 		--virtual-time-budget=20000 --user-data-dir=build/chromium --screenshot=docs/report.png \
 		file://$(CURDIR)/$(DEMO)/map/report.html
 
+# All of them, then what missed a bound.
+BENCHES := tests.benchmarks $(addprefix tests.benchmarks.speed.,fleet solver_bench solver_scaling stages_bench \
+	corners_bench thinning_bench)
+
 bench: $(READY)
-	$(BIN)/python -m tests.benchmarks
-	$(BIN)/python -m tests.benchmarks.speed.fleet
-	$(BIN)/python -m tests.benchmarks.speed.solver_bench
-	$(BIN)/python -m tests.benchmarks.speed.solver_scaling
-	$(BIN)/python -m tests.benchmarks.speed.stages_bench
-	$(BIN)/python -m tests.benchmarks.speed.corners_bench
-	$(BIN)/python -m tests.benchmarks.speed.thinning_bench
+	@missed=; for each in $(BENCHES); do $(BIN)/python -m $$each || missed="$$missed $$each"; done; \
+	test -z "$$missed" || { echo "missed a bound:$$missed"; exit 1; }
 
 # Writes requirements.lock anew: exact versions and hashes for every platform.
 lock: $(READY)

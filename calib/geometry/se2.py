@@ -77,13 +77,6 @@ def adjoint(T_a_b: ArrayLike) -> FloatArray:
     return _affine(cos, -sin, y, sin, cos, -x)
 
 
-def matrix(T_a_b: ArrayLike) -> FloatArray:
-    """`[..., 3, 3]` homogeneous matrices."""
-    x, y, theta = _parts(T_a_b)
-    cos, sin = np.cos(theta), np.sin(theta)
-    return _affine(cos, -sin, x, sin, cos, y)
-
-
 def right_jacobian(xi: ArrayLike) -> FloatArray:
     """`[..., 3, 3]` with exp(xi + d) = exp(xi) o exp(right_jacobian(xi) d) to first order."""
     x, y, omega = _parts(xi)

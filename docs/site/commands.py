@@ -17,7 +17,7 @@ PROGRAMS = {
     "groundsbot-onboard": onboard,
     "groundsbot-offline": offline,
     "groundsbot-calib": calib,
-    "python -m fixtures": fixtures,
+    "python -m groundsbot.fixtures": fixtures,
 }
 WIDTH = 110
 HEAD = """# Commands

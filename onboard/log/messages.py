@@ -47,7 +47,6 @@ __all__ = [
     "TagObservations",
     "Topic",
     "WheelEncoders",
-    "nanoseconds",
     "timestamp",
 ]
 
@@ -112,8 +111,3 @@ class EventKind(StrEnum):
 def timestamp(stamp_ns: int) -> Timestamp:
     """Foxglove's stamp for one of ours."""
     return Timestamp(seconds=stamp_ns // _NS_PER_S, nanos=stamp_ns % _NS_PER_S)
-
-
-def nanoseconds(stamp: Timestamp) -> int:
-    """Our stamp for one of Foxglove's."""
-    return stamp.seconds * _NS_PER_S + stamp.nanos

@@ -34,7 +34,7 @@ PROGRAMS = {
     "groundsbot-calib": "groundsbot.calib.cli",
     "groundsbot-onboard": "groundsbot.onboard.cli",
     "groundsbot-offline": "groundsbot.offline.cli",
-    "python -m fixtures": "groundsbot.fixtures.__main__",
+    "python -m groundsbot.fixtures": "groundsbot.fixtures.__main__",
 }
 # What is no command of ours is neither run nor parsed.
 NOT_OURS = {

@@ -105,6 +105,7 @@ def test_a_wheel_works_beside_a_project_that_has_a_package_offline(tmp_path: Pat
 
     where = run("-c", "import groundsbot.fixtures as package; print(package.__file__)")
     assert Path(where.strip()).is_relative_to(installed)
+    run("-c", "import pickle; from groundsbot.onboard.log import WheelEncoders; pickle.dumps(WheelEncoders())")
     assert sorted(path.name for path in installed.iterdir() if path.suffix != ".dist-info") == ["bin", "groundsbot"]
     run("-m", "groundsbot.fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render", "--output", "logs")
     assert (project / "logs" / "truth.json").is_file()

@@ -18,15 +18,13 @@ from groundsbot.onboard.log import losses as log_losses
 from groundsbot.onboard.log.losses import LogLosses
 from groundsbot.onboard.log.messages import TOPICS
 from groundsbot.onboard.log.reading import chunks as chunk_reader
-from groundsbot.onboard.log.reading import decoder as message_decoder
+from groundsbot.onboard.log.reading import decoder, record_bytes, summary
 from groundsbot.onboard.log.reading import reader as log_reader
-from groundsbot.onboard.log.reading import record_bytes
-from groundsbot.onboard.log.reading import summary as mcap_summary
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.logs import Entry, drive, head
 
-_READER = (chunk_reader, log_losses, log_reader, mcap_summary, message_decoder, record_bytes)
+_READER = (chunk_reader, log_losses, log_reader, summary, decoder, record_bytes)
 MODULES = [str(module.__file__) for module in _READER]
 LONGEST_BYTES = 6000
 _LIMIT_BYTES = 64 << 20

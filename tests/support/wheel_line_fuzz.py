@@ -5,11 +5,11 @@ from itertools import pairwise
 
 from groundsbot.onboard.process import clock
 from groundsbot.onboard.wheels import intake as wheel_intake
-from groundsbot.onboard.wheels import protocol as encoder_protocol
+from groundsbot.onboard.wheels import protocol
 from groundsbot.onboard.wheels.intake import StampedReading, WheelIntake
 from groundsbot.onboard.wheels.protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
 
-MODULES = [str(module.__file__) for module in (encoder_protocol, wheel_intake, clock)]
+MODULES = [str(module.__file__) for module in (protocol, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))
 _LONGEST_FIELDS = (10, 10, 10, 10, 10, 5)
 _HOST_NS = 1_800_000_000_000_000_000

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam.arrowhead import substitution as arrowhead_substitution
+from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 
@@ -222,9 +222,9 @@ def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, wanted: Int
     solved[np.arange(k), own // 3, own % 3] = 1.0
     values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), k))
     for i in range(k):
-        arrowhead_substitution.solve_leaf(tree, rows, leaf, solved[i])
+        substitution.solve_leaf(tree, rows, leaf, solved[i])
         outside = np.zeros(end - start)
-        arrowhead_substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
+        substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
         values[tree.up[start:end], i] = -outside
     return solved.reshape(k, 3 * n)[:, own].T, values
 

@@ -14,7 +14,7 @@ from scipy import linalg
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.foundation import inner, jitted
-from groundsbot.offline.sam.arrowhead import substitution as arrowhead_substitution
+from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
@@ -101,12 +101,12 @@ def _add_leaf(
                 for axis in range(3):
                     inside[j, axis] = 0.0
             inside[k, i] = 1.0
-            arrowhead_substitution.solve_leaf(tree, rows, leaf, inside)
+            substitution.solve_leaf(tree, rows, leaf, inside)
             for j in range(3):
                 marginals[first + k, i, j] = inside[k, j]
             for a in range(size):
                 outside[i, a] = 0.0
-            arrowhead_substitution.leaf_to_front(tree, system, leaf, inside, outside[i])
+            substitution.leaf_to_front(tree, system, leaf, inside, outside[i])
         _add_square(outside, front, marginals[first + k])
 
 

@@ -12,8 +12,7 @@ import numpy as np
 from scipy import linalg
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam.arrowhead import block_substitution as arrowhead_many
-from groundsbot.offline.sam.arrowhead import substitution as arrowhead_substitution
+from groundsbot.offline.sam.arrowhead import block_substitution, substitution
 from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
 from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
@@ -171,7 +170,7 @@ class Arrowhead:
 
     def product(self, system: System, x: FloatArray) -> FloatArray:
         """H x, in the arrowhead's order."""
-        y = arrowhead_substitution.product(self.tree, system, x)
+        y = substitution.product(self.tree, system, x)
         if self.measured is not None:
             self.measured.add_product(system, x, y)
         return y
@@ -197,11 +196,11 @@ class Factorisation:
         """H^-1 vector (3P + 2T + C,), in the arrowhead's own order."""
         tree = self.arrowhead.tree
         solution = vector.copy()
-        arrowhead_substitution.forward(tree, self.system, self.rows, solution)
+        substitution.forward(tree, self.system, self.rows, solution)
         columns = tree.front[tree.front_start[-2] :]
         if len(columns):
             solution[columns], _ = linalg.lapack.dpotrs(self.top, solution[columns], lower=1)
-        arrowhead_substitution.backward(tree, self.system, self.rows, solution)
+        substitution.backward(tree, self.system, self.rows, solution)
         return solution
 
     def solve(self, vector: FloatArray) -> FloatArray:
@@ -212,13 +211,13 @@ class Factorisation:
         """H^-1 vectors (n, k), in the order of the tangent vector; as `solve`, but quicker for several."""
         tree, k = self.arrowhead.tree, vectors.shape[1]
         solutions = self.arrowhead.in_order(vectors)
-        pieces = arrowhead_many.pieces_of(tree, self.system, self.rows)
+        pieces = block_substitution.pieces_of(tree, self.system, self.rows)
         room = np.empty((3 * len(self.rows.inside), k)), np.empty((self.rows.border.shape[2], k))
-        arrowhead_many.substitute(pieces, solutions, True, *room)
+        block_substitution.substitute(pieces, solutions, True, *room)
         columns = tree.front[tree.front_start[-2] :]
         if len(columns):
             solutions[columns], _ = linalg.lapack.dpotrs(self.top, solutions[columns], lower=1)
-        arrowhead_many.substitute(pieces, solutions, False, *room)
+        block_substitution.substitute(pieces, solutions, False, *room)
         return np.asarray(solutions[self.arrowhead.tangent])
 
     def covariance(self, columns: IntArray) -> FloatArray:

@@ -15,7 +15,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.tags.edges import outward
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.corners import bundle_adjustment as corner_map
+from groundsbot.offline.corners import bundle_adjustment
 from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.corners.edge_directions import facing_as_predicted
 from groundsbot.offline.corners.factors import SpatialState
@@ -164,7 +164,7 @@ def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
         off = replace(problem.corners.looks, corners_px=problem.corners.looks.corners_px + 20.0)
         return replace(found, problem=replace(problem, corners=replace(problem.corners, looks=off)))
 
-    monkeypatch.setattr(corner_map, "solve_corners", {"no end": stopped, "no fit": unfit}[what])
+    monkeypatch.setattr(bundle_adjustment, "solve_corners", {"no end": stopped, "no fit": unfit}[what])
     result = build_map([short], noise=NOISE, corners=True)
     assert result.components[0].model is MapModel.FLOOR
     assert all(tag.pose is None for tag in result.components[0].tags)
@@ -252,8 +252,8 @@ def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
 ) -> None:
     solved = room[2].solved[0]
     assert refine(solved.graph, solved.solution)[0] is not None
-    monkeypatch.setattr(corner_map, "_FREE_FACTOR_BYTES", 1 << 20)
-    monkeypatch.setattr(corner_map, "_FACTOR_BYTES_PER_BYTE", 0)
+    monkeypatch.setattr(bundle_adjustment, "_FREE_FACTOR_BYTES", 1 << 20)
+    monkeypatch.setattr(bundle_adjustment, "_FACTOR_BYTES_PER_BYTE", 0)
     refined, (sentence,) = refine(solved.graph, solved.solution)
     assert refined is None
     assert "limit 1 MiB" in sentence

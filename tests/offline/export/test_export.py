@@ -16,7 +16,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.maps.result import Component
-from groundsbot.onboard.log.messages import TagDetections, WheelEncoders, nanoseconds
+from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.drives import made_robot
 from tests.support.data.exported_map import make_small_map
@@ -199,7 +199,7 @@ def test_the_maps_mcap_runs_on_the_time_line_of_the_logs(folder: Path) -> None:
         messages = [each.message for each in read_log(run.log, topics=["/wheels", "/tags/detections"])]
         wheels = [each.stamp_ns for each in messages if isinstance(each, WheelEncoders)]
         pictures = [each.stamp_ns for each in messages if isinstance(each, TagDetections)]
-        stamps = [nanoseconds(each.timestamp) for each in transforms if each.child_frame_id == f"{run.name}/base"]
+        stamps = [each.timestamp.ToNanoseconds() for each in transforms if each.child_frame_id == f"{run.name}/base"]
         assert stamps[0] == wheels[0]
         assert set(stamps[1:]) <= set(pictures)
 

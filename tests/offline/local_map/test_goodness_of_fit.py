@@ -9,7 +9,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.local_map import goodness_of_fit as goodness
+from groundsbot.offline.local_map import goodness_of_fit
 from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows, in_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
@@ -17,7 +17,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.outliers import local_maps_without_outliers as local_maps
+from groundsbot.offline.outliers import local_maps_without_outliers
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
@@ -75,13 +75,13 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
     tags = [TagKey(FAMILY, i) for i in range(3)]
     (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     rounds = []
-    left_over = goodness._left_over
+    left_over = goodness_of_fit._left_over
 
     def counted(solution: Solution) -> tuple[FloatArray, FloatArray]:
         rounds.append(solution)
         return left_over(solution)
 
-    monkeypatch.setattr(goodness, "_left_over", counted)
+    monkeypatch.setattr(goodness_of_fit, "_left_over", counted)
     windows = fitted_windows(build_graph([chain]).problem)
     assert (windows.factors < 0.1).all()
     assert len(rounds) <= 8
@@ -142,7 +142,7 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     def contradictory(chain: Chain, _: Effort) -> LocalMap:
         return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
 
-    monkeypatch.setattr(local_maps, "solve_local_map", contradictory)
+    monkeypatch.setattr(local_maps_without_outliers, "solve_local_map", contradictory)
     (warning,) = build_map(read_runs([log])).warnings
     assert warning.startswith("carl_one: its readings contradict each other")
     assert "(chi-square 300, expected 40, at most 80)" in warning

@@ -8,7 +8,7 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.localization.online import information_root as online_root
+from groundsbot.offline.localization.online import information_root
 from groundsbot.offline.localization.online.drive import Table
 from groundsbot.offline.localization.online.information_root import OnlineRoot
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
@@ -83,7 +83,7 @@ def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray
 def test_a_root_takes_the_step_of_dense_least_squares(
     online: OnlineLocalizer, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr(online_root, "_MOST_MOTIONS", most)
+    monkeypatch.setattr(information_root, "_MOST_MOTIONS", most)
     calibration = online._smoother.calibration + np.where(online._smoother._numbers.columns >= 0, 1e-3, 0.0)
     root = _root(online, calibration)
     information, gradient, graph, _ = _dense(online, calibration)
@@ -241,7 +241,7 @@ def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None
         before = root.keyframe, root.n_readings
         root.advance(smoother.drive)
         assert root.keyframe - before[0] <= 128
-        assert (root.n_readings - before[1] - 1) * 4 * root.prior.n**2 <= online_root.SLICE
+        assert (root.n_readings - before[1] - 1) * 4 * root.prior.n**2 <= information_root.SLICE
         assert (root.keyframe, root.n_readings) != before
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.offline.maps.mcap import write_mcap
 from groundsbot.offline.maps.result import MapResult, TagPose
-from groundsbot.onboard.log.messages import TOPICS, nanoseconds
+from groundsbot.onboard.log.messages import TOPICS
 from tests.support.data.maps import made_component, made_map
 
 T_BASE_CAMERA = np.array([0.2, 0.05, 0.4, -0.5, 0.5, -0.5, 0.5])
@@ -48,19 +48,19 @@ def test_the_drive_plays_over_the_map_on_the_logs_time_line(tmp_path: Path) -> N
     times = [at for _, _, at, _ in found]
     assert times == sorted(times)
     for _, _, at, message in (each for each in found if each[0] == "/map/tf"):
-        assert {nanoseconds(each.timestamp) for each in message.transforms} == {at}
+        assert {each.timestamp.ToNanoseconds() for each in message.transforms} == {at}
     transforms = [each for message in of_topic(found, "/map/tf") for each in message.transforms]
     for run in (first, second):
         moved = [each for each in transforms if each.child_frame_id == f"{run.name}/base"]
         assert {each.parent_frame_id for each in moved} == {"map"}
-        assert [nanoseconds(each.timestamp) for each in moved] == run.stamps_ns.tolist()
+        assert [each.timestamp.ToNanoseconds() for each in moved] == run.stamps_ns.tolist()
         poses = [[each.translation.x, each.translation.y, heading(each.rotation)] for each in moved]
         np.testing.assert_allclose(poses, run.T_map_base, atol=1e-12)
     (camera,) = (each for each in transforms if each.child_frame_id.endswith("/camera"))
     assert (camera.parent_frame_id, camera.child_frame_id) == ("blue_two/base", "blue_two/camera")
     place, turn = camera.translation, camera.rotation
     assert [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w] == T_BASE_CAMERA.tolist()
-    assert nanoseconds(camera.timestamp) == second.stamps_ns[0]
+    assert camera.timestamp.ToNanoseconds() == second.stamps_ns[0]
 
     still = [(schema, at) for topic, schema, at, _ in found if topic != "/map/tf"]
     assert {at for _, at in still} == {int(first.stamps_ns[0])}

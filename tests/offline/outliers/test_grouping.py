@@ -10,7 +10,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.outliers import grouping as suspects_passings
+from groundsbot.offline.outliers import grouping
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.outliers import split_alone
 from groundsbot.offline.outliers.sightings import sightings_of
@@ -60,7 +60,7 @@ def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
 @pytest.mark.parametrize("most", [20, 8, 1])
 def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, each reading once, and no more than are allowed; what there were is told."""
-    monkeypatch.setattr(suspects_passings, "_MOST_OF_A_TAG", most)
+    monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     whole = sightings_of([laps()])
     few = few_of_each_tag(graph(), whole)
     assert (np.bincount(few.id) <= most).all()
@@ -77,15 +77,15 @@ def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.M
 
 def test_few_tags_leave_room_to_those_that_are_seen_often() -> None:
     counts = np.array([3, 500, 90, 40])
-    assert suspects_passings._most_of_each(counts, 2048) == 128
-    assert suspects_passings._most_of_each(counts, 193) == 75
-    assert np.minimum(counts, suspects_passings._most_of_each(counts, 20)).sum() <= 20
+    assert grouping._most_of_each(counts, 2048) == 128
+    assert grouping._most_of_each(counts, 193) == 75
+    assert np.minimum(counts, grouping._most_of_each(counts, 20)).sum() <= 20
 
 
 @pytest.mark.parametrize("most", [128, 8])
 def test_a_move_is_found_to_the_passing(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gathered or not: two places, of the readings before and after."""
-    monkeypatch.setattr(suspects_passings, "_MOST_OF_A_TAG", most)
+    monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     found = split_alone(solved())
     tags = found.chain.tags
     assert [(tag.tag_id, bool(tag.instance)) for tag in tags] == [

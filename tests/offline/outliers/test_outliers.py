@@ -27,7 +27,7 @@ from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.outliers import Searched, split_together
 from groundsbot.offline.outliers.places import NOWHERE, settled
 from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
-from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
+from groundsbot.offline.sam.arrowhead import covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
@@ -160,7 +160,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
     information = seen.evidence.information
     n = len(seen.evidence.score)
     whole = information.times(np.eye(n))
-    monkeypatch.setattr(arrowhead_covariance, "_FEW", 0)
+    monkeypatch.setattr(covariance, "_FEW", 0)
     scales = noise_scales([each.goodness for each in local_maps()])
     apart = gathered(heard(seen.graph, seen.solution.state, scales), seen.sightings).information
     assert apart.root.below.shape[0] > 0

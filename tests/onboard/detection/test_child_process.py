@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.onboard.detection import child_process as detection_process
+from groundsbot.onboard.detection import child_process
 from groundsbot.onboard.detection.child_process import ChildDetector, DetectionResult, DetectorSettings
 from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.support.devices.live_recording import has_ended, tag_jpeg, until
@@ -70,13 +70,13 @@ def test_a_child_that_starts_too_late_is_ended_and_its_greeting_taken_for_no_ans
     with child_detector(LateSettings(file=tmp_path / "wait")) as child:
         assert len(child.detect(tag_jpeg()).detections) == 1
         (tmp_path / "wait").touch()
-        monkeypatch.setattr(detection_process, "_START_LIMIT_S", 0.05)
+        monkeypatch.setattr(child_process, "_START_LIMIT_S", 0.05)
         os.kill(child._process.pid or 0, signal.SIGKILL)
         told = child.detect(tag_jpeg()).error
         assert told is not None
         assert "did not start within" in told
         assert has_ended(child)
-        monkeypatch.setattr(detection_process, "_START_LIMIT_S", LIMIT_S)
+        monkeypatch.setattr(child_process, "_START_LIMIT_S", LIMIT_S)
         (tmp_path / "wait").unlink()
         assert child.detect(tag_jpeg()).error is not None  # this one finds no child, and starts one
         found = [len(child.detect(picture).detections) for picture in (tag_jpeg(), BLANK, tag_jpeg(), BLANK)]
@@ -104,7 +104,7 @@ def test_an_answer_that_is_none_costs_its_picture_and_not_those_after_it(
     monkeypatch: pytest.MonkeyPatch, child_like_that: Callable[[Connection, DetectorSettings], None]
 ) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr(detection_process, "_child", child_like_that)
+        patched.setattr(child_process, "_child", child_like_that)
         child = ChildDetector(DetectorSettings())
     try:
         result = in_time(lambda: child.detect(tag_jpeg()))
@@ -136,7 +136,7 @@ def test_closing_while_a_child_is_being_started(monkeypatch: pytest.MonkeyPatch)
         may_start.wait()
         start(process)
 
-    monkeypatch.setattr(detection_process, "_END_LIMIT_S", 0.0)
+    monkeypatch.setattr(child_process, "_END_LIMIT_S", 0.0)
     child = ChildDetector(DetectorSettings())
     monkeypatch.setattr(SpawnProcess, "start", held_up)
     os.kill(child._process.pid or 0, signal.SIGKILL)

@@ -12,7 +12,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import TOPICS, nanoseconds
+from groundsbot.onboard.log.messages import TOPICS
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.logs import HEADS, ChunkPlace, Seen, chunks_of, drive, read_all, run_info_of, write_log
 from tests.support.programs import Run
@@ -199,6 +199,6 @@ def test_row_44_every_topic_decodes_with_the_plain_library(large: Path) -> None:
                 assert schema is not None
                 assert schema.name == TOPICS[channel.topic].schema.DESCRIPTOR.full_name
                 if channel.topic not in HEADS:
-                    stamp = decoded.stamp_ns if hasattr(decoded, "stamp_ns") else nanoseconds(decoded.timestamp)
+                    stamp = decoded.stamp_ns if hasattr(decoded, "stamp_ns") else decoded.timestamp.ToNanoseconds()
                     assert stamp == message.publish_time
     assert topics == {*HEADS, "/wheels", "/tags/detections", "/clock", "/events", "/camera/image"}

@@ -10,7 +10,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.robot_yaml import Wheels
 from groundsbot.fixtures.drives.true_motion import Drive
 from groundsbot.fixtures.drives.wheel_controller import Controller, TimedLine
-from groundsbot.fixtures.recording import feed as simulated
+from groundsbot.fixtures.recording import feed
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import Waypoint, World, load_world
 from groundsbot.offline.measurements.run import load_run
@@ -68,7 +68,7 @@ def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run, new_boot: bool
 ) -> None:
     monkeypatch.setattr(ResetController, "new_boot", new_boot)
-    monkeypatch.setattr(simulated, "Controller", ResetController)
+    monkeypatch.setattr(feed, "Controller", ResetController)
     truth = simulate(slow_rounds(), 29, tmp_path / "logs", robots=["a"], render=False)
     (log,) = find_logs([tmp_path / "logs"])
     (told,) = events_of(log, EventKind.WHEEL_RESET)

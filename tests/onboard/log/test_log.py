@@ -24,7 +24,6 @@ from groundsbot.onboard.log.messages import (
     FrameTransform,
     RunInfo,
     WheelEncoders,
-    nanoseconds,
     timestamp,
 )
 from groundsbot.onboard.log.reading.decoder import LogMessage
@@ -131,7 +130,7 @@ def decoded_by_schema(schema: bytes, name: str, data: bytes) -> object:
 def test_stamps_in_the_message_and_around_it_agree(tmp_path: Path) -> None:
     for each in read_log(write_run(tmp_path), ["/wheels", "/camera/image"]):
         message = each.message
-        inside = nanoseconds(message.timestamp) if isinstance(message, CompressedImage) else message.stamp_ns  # type: ignore[attr-defined]  # wheels
+        inside = message.timestamp.ToNanoseconds() if isinstance(message, CompressedImage) else message.stamp_ns  # type: ignore[attr-defined]  # wheels
         assert inside == each.publish_time_ns
 
 

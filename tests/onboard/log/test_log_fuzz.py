@@ -4,7 +4,7 @@ from itertools import islice
 
 import pytest
 
-from groundsbot.onboard.log.reading import chunks as chunk_reader
+from groundsbot.onboard.log.reading import chunks
 from tests.support.guided_fuzz import fuzz
 from tests.support.log_reader_fuzz import LONGEST_BYTES, MODULES, MUTATIONS, check, seeds
 
@@ -21,7 +21,7 @@ def test_the_judge_sees_a_checksum_that_is_not_looked_at(monkeypatch: pytest.Mon
     check(plain)
     changed = plain[:at] + b"R" + plain[at + 1 :]
     check(changed)
-    monkeypatch.setattr(chunk_reader, "zlib", _NoChecksums)
+    monkeypatch.setattr(chunks, "zlib", _NoChecksums)
     with pytest.raises(AssertionError, match="no whole chunk holds"):
         check(changed)
 
