@@ -51,7 +51,7 @@ offline localize INPUTS/nsh/SECOND --map first -o second_in_first
 offline map --extend first/map.json INPUTS/nsh/SECOND -o extended
 offline calibrate INPUTS/room -o calibrated
 offline map INPUTS/room -o given --noise INPUTS/noise.yaml --keep-suspects --distance a_seed0,b_seed0=3,9
-offline map INPUTS/room -o recalibrated --robot calibrated/a.yaml
+offline map INPUTS/room -o recalibrated --robot calibrated/a.yaml --robot calibrated/b.yaml --robot calibrated/c.yaml
 offline import INPUTS/folder -o from_folder --track-width-m 0.3
 offline map from_folder -o folder_map
 offline compare demo --truth INPUTS/demo/logs/truth.json --json
