@@ -31,6 +31,7 @@ class NoiseParameters(BaseModel):
     sigma_range_m: Sigma = 0.05
     sigma_range_per_m: Sigma = 0.03  # adds in quadrature: share of the range
     sigma_bearing_rad: Sigma = math.radians(1.0)
+    sigma_stamp_s: Sigma = 0.01  # of each stamp by itself: what a detector's queue or a slow loop makes of it
 
 
 def read_noise_yaml(path: Path) -> NoiseParameters:

@@ -32,6 +32,9 @@ RELATIVE_TAG_SIZE_SIGMA = 0.005
 # blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a step best which was blurred and then coded; that is
 # within reach of this sigma, and the tags of a drive tell it.
 EDGE_SHIFT_PX_SIGMA = 0.1
+# Who measured a clock, or the distance between wheels, knows more of it.
+LEFT_OPEN_TIME_SIGMA_S = 0.05
+LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
 # x right, y down, z forward of the camera, in forward, left, up.
 R_LEVEL_OPTICAL = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -173,6 +176,8 @@ class Robot(_Section):
     edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
     tags: list[TagBatch] = []
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
+    imported_range_offset_m: Finite = 0.0
+    imported_range_offset_m_sigma: NotNegative = 0.0
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
 
@@ -215,6 +220,15 @@ class Robot(_Section):
             if batch.default_size_m is not None:
                 defaults.add(batch.family)
         return self
+
+    @property
+    def is_left_open(self) -> bool:
+        """Whether the file leaves clock or track open, as nobody does who measured them."""
+        wheels = self.wheels
+        return (
+            self.time_offset_s_sigma > LEFT_OPEN_TIME_SIGMA_S
+            or wheels.track_m_sigma > LEFT_OPEN_TRACK_SIGMA * wheels.track_m
+        )
 
     def tag_size_m(self, family: str, tag_id: int) -> tuple[float, float, str]:
         """A tag's side (the black border's outer edge), its sigma and its batch.

@@ -72,8 +72,9 @@ def map_command(
 ) -> None:
     """Turns the drives in logs into one map of all tags and trajectories, in the frame of the first log's start.
 
-    Exit 3: the runs do not all hang together, so that the map has several components; or a log is damaged, and the map
-    is without what is lost of it. Which of these is printed.
+    Exit 3: the runs do not all hang together, so that the map has several components; a log is damaged, and the map is
+    without what is lost of it; or drives contradict the model, and all sigmas are larger for it. Which of these is
+    printed.
     """
     from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 

@@ -31,7 +31,7 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import advice_sentence, write_picture
+from groundsbot.offline.report import advice_sentence, contradiction_sentence, write_picture
 from groundsbot.offline.self_calibration import OFF, freed_lines, parse_calibrate
 from groundsbot.onboard.log import find_logs
 
@@ -120,13 +120,14 @@ def _read_extended(path: Path, options: MapOptions) -> MapResult:
 
 
 def exit_code(result: MapResult) -> int:
-    """Done, or done in several components or with logs of which something is lost."""
-    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses else EXIT_DONE
+    """Done; or done in several components, of logs with losses, or of drives that contradict the model."""
+    contradicts = any(component.misfit for component in result.components)
+    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or contradicts else EXIT_DONE
 
 
 def summary(result: MapResult, output: Path) -> list[str]:
     """What a person wants to know first."""
-    lines = []
+    lines = _contradiction_lines(result)
     for component in result.components:
         lines += _component_lines(component, several=len(result.components) > 1)
     lines += [_alignment_line(alignment) for alignment in result.alignments]
@@ -146,6 +147,12 @@ def summary(result: MapResult, output: Path) -> list[str]:
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
+
+
+def _contradiction_lines(result: MapResult) -> list[str]:
+    if not any(component.misfit for component in result.components):
+        return []
+    return [contradiction_sentence(map_as_json(result))]
 
 
 def _report_line(output: Path) -> str:

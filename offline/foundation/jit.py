@@ -15,6 +15,8 @@ import numba
 from numba import extending
 from numba.core import event, types
 
+from groundsbot.calib.robot import CAMERA_PARAMETERS
+
 _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
 _COMPILED: Final = re.compile(rb"^ *@(jitted|inner|inlined)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
@@ -120,9 +122,10 @@ def compilation_announced(tell: Callable[[str], None]) -> Iterator[None]:
 def _kernel_hash() -> str:
     """Of all files of the package with compiled functions: numba's cache looks only at the file of the function called.
 
-    How they are compiled, which this file says, counts too.
+    How they are compiled, which this file says, counts too, and so do the calibration parameters, whose number is a
+    constant in them.
     """
-    digest = hashlib.sha256(Path(__file__).read_bytes())
+    digest = hashlib.sha256(Path(__file__).read_bytes() + repr(CAMERA_PARAMETERS).encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         source = path.read_bytes()
         if _COMPILED.search(source):

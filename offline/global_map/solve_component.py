@@ -48,10 +48,13 @@ def solved_component(
 ) -> SolvedComponent:
     """Solves the members of a group together, tags that do not belong apart unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
-    with stages.stage("tags that do not belong"):
-        searched = split_together(graph, solution, [maps[m] for m in members.members])
-        suspects = suspect_tags(searched)
-    graph, solution = searched.graph, searched.solution
+    suspects: list[SuspectTag] = []
+    # Where a drive does not fit whatever its noise, what tags seem to have done is that drive's doing.
+    if not any(maps[m].is_doubtful for m in members.members):
+        with stages.stage("tags that do not belong"):
+            searched = split_together(graph, solution, [maps[m] for m in members.members])
+            suspects = suspect_tags(searched)
+        graph, solution = searched.graph, searched.solution
     if keep_suspects and suspects:
         graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
     solved = SolvedComponent(members, graph, solution, suspects)

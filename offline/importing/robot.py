@@ -22,14 +22,25 @@ class WheelScale:
     tick_flags: tuple[str, ...] = ()  # options of the command line that tell of ticks
 
 
-# Somebody else's CSV seldom says where the camera sat; a robot of this kind holds it within these of its axle's middle.
-UNKNOWN_MOUNT_SIGMA_X_M: Final = 0.2
-UNKNOWN_MOUNT_SIGMA_Y_M: Final = 0.1
-UNKNOWN_MOUNT_SIGMA_YAW_DEG: Final = 2.0
+# What nobody measured of a robot whose recording is imported without its robot.yaml: sigmas wide enough for what the
+# recordings of others show (docs/estimate.md). Its drives tell these numbers.
+UNKNOWN_MOUNT_SIGMA_M: Final = 0.5
+UNKNOWN_MOUNT_SIGMA_YAW_RAD: Final = radians(8.0)
+UNKNOWN_TIME_OFFSET_SIGMA_S: Final = 0.3
+UNKNOWN_RANGE_OFFSET_SIGMA_M: Final = 0.1
+# Who vouches for the metre. Encoders count what wheels of a measured radius roll; a speed of the whole robot may be
+# what was commanded. A range sensor was calibrated by somebody; a detector of tags was told a size, often a wrong one.
+ENCODER_SCALE_SIGMA: Final = 0.01
+SPEED_SCALE_SIGMA: Final = 0.05
+RANGE_SCALE_SIGMA: Final = 0.02
+TOLD_SIZE_SIGMA: Final = 0.15
+UNKNOWN_WHEEL_RATIO_SIGMA: Final = 0.02
+UNKNOWN_TRACK_SIGMA: Final = 0.3  # as a share: wheels skid, and turning speeds were calibrated by somebody or not
 # The log holds metres, so radius and ticks are not used; robot.yaml must name some.
 _NOMINAL_RADIUS_M: Final = 0.1
 _NOMINAL_TICKS_PER_TURN: Final = 1000
-_NOMINAL_TRACK_M: Final = 0.5  # where odometry holds poses, nothing but the look of robot.yaml depends on it
+# Where odometry holds poses or turning speeds, nothing but the look of robot.yaml depends on it.
+NOMINAL_TRACK_M: Final = 0.5
 # Fewer states a second tell no path, more no robot has; and stamps are whole nanoseconds that 63 bits hold.
 _STATE_RATES_HZ: Final = (0.1, 1000.0)
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -96,12 +107,16 @@ class KnownRobot:
         family: of its tags.
         tag_size_m: of them.
         needs_track: whether the distance between the wheels matters.
+        wheel_scale_sigma: how well a metre by its odometry is known, as a share.
+        range_scale_sigma: likewise a metre by its positions of tags.
     """
 
     mount: Mount | None = None
     family: str = "tag36h11"
     tag_size_m: float | None = None
     needs_track: bool = True
+    wheel_scale_sigma: float = ENCODER_SCALE_SIGMA
+    range_scale_sigma: float = RANGE_SCALE_SIGMA
 
 
 def safe_name(recording: Path) -> str:
@@ -146,13 +161,16 @@ def describe_robot(
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
     else:
         data = _bare_robot(recording, options, known)
-        unknown = [] if known.tag_size_m is not None else ["tag size"]
-        unknown += [] if options.wheel_radius_m is not None else ["wheel radii"]
-        told = f"; {' and '.join(unknown)} unknown" if unknown else ""
-        said = f"robot.yaml made from the options{told}"
+        said = (
+            "robot.yaml made from the options; what nobody measured (clock, mount, track, ratio of the wheels, size "
+            "of tags, offset of ranges) is left open, and map finds it"
+        )
     if options.robot_id is not None:
         data["robot_id"] = options.robot_id
-    _apply_wheels(data["wheels"], options)
+    if options.robot is not None:
+        _apply_wheels(data["wheels"], options)
+    else:
+        data["wheels"] |= _given_wheels(options)
     remarks = [said]
     if in_camera:
         remarks.append(_apply_mount(data["mount"], options))
@@ -163,18 +181,25 @@ def describe_robot(
 def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> dict[str, Any]:
     if options.track_width_m is None and known.needs_track:
         raise OfflineError(
-            f"{recording}: the distance between the wheels is not known; give --track-width-m or --robot"
+            f"{recording}: the distance between the wheels is not known; give --track-width-m (about will do, the "
+            "drives tell it) or --robot"
         )
     bare: dict[str, Any] = {
         "robot_id": options.robot_id or safe_name(recording),
         "wheels": {
             "radius_left_m": _NOMINAL_RADIUS_M,
             "radius_right_m": _NOMINAL_RADIUS_M,
-            "track_m": options.track_width_m or _NOMINAL_TRACK_M,
+            "track_m": options.track_width_m or NOMINAL_TRACK_M,
             "ticks_per_turn": _NOMINAL_TICKS_PER_TURN,
+            "radii_scale_sigma": known.wheel_scale_sigma,
+            "radii_ratio_sigma": UNKNOWN_WHEEL_RATIO_SIGMA,
         },
         "mount": known.mount.model_dump() if known.mount is not None else {},
+        "time_offset_s_sigma": UNKNOWN_TIME_OFFSET_SIGMA_S,
+        "imported_range_offset_m_sigma": UNKNOWN_RANGE_OFFSET_SIGMA_M,
+        "imported_tag_scale_sigma": known.range_scale_sigma,
     }
+    bare["wheels"]["track_m_sigma"] = UNKNOWN_TRACK_SIGMA * bare["wheels"]["track_m"]
     if known.tag_size_m is not None:
         bare["tags"] = [{"family": known.family, "default_size_m": known.tag_size_m}]
         bare["recorder"] = {"families": [known.family]}
@@ -202,9 +227,14 @@ def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
     yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
     assumed = []
     for field, given, sigma, said in (
-        ("x_m", options.camera_x_m, UNKNOWN_MOUNT_SIGMA_X_M, f"x (sigma {UNKNOWN_MOUNT_SIGMA_X_M:g} m)"),
-        ("y_m", options.camera_y_m, UNKNOWN_MOUNT_SIGMA_Y_M, f"y (sigma {UNKNOWN_MOUNT_SIGMA_Y_M:g} m)"),
-        ("yaw_rad", yaw_rad, radians(UNKNOWN_MOUNT_SIGMA_YAW_DEG), f"yaw (sigma {UNKNOWN_MOUNT_SIGMA_YAW_DEG:g} deg)"),
+        ("x_m", options.camera_x_m, UNKNOWN_MOUNT_SIGMA_M, f"x (sigma {UNKNOWN_MOUNT_SIGMA_M:g} m)"),
+        ("y_m", options.camera_y_m, UNKNOWN_MOUNT_SIGMA_M, f"y (sigma {UNKNOWN_MOUNT_SIGMA_M:g} m)"),
+        (
+            "yaw_rad",
+            yaw_rad,
+            UNKNOWN_MOUNT_SIGMA_YAW_RAD,
+            f"yaw (sigma {degrees(UNKNOWN_MOUNT_SIGMA_YAW_RAD):g} deg)",
+        ),
     ):
         if given is not None:
             mount[field] = given

@@ -8,21 +8,19 @@ from .archive import (
     tags_of,
     tape_of,
 )
-from .correlated_errors import SharedErrors, fit_shared_errors
 from .goodness_of_fit import FALSE_ALARM, WINDOW_M, Goodness, fitted_windows, freedom_of
-from .local_map import LocalMap, solve_local_map
+from .local_map import LocalMap, judged, solve_local_map
 
 __all__ = [
     "FALSE_ALARM",
     "WINDOW_M",
     "Goodness",
     "LocalMap",
-    "SharedErrors",
     "check_can_be_extended",
     "check_sizes_in_map",
-    "fit_shared_errors",
     "fitted_windows",
     "freedom_of",
+    "judged",
     "kept_of",
     "local_map_of",
     "measured_chain",

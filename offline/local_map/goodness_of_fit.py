@@ -141,6 +141,8 @@ def fitted_windows(
     effort: Effort | None = None,
     share: float = 1.0,
     least_shared: FloatArray | float = 0.0,
+    *,
+    least_factor: float = 0.0,
 ) -> Windows:
     """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
 
@@ -154,6 +156,8 @@ def fitted_windows(
         share: of it.
         least_shared: (M, 2) variance that a reading shares with its neighbours at least, as a multiple of the told one,
             by component.
+        least_factor: the noise is taken to be so many times as large as told at least. Where errors last, windows show
+            too little of them: what was fitted to whole drives is then the least.
     """
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
@@ -169,7 +173,7 @@ def fitted_windows(
         squares, redundancy = _left_over(solution)
         squares = squares * factors**2
         believed = (squares + _TOLD) / (redundancy + _TOLD)
-        found = np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD))
+        found = np.maximum(np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD)), least_factor)
         # Wheels and readings share out what is left over: one that turns back had gone too far, and half is taken.
         turns_back = (found / factors - 1.0) * (factors / last - 1.0) < 0.0
         last, factors = factors, np.where(turns_back, np.sqrt(found * factors), found)

@@ -22,6 +22,7 @@ from groundsbot.offline.measurements import (
     TagKey,
     coarse_keyframes,
     coarsened,
+    confirmed,
     least_shared,
     refined,
     telling_keyframes,
@@ -42,6 +43,17 @@ _MOST_TRIES_A_PIECE: Final = 60
 _BUILDING_SHARE: Final = 0.5
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.1  # it is solved some times
+# Where windows show that the noise is far larger than told, other starts end with the first that does not lower the
+# cost by this share: it is noise that is left.
+_MOST_IN_VAIN: Final = 1
+_LEAST_GAIN: Final = 0.01
+# Building up allows for the noise that windows show where it is so many times as large as told. Where it is not much
+# more, that would leave room for wrong places.
+_FAR_LARGER: Final = 1.5
+# Keyframes that the test of goodness looks at, spread over the drive where there are more.
+_MOST_CHECKED: Final = 2500
+_LEAST_SHARE: Final = 0.25
+_NEXT_SHARE: Final = 1.4
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,7 @@ class LocalMap:
     graph: Graph
     solution: Solution
     goodness: Goodness
+    is_doubtful: bool = False  # it does not fit even under the noise that was fitted to it: no tag of it is named
 
     @property
     def T_start_base(self) -> FloatArray:
@@ -68,6 +81,15 @@ class LocalMap:
         """What the chain says of the calibration."""
         return self.graph.calibration_of(self.solution.state)
 
+    @property
+    def is_noisy(self) -> bool:
+        """Whether nobody measured the robot and its windows show far more noise than was told.
+
+        Then the noise comes first, and what does not fit in afterwards.
+        """
+        factors = self.goodness.odometry_factor, self.goodness.reading_factor
+        return self.chain.run.robot.is_left_open and max(factors) > _FAR_LARGER
+
     def without_factors(self) -> "LocalMap":
         """The same, less the factorisation that its solution keeps for whoever asks again: it may be most of a map."""
         return replace(self, solution=replace(self.solution))
@@ -82,7 +104,7 @@ class _BuiltUp(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
+def solve_local_map(chain: Chain, effort: Effort | None = None, other_starts: int | None = None) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
@@ -91,6 +113,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     Args:
         chain: what was measured.
         effort: what the stretch is worth; the whole log's where None.
+        other_starts: how many may be tried; eight where None.
 
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
@@ -99,53 +122,82 @@ def solve_local_map(chain: Chain, effort: Effort | None = None) -> LocalMap:
     graph = build_graph([chain])
     effort.check(graph.problem, chain.run.log, chain.name)
     keyframes = coarse_keyframes(chain)
-    coarse = coarsened(chain, keyframes)
-    known = _built_up(coarse, effort)
     check = _Check(graph, effort)
+    coarse = coarsened(confirmed(chain) if chain.run.robot.is_left_open else chain, keyframes)
+    far_larger = chain.run.robot.is_left_open and max(check.noise_factors) > _FAR_LARGER
+    known = _built_up(_as_shown(coarse, check.noise_factors) if far_larger else coarse, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
-    for _ in range(1 + _OTHER_STARTS):
+    n_in_vain = 0
+    for _ in range(1 + (_OTHER_STARTS if other_starts is None else other_starts)):
         poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
-        if best is None or solution.cost < best.solution.cost:
+        n_in_vain += 1
+        if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
             best = LocalMap(chain, graph, solution, check.judge(solution))
+            n_in_vain = 0
             if best.goodness.fits:
                 break
-        if effort.left < _BUILDING_SHARE * effort.allowed:
+        if effort.left < _BUILDING_SHARE * effort.allowed or (far_larger and n_in_vain >= _MOST_IN_VAIN):
             break
-        known = _built_up(_redrawn(_as_shown(coarse, best.goodness), rng), effort)
+        known = _built_up(_redrawn(_as_shown(coarse, check.noise_factors), rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
     return best
 
 
+def judged(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
+    """The map with its test of goodness of fit made again, under the noise that was fitted to whole drives."""
+    chain = local_map.chain
+    effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    check = _Check(local_map.graph, effort, least_factor=1.0)
+    found = replace(local_map, goodness=check.judge(local_map.solution))
+    local_map.graph.problem.arrowhead.without_scratch()
+    return found
+
+
 class _Check:
     """Whether solutions of a chain fit together; without most of the poses that read no tag and have little to say."""
 
-    def __init__(self, graph: Graph, effort: Effort) -> None:
+    def __init__(self, graph: Graph, effort: Effort, least_factor: float = 0.0) -> None:
         (chain,) = graph.chains
         self._keyframes = telling_keyframes(chain)
+        share = _LEAST_SHARE
+        while len(self._keyframes) > _MOST_CHECKED:
+            self._keyframes = coarse_keyframes(chain, share)
+            share *= _NEXT_SHARE
         if len(self._keyframes) < len(chain.stamps_ns):
             chain = coarsened(chain, self._keyframes)
             graph = build_graph([chain])
         self._windows: Windows = fitted_windows(
-            graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least_shared(chain.readings)
+            graph.problem,
+            effort=effort,
+            share=_WINDOWS_SHARE,
+            least_shared=least_shared(chain.readings),
+            least_factor=least_factor,
         )
+
+    @property
+    def noise_factors(self) -> tuple[float, float]:
+        """The noise of wheels and of readings as a multiple of what was told."""
+        wheels, readings = self._windows.factors.tolist()
+        return wheels, readings
 
     def judge(self, solution: Solution) -> Goodness:
         state = solution.state
         return self._windows.judge(replace(state, poses=state.poses[self._keyframes]))
 
 
-def _as_shown(chain: Chain, goodness: Goodness) -> Chain:
+def _as_shown(chain: Chain, factors: tuple[float, float]) -> Chain:
     """The chain under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
+    of_wheels, of_readings = factors
     return replace(
         chain,
-        odometry=replace(chain.odometry, covariance=goodness.odometry_factor**2 * chain.odometry.covariance),
-        readings=chain.readings.spread(np.full((len(chain.readings), 2), goodness.reading_factor)),
+        odometry=replace(chain.odometry, covariance=of_wheels**2 * chain.odometry.covariance),
+        readings=chain.readings.spread(np.full((len(chain.readings), 2), of_readings)),
     )
 
 

@@ -23,7 +23,7 @@ from groundsbot.offline.localization.solve_in_map import HeldRun, solve_held
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import Run, chains_of
 from groundsbot.offline.noise import weighed_as
-from groundsbot.offline.outliers import local_maps_of, told_apart
+from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, told_apart
 
 _MAP = "the map"
 
@@ -58,8 +58,9 @@ def localize(
     chains = [told_apart(chain) for chain in chains_of(run, noise or known.noise)]
     if not any(chain.tags for chain in chains):
         raise OfflineError(f"{run.log}: {run.name} saw no tag, so nothing tells where in {folder} it drove")
-    maps, broken = local_maps_of(chains, stages)
+    maps, noisy, broken = local_maps_of(chains, stages)
     maps = weighed_as(maps, noise or known.noise, known.noise_fit if noise is None else None)
+    maps = judged_under_own_noise(maps, noisy, stages)
     found = localize_maps(maps, known, folder, component=component, stages=stages)
     told = [*run.warnings, *broken, *(warning for each in maps for warning in each.chain.warnings), *found.warnings]
     losses = (f"{run.name}: located without what is lost of {run.log}: {run.lost}",) if run.lost else ()

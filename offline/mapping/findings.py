@@ -1,10 +1,9 @@
 """What the components of a map say, gathered for the result."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from groundsbot.offline.advice import advise
-from groundsbot.offline.alignment import Group
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map import (
     SolvedComponent,
@@ -14,9 +13,13 @@ from groundsbot.offline.global_map import (
     joined_goodness,
     judged,
     metre_of,
+    misfit_of,
+    noise_freedom,
+    scatter_of_passes,
+    scatter_warnings,
     weak_parts,
 )
-from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.local_map import Goodness, LocalMap
 from groundsbot.offline.mapping.workings import Solved
 from groundsbot.offline.maps import (
     AdviceResult,
@@ -26,6 +29,7 @@ from groundsbot.offline.maps import (
     MeasurementResult,
     MetreResult,
     SuspectTag,
+    widened,
 )
 from groundsbot.offline.measurements import Measurements
 from groundsbot.offline.sam import Solution
@@ -52,30 +56,47 @@ class Found:
         members, graph, solution, suspects, refined, told = solved
         self.suspects += suspects
         self.warnings += [f"component {index}: {sentence}" for sentence in told]
+        own_maps = [maps[m] for m in members.members]
+        with stages.stage("checking that it fits"):
+            together = _joined(own_maps, solution)
+            misfit = misfit_of(own_maps, graph, solution, together)
+            factor = 1.0 if misfit is None else misfit.variance_factor
+            scatter = scatter_of_passes(graph, solution, factor, noise_freedom(own_maps))
         with stages.stage("covariances"):
-            self.components.append(component_of(graph, solution, refined))
+            self.components.append(widened(component_of(graph, solution, refined), misfit, scatter))
             last = refined.solution if refined else solution
-            self.calibration += calibration_of(refined.parameters if refined else graph.parameters, last, index)
+            numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)
+            self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
             self.measured += judged(graph, last, measurements, index)
-            self.checks += checks_of(graph, solution, index)
+            self.checks += [replace(each, sigma=factor**0.5 * each.sigma) for each in checks_of(graph, solution, index)]
             self.metres.append(metre_of(graph, index))
         is_refined, poses = refined is not None, last.state.poses
         del solved, refined, last  # the factor on corners, which nothing below asks
         if not is_refined:  # else the map's sigmas are not those that advice is foretold from
             with stages.stage("advice"):
-                self.advice += advise(graph, solution, index)
+                self.advice += [_widened(each, factor**0.5) for each in advise(graph, solution, index)]
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
             )
-        with stages.stage("checking that it fits"):
-            self.warnings += weak_parts(graph, solution) + _contradictions(maps, members, index, solution)
+        self.warnings += weak_parts(graph, solution) + _contradictions(own_maps, index, together)
+        self.warnings += scatter_warnings(graph, scatter)
         return Solved(members, graph, solution, poses)
 
 
-def _contradictions(maps: Sequence[LocalMap], members: Group, component: int, solution: Solution) -> list[str]:
-    """Runs that do not fit together in themselves, and a component that does not though its runs do."""
-    found = [w for m in members.members for w in maps[m].goodness.warnings(maps[m].chain.name)]
-    if found or len(members.members) == 1:
-        return found
-    return joined_goodness([maps[m] for m in members.members], solution).warnings(f"component {component}")
+def _joined(maps: Sequence[LocalMap], solution: Solution) -> Goodness | None:
+    """Whether several drives fit together that do so each by itself; None where there are none."""
+    if len(maps) == 1 or not all(each.goodness.fits for each in maps):
+        return None
+    return joined_goodness(maps, solution)
+
+
+def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness | None) -> list[str]:
+    """Drives that do not fit together in themselves, and a component that does not though its drives do."""
+    found = [w for each in maps for w in each.goodness.warnings(each.chain.name)]
+    return found if together is None else found + together.warnings(f"component {component}")
+
+
+def _widened(advice: AdviceResult, sigma_factor: float) -> AdviceResult:
+    """What it tells of sigmas, in those that are reported."""
+    return replace(advice, sigma_m=sigma_factor * advice.sigma_m, sigma_then_m=sigma_factor * advice.sigma_then_m)

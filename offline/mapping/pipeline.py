@@ -33,8 +33,14 @@ from groundsbot.offline.measurements import (
     parse_measurements,
 )
 from groundsbot.offline.noise import fit_and_weigh, weighed_as
-from groundsbot.offline.outliers import local_maps_of, told_apart, with_outliers_apart
-from groundsbot.offline.self_calibration import TIMES_MAPPED, Calibrate, about_the_files, free_what_is_told
+from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, told_apart, with_outliers_apart
+from groundsbot.offline.self_calibration import (
+    TIMES_MAPPED,
+    Calibrate,
+    about_the_files,
+    free_what_is_told,
+    with_start_values,
+)
 
 
 def build_map(
@@ -82,10 +88,11 @@ def build_map(
     runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
     measurements = _measurements(tape, runs, chains, extending)
     known = _known_maps(extending, stages)
-    maps, broken = local_maps_of(chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
+    maps, noisy, broken = local_maps_of(chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
+        maps = judged_under_own_noise(maps, noisy, stages)
     else:
         maps = known + weighed_as(maps, noise, noise_fit)
     kept = tuple(kept_of(each) for each in maps)
@@ -124,12 +131,16 @@ def _calibrated(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
 ) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...]]:
     """The runs as their robots are to be taken, their stretches, and what self-calibration freed."""
+    with stages.stage("start values of robots"):
+        runs, started, _ = with_start_values(runs, noise)
     chains = _chains(runs, noise, stages)
     if not calibrate.is_on:
-        return runs, chains, ()
+        return runs, chains, started
     with stages.stage("self-calibration"):
         freed, choices = free_what_is_told(runs, chains, noise, calibrate.names, corners=corners)
-    return freed, _chains(freed, noise, stages) if any(each.is_freed for each in choices) else chains, choices
+    if any(each.is_freed for each in choices):
+        chains = _chains(freed, noise, stages)
+    return freed, chains, (*started, *choices)
 
 
 def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:

@@ -1,6 +1,6 @@
 from .archive import KeptCalibration, KeptChain, nominal_row
 from .files import JSON_FILE, read_map, write_map
-from .fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from .fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
 from .json_document import advice_as_json, map_as_json
 from .mcap import MAP_FILE, write_mcap
 from .model import MapModel
@@ -27,6 +27,7 @@ from .result import (
 )
 from .tags_table import tags_csv
 from .tum import write_tum
+from .widening import TagScatter, widened
 
 __all__ = [
     "JSON_FILE",
@@ -49,17 +50,20 @@ __all__ = [
     "MapResult",
     "MeasurementResult",
     "MetreResult",
+    "Misfit",
     "RivalResult",
     "RunResult",
     "StartToStart",
     "SuspectTag",
     "TagPose",
     "TagResult",
+    "TagScatter",
     "advice_as_json",
     "map_as_json",
     "nominal_row",
     "read_map",
     "tags_csv",
+    "widened",
     "write_map",
     "write_mcap",
     "write_tum",

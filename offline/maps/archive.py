@@ -51,7 +51,7 @@ class KeptChain:
             (K-1, 3, 3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
         tag_families, tag_ids, tag_instances: (T,) what was read; an instance where the run alone told places apart.
         reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance:
-            (M, 2, 2); reading_by_camera: (M, 2, 4) derivative by `readings.CAMERA_PARAMETERS`.
+            (M, 2, 2); reading_by_camera: (M, 2, 5) derivative by `readings.CAMERA_PARAMETERS`.
         reading_polar, reading_in_camera: (M,) its form, and whether about the camera or about base.
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the chain's start; tags_m: (T, 2) there; calibration: of its graph.

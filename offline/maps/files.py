@@ -28,6 +28,7 @@ from groundsbot.offline.maps.json_document import (
     floor_from,
     map_as_json,
     measurement_from,
+    misfit_from,
     noise_fit_from,
     noise_from,
     number_from,
@@ -133,6 +134,7 @@ def _arrays(result: MapResult) -> dict[str, Any]:
             f"{key}tag_instances": np.array([tag.instance for tag in tags], dtype=np.str_),
             f"{key}tag_positions_m": np.array([tag.position_m for tag in tags]).reshape(-1, 2),
             f"{key}joint_covariance": component.joint_covariance,
+            f"{key}sigma_factor": np.float64(component.sigma_factor),
         }
         if component.edges is not None:
             arrays |= {f"{key}edges_{name}": value for name, value in vars(component.edges).items()}
@@ -184,6 +186,8 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         model=MapModel(entry.get("model", MapModel.FLOOR)),
         calibration=calibration_from(arrays, f"{key}calibration_"),
         floor=floor_from(entry.get("floor")),
+        sigma_factor=float(arrays[f"{key}sigma_factor"]) if f"{key}sigma_factor" in arrays else 1.0,
+        misfit=misfit_from(entry.get("misfit")),
     )
 
 

@@ -32,6 +32,28 @@ class AlignmentResult:
 
 
 @dataclass(frozen=True)
+class Misfit:
+    """What of a component the model does not explain.
+
+    Attributes:
+        kind: joins (drives do not share tags and calibration as they should) or windows (parts of drives do not join).
+        run: what fits worst.
+        chi_square: in squared sigmas of the noise that the map was made with.
+        expected: how much of it chance explains.
+    """
+
+    kind: str
+    run: str
+    chi_square: float
+    expected: int
+
+    @property
+    def variance_factor(self) -> float:
+        """By how many times covariances must grow to cover it, 1 at least."""
+        return max(1.0, self.chi_square / self.expected)
+
+
+@dataclass(frozen=True)
 class SuspectTag:
     """A tag that does not belong.
 

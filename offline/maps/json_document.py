@@ -11,7 +11,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, RivalResult, SuspectTag
+from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
 from groundsbot.offline.maps.parameter_results import CheckResult, FittedNoise, FittedParameter
 from groundsbot.offline.maps.result import (
     AdviceResult,
@@ -70,6 +70,8 @@ def _component_json(component: Component) -> dict[str, Any]:
         "cost": _plain(component.cost),
         "n_residuals": component.n_residuals,
         "floor": _floor_json(component.floor) or None,
+        "sigma_factor": _plain(component.sigma_factor),
+        "misfit": None if component.misfit is None else _plain(asdict(component.misfit)),
     }
 
 
@@ -86,6 +88,11 @@ def noise_from(entry: dict[str, Any]) -> NoiseParameters:
 def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
     """Of `floor` of a component."""
     return None if entry is None else FloorSigmas(**entry)
+
+
+def misfit_from(entry: dict[str, Any] | None) -> Misfit | None:
+    """Of `misfit` of a component; maps of older programs have none."""
+    return None if entry is None else Misfit(**entry)
 
 
 def _run_json(run: RunResult, component: int) -> dict[str, Any]:
@@ -114,6 +121,7 @@ def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
         "quaternion_xyzw": None if tag.pose is None else _plain(tag.pose.quaternion_xyzw),
         "covariance": _plain(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
         "pose_covariance": None if tag.pose is None else _plain(tag.pose.covariance),
+        "sigma_factor": _plain(tag.sigma_factor),
         "n_observations": tag.n_observations,
         "runs": list(tag.runs),
         "component": component,
@@ -184,6 +192,7 @@ def tag_from(entry: dict[str, Any]) -> TagResult:
         n_observations=entry["n_observations"],
         runs=tuple(entry["runs"]),
         pose=_tag_pose(entry),
+        sigma_factor=entry.get("sigma_factor", 1.0),
     )
 
 
@@ -234,6 +243,8 @@ def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:
         parameters,
         shared_range=number_from(entry["shared_range"]),
         shared_bearing=number_from(entry["shared_bearing"]),
+        pass_range=number_from(entry["pass_range"]),
+        pass_bearing=number_from(entry["pass_bearing"]),
         runs=tuple(entry["runs"]),
         contradicting=tuple(entry["contradicting"]),
     )

@@ -101,7 +101,11 @@ class FittedNoise:
     """Where the noise comes from when nobody gave it."""
 
     parameters: tuple[FittedParameter, ...]
-    shared_range: float  # variance that readings of a tag within 2.5 m of the way share, as a multiple of their own
+    # Variances of errors that readings of a tag share, as multiples of what the default noise gives: within 2.5 m of
+    # the way, and within a pass.
+    shared_range: float
     shared_bearing: float
+    pass_range: float
+    pass_bearing: float
     runs: tuple[str, ...]  # names of those that it was fitted to
     contradicting: tuple[str, ...]  # of those that contradict themselves: under the prior, or this where it is larger

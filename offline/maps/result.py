@@ -11,7 +11,7 @@ from pathlib import Path
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.maps.archive import KeptCalibration, KeptChain
-from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, SuspectTag
+from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, SuspectTag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
     CalibrationChoice,
@@ -79,6 +79,8 @@ class TagResult:
     n_observations: int
     runs: tuple[str, ...]  # names of the runs that saw it
     pose: TagPose | None = None  # None where it is known on the floor only
+    # By how many times its passes scatter more than chance explains, in sigmas; 1 where it does. The covariance has it.
+    sigma_factor: float = 1.0
 
     @property
     def label(self) -> str:
@@ -165,6 +167,9 @@ class Component:
     model: MapModel = MapModel.FLOOR
     calibration: KeptCalibration | None = None  # with its covariance, and that with the tags
     floor: FloorSigmas | None = None  # None where nobody looked at corners
+    # By how many times all sigmas of the component are larger than computed; 1 where the model explains the drives.
+    sigma_factor: float = 1.0
+    misfit: Misfit | None = None  # what it does not explain
 
     @property
     def tag_covariance(self) -> FloatArray:

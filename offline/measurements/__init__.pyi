@@ -4,21 +4,25 @@ from .covariance_components import CovarianceParts
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, ChainOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.stretches import wheel_distances
+from .passes import FEW_READINGS, GAP_M, cells_of, confirmed, passes_of
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
 from .sensor_model.readings import Readings
-from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M
+from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M, STAMP_NOISE, read_detections, read_positions
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
 
 __all__ = [
+    "FEW_READINGS",
+    "GAP_M",
     "GAP_NS",
     "MAX_RANGE_M",
     "ODOMETRY_NOISE",
     "REACH_M",
     "SAME_SIZE_M",
+    "STAMP_NOISE",
     "UNIT_CORNERS",
     "UNMODELLED_SIGMA_M",
     "Chain",
@@ -36,14 +40,19 @@ __all__ = [
     "RunEvent",
     "TagKey",
     "TapeOptions",
+    "cells_of",
     "chains_of",
     "coarse_keyframes",
     "coarsened",
+    "confirmed",
     "growth",
     "least_shared",
     "least_shared_by_corners",
     "load_run",
     "parse_measurements",
+    "passes_of",
+    "read_detections",
+    "read_positions",
     "read_robot_file",
     "refined",
     "telling_keyframes",

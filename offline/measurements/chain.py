@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.measurements.keyframes import (
     candidate_stamps,
@@ -16,7 +16,7 @@ from groundsbot.offline.measurements.motion_model.motion_model import ChainOdome
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, joined
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections, read_positions
-from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.tags import TagKey
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,14 @@ class Chain:
             readings=replace(readings, tag=tag, keyframe=readings.keyframe - first),
         )
 
+    def with_readings(self, which: BoolArray) -> "Chain":
+        """The same chain with some of its readings, (M,), and their tags only."""
+        if which.all():
+            return self
+        readings = self.readings.where(which)
+        seen, tag = np.unique(readings.tag, return_inverse=True)
+        return replace(self, tags=tuple(self.tags[i] for i in seen), readings=replace(readings, tag=tag))
+
     def weighed(self, noise: NoiseParameters) -> "Chain":
         """The same measurements under other noise."""
         return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
@@ -118,23 +126,12 @@ def _readings(
     kept = keyframe >= 0
     from_corners, warnings = read_detections(
         run,
-        Detections(detections.stamps_ns[kept], detections.tag[kept], detections.corners_px[kept]),
+        detections.where(kept),
         keyframe[kept],
         twist,
         noise,
     )
     keyframe = keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
-    imported, more_warnings = read_positions(
-        Positions(
-            positions.stamps_ns[kept],
-            positions.tag[kept],
-            positions.value[kept],
-            positions.polar[kept],
-            positions.covariance[kept],
-            positions.in_camera[kept],
-        ),
-        keyframe[kept],
-        noise,
-    )
+    imported, more_warnings = read_positions(run.robot, positions.where(kept), keyframe[kept], twist, noise)
     return joined(from_corners, imported), warnings + more_warnings

@@ -19,14 +19,14 @@ _TURN_RADIUS_M: Final = 0.5
 _COMPOSED_M: Final = 0.5
 
 
-def coarse_keyframes(chain: Chain) -> IntArray:
-    """(k,) the first and the last keyframe of a chain and some in between, rising."""
+def coarse_keyframes(chain: Chain, share: float = 1.0) -> IntArray:
+    """(k,) the first and the last keyframe of a chain and some in between, rising; at this share of the spacings."""
     n_keyframes = len(chain.stamps_ns)
     along_m = _along_m(chain)
     reads = np.bincount(chain.readings.keyframe, minlength=n_keyframes) > 0
     chosen, last_m = [0], 0.0
     for keyframe, (here_m, has_readings) in enumerate(zip(along_m.tolist(), reads.tolist(), strict=True)):
-        if here_m - last_m >= (_READING_SPACING_M if has_readings else _EMPTY_SPACING_M):
+        if here_m - last_m >= share * (_READING_SPACING_M if has_readings else _EMPTY_SPACING_M):
             chosen.append(keyframe)
             last_m = here_m
     if chosen[-1] != n_keyframes - 1:

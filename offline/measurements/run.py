@@ -78,6 +78,16 @@ class Run:
     corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
 
+    def retimed(self, late_s: float) -> "Run":
+        """The run with the stamps of pictures and imported positions taken back by so many seconds."""
+        late_ns = round(late_s * 1e9)
+        return replace(
+            self,
+            picture_stamps_ns=self.picture_stamps_ns - late_ns,
+            detections=replace(self.detections, stamps_ns=self.detections.stamps_ns - late_ns),
+            positions=replace(self.positions, stamps_ns=self.positions.stamps_ns - late_ns),
+        )
+
 
 _MOST_EVENTS = 500  # a recorder gathers what happens often into one event
 
@@ -178,7 +188,6 @@ def load_run(
     warnings += _not_used(collected, read.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
-    late_ns = round(robot.time_offset_s * 1e9)  # by which the camera's stamps are ahead of the wheels'
     return Run(
         name=name,
         robot_id=info.robot_id,
@@ -187,11 +196,10 @@ def load_run(
         robot=robot,
         camera=camera,
         stretches=tuple(stretches),
-        picture_stamps_ns=read.pictures_ns - late_ns,
+        picture_stamps_ns=read.pictures_ns,
         tags=read.tags,
         detections=replace(
             read.detections,
-            stamps_ns=read.detections.stamps_ns - late_ns,
             corners_px=moved_out(read.detections.corners_px, -robot.edge_shift_px),
         ),
         positions=read.positions,
@@ -201,7 +209,7 @@ def load_run(
         lost=losses.in_words,
         corners_refined=read.corners_refined,
         events=tuple(sorted(collected.events)),
-    )
+    ).retimed(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
 
 
 def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:

@@ -7,19 +7,22 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
-from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.robot import NoiseParameters
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import Chain, CovarianceParts
+from groundsbot.offline.measurements import STAMP_NOISE, Chain, CovarianceParts, coarse_keyframes, coarsened
 from groundsbot.offline.noise.likelihood import Components, Part
+from groundsbot.offline.noise.shared_errors import shared_levels, shared_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
-from groundsbot.offline.sam import Solution, build_graph
+from groundsbot.offline.sam import build_graph
 
-# What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals.
+# What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals. Keyframes are
+# spread over the whole of long runs, since what readings share shows where tags are met again.
 _MAX_KEYFRAMES: Final = 6_000
+_LEAST_SHARE: Final = 0.25  # of the spacings of `coarse_keyframes`
+_NEXT_SHARE: Final = 1.4
 _QUANTILE: Final = float(ndtri(0.995))
-# No wheel and no detector is so many times better or worse than the defaults: smaller residuals are made up, and larger
-# ones are no noise.
+# No wheel and no detector is so many times better than the defaults: smaller residuals are made up.
 PLAUSIBLE: Final = 20.0
 _LEAST: Final = (1.0 + 1e-6) / PLAUSIBLE  # where the search stops, with its rounding
 
@@ -44,79 +47,52 @@ class FittedSigma:
 
 
 @dataclass(frozen=True)
-class FittedPart:
-    """The beginning of a chain, or all of it, and its solution."""
-
-    chain: Chain
-    solution: Solution
-    is_whole: bool
-
-
-@dataclass(frozen=True)
 class NoiseFit:
     """All noise parameters.
 
     Attributes:
         noise: fitted.
         sigmas: those that some measurement depends on.
-        parts: of each map what was looked at, as solved under the fitted noise; none where nothing was fitted.
+        shared: (2, 2) variances of errors that the readings of a tag share within a cell (row 0) and within a pass
+            (row 1), in range and bearing, as multiples of the variance that the default noise gives them.
+        n_groups: (2, 2) of how many cells and passes tell of them.
     """
 
     noise: NoiseParameters
     sigmas: tuple[FittedSigma, ...]
-    parts: tuple[FittedPart, ...] = ()
+    shared: FloatArray
+    n_groups: FloatArray
 
 
 def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
-    """Fits the noise of all runs at once.
+    """Fits the noise of all runs at once, whatever it comes out at.
 
     What the drives tell too little of stays where it began, or where they are more content with if that is more; what
-    comes out smaller than any robot's stays, and the others are fitted without it; all stay if the fit finds no end, or
-    one comes out larger than any noise.
+    comes out smaller than any robot's stays, and the others are fitted without it.
 
     Args:
         maps: solved under any noise.
         noise: where to begin, and what stays where the drives say nothing.
     """
+    maps = sorted(maps, key=lambda each: each.chain.name)  # sums are rounded alike whatever the order of the logs
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
         fitted = _fitted(maps, noise, free)
         found = _sigmas(free, fitted)
-        why = _no_noise(found) if fitted.converged else "the fit came to no end"
-        if why:
-            kept |= {each.name: replace(each, value=getattr(noise, each.name), kept=why) for each in found}
-            break
         small = {each.name: _left(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept}
         if not small:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
-            parts = tuple(
-                FittedPart(chain, solution, chain is each.chain)
-                for each, chain, solution in zip(maps, _beginnings(maps), fitted.solutions, strict=True)
-            )
-            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept), parts)
+            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept), fitted.shared, fitted.n_groups)
         kept |= small
         free = tuple(name for name in free if name not in small)
-    return NoiseFit(noise, _in_order(kept))
+    return NoiseFit(noise, _in_order(kept), np.zeros((2, 2)), np.zeros((2, 2)))
 
 
 def _times_default(sigma: FittedSigma) -> float:
     default: float = getattr(NoiseParameters(), sigma.name)
     return sigma.value / default
-
-
-def _no_noise(found: Sequence[FittedSigma]) -> str:
-    """Why what the drives leave over is no noise; empty if it may be.
-
-    What one sigma cannot explain the others were stretched to as well, so none of them is believed then.
-    """
-    for each in found:
-        if not each.kept and _times_default(each) >= PLAUSIBLE:
-            return (
-                f"{each.name} came out at {_times_default(each):.3g} times the default: what is left over is no noise"
-            )
-    return ""
 
 
 def _left(sigma: FittedSigma, noise: NoiseParameters) -> FittedSigma:
@@ -140,32 +116,54 @@ def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
 def _fitted(maps: Sequence[LocalMap], noise: NoiseParameters, names: tuple[str, ...]) -> FittedVariances:
     default = NoiseParameters()
     return fit_variances(
-        [_part(each, part, noise, names) for each, part in zip(maps, _beginnings(maps), strict=True)],
+        [_part(each, chain, noise, names) for each, chain in zip(maps, _thinned(maps), strict=True)],
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
     )
 
 
-def _beginnings(maps: Sequence[LocalMap]) -> list[Chain]:
-    """The same share of each run."""
-    share = min(1.0, _MAX_KEYFRAMES / sum(len(each.T_start_base) for each in maps))
-    if share == 1.0:
-        return [each.chain for each in maps]
-    return [each.chain.prefix(max(2, int(share * len(each.chain.stamps_ns)))) for each in maps]
+def _thinned(maps: Sequence[LocalMap]) -> list[Chain]:
+    """All of each run, at so few keyframes that all together have no more than is looked at."""
+    chains = [each.chain for each in maps]
+    n_all = sum(len(chain.stamps_ns) for chain in chains)
+    if n_all <= _MAX_KEYFRAMES:
+        return chains
+    share = _LEAST_SHARE
+    keyframes = [coarse_keyframes(chain, share) for chain in chains]
+    while sum(map(len, keyframes)) > _MAX_KEYFRAMES:
+        share *= _NEXT_SHARE
+        keyframes = [coarse_keyframes(chain, share) for chain in chains]
+    return [coarsened(*each) for each in zip(chains, keyframes, strict=True)]
 
 
 def _part(local_map: LocalMap, chain: Chain, noise: NoiseParameters, names: tuple[str, ...]) -> Part:
-    """Of a map, the chain that is all of its own or the beginning of it."""
+    """Of a map, the chain that is all of its own or some keyframes of it."""
     state = local_map.solution.state
     graph, start = local_map.graph, state
     if chain is not local_map.chain:
         graph = build_graph([chain])
-        start = graph.start(state.poses[: len(chain.stamps_ns)], local_map.tags_m, local_map.calibration)
+        at = np.searchsorted(local_map.chain.stamps_ns, chain.stamps_ns)
+        start = graph.start(state.poses[at], local_map.tags_m, local_map.calibration)
     odometry, readings = chain.odometry.parts, chain.readings.parts
     components = Components(
-        odometry.of(names), _rest(odometry, noise, names), readings.of(names), _rest(readings, noise, names)
+        odometry.of(names),
+        _rest(odometry, noise, names),
+        readings.of(names),
+        _rest(readings, noise, names),
+        shared_levels(chain),
+        shared_root(chain),
+        *_of_stamps(chain, names),
     )
     return Part(graph.problem, start, components)
+
+
+def _of_stamps(chain: Chain, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
+    """Which variance is that of stamps, readings' change in a second, and the picture of each; or nothing of it."""
+    if STAMP_NOISE not in names or not len(chain.readings):
+        return None, None, None
+    _, picture = np.unique(chain.readings.keyframe, return_inverse=True)
+    by_time = chain.readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+    return names.index(STAMP_NOISE), by_time, np.asarray(picture, dtype=np.int64)
 
 
 def _rest(parts: CovarianceParts, noise: NoiseParameters, names: tuple[str, ...]) -> FloatArray:

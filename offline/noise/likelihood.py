@@ -1,49 +1,86 @@
-"""What the residuals of one problem say of K variances, at given values of them: see `variance_components`.
+"""What the residuals of one problem say of variances, at given values of them: see `variance_components`.
 
-The problem is solved under them from where it was before, and what the estimate takes is worked out for all vectors at
-once.
+The problem is solved under the variances from where it was before. Of each variance component i the quadratic form
+q_i = r' S^-1 V_i S^-1 r of the residuals is taken, with V_i the covariance that a variance of one would bring, and how
+much each component j contributes to its expectation, tr(S^-1 V_i S^-1 P V_j P'), with P = 1 - J H^-1 J' S^-1 what the
+estimate leaves of an error. The traces are averages over random signs (Hutchinson, "A stochastic estimator of the trace
+of the influence matrix for Laplacian smoothing splines", 1989).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.linalg import hadamard
-from scipy.special import chdtr, chdtri
+from scipy import sparse
+from scipy.stats import chi2
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.sam import Problem, Solution, State, solve, stacked, whitening
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stacked, whitening
 
-# A residual beyond this is no noise but a fault, and says nothing of the noise; of good ones 0.1 % lie there.
-_FAULT: Final = 1e-3
-_MAX_FAULTS: Final = 0.1
-_N_SIGNS: Final = 16  # a power of two
+_N_SIGNS: Final = 8
+_ROUNDING: Final = 1e-9
 _SEED: Final = 11
-# Of the solves in between. The cost as a whole is level where a solve ends, but its parts are not: what they are off by
-# is its root.
+# A residual beyond this is rather a fault than noise, and counts as if it lay there; of good ones 0.1 % do.
+_FAULT: Final = 1e-3
+# Of the solves in between: their residuals are asked for, which are off by the root of what the cost is off by.
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
-# Drives take some three a look, and not twenty where the sigmas are ten times off. Where readings contradict each other
-# steps lead nowhere, hundreds of them: each further look then goes on from where the last one ended by one.
+# Drives take some three steps a look. Where readings contradict each other steps lead nowhere, hundreds of them: each
+# further look then goes on from where the last one ended by one.
 _STEPS_IN_ALL: Final = 100
-
-Good = tuple[BoolArray, BoolArray]  # which motions and which readings are no faults
 
 
 @dataclass(frozen=True)
 class Components:
-    """How the covariances of one problem's factors follow from K variances.
+    """How the covariances of one problem's factors follow from K variances, and from what readings share.
 
     Attributes:
         odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
         odometry_rest: (M, 3, 3) what is added whatever the variances.
         readings: (K, N, 2, 2) and readings_rest: (N, 2, 2) likewise.
+        cells: L levels at which readings share errors: (N,) each, the cell of each reading, from 0 without gaps.
+        shared_root: (N, 2, 2) its columns are the errors of each reading for a shared component of one; with a level's
+            two variances the readings of a cell all err by the same multiples of their columns.
+        common: which of the K variances is of an error that all readings of a picture have in common, as that of its
+            stamp; None: none. It is weighed as if each reading had its own.
+        common_root: (N, 2) what such an error of one adds to each reading.
+        picture: (N,) of each reading, from 0 without gaps.
     """
 
     odometry: FloatArray
     odometry_rest: FloatArray
     readings: FloatArray
     readings_rest: FloatArray
+    cells: tuple[IntArray, ...] = ()
+    shared_root: FloatArray | None = None
+    common: int | None = None
+    common_root: FloatArray | None = None
+    picture: IntArray | None = None
+
+    @property
+    def n_shared(self) -> int:
+        """Variances of shared errors: two a level."""
+        return 2 * len(self.cells)
+
+    def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; readings count as independent with what that takes.
+
+        The mean of n readings that share an error of variance s errs by it as n independent ones would of n s.
+        """
+        own, shared = variances[: len(self.odometry)], variances[len(self.odometry) :].reshape(-1, 2)
+        odometry: FloatArray = np.tensordot(own, self.odometry, 1) + self.odometry_rest
+        readings: FloatArray = np.tensordot(own, self.readings, 1) + self.readings_rest
+        return _regular(odometry), _regular(readings + self.covariance_shared(shared))
+
+    def covariance_shared(self, shared: FloatArray) -> FloatArray:
+        """(N, 2, 2) what (L, 2) variances of shared errors add to each reading's covariance."""
+        added = np.zeros_like(self.readings_rest)
+        for cell, both in zip(self.cells, shared, strict=True):
+            assert self.shared_root is not None
+            column = self.shared_root * np.sqrt(both)
+            added += np.bincount(cell)[cell][:, None, None] * (column @ column.swapaxes(-1, -2))
+        return added
 
 
 @dataclass(frozen=True)
@@ -56,20 +93,20 @@ class Part:
 
 
 class Seen(NamedTuple):
-    """What one part says at given variances, by the logarithms of sigma.
+    """What one part says at given variances.
 
     Attributes:
-        squares: (K,) weighted squares of residuals that each sigma answers for; expected: (K,) what they should be;
-            at_most: (K,) what they would be if the estimate took nothing.
-        information: (K, K) average information.
-        good: what took part.
+        squares: (C,) q_i, less what the parts of the covariances bring that no variance scales.
+        traces: (C, C) what a variance of one of component j brings to q_i.
+        at_most: (C,) what a variance of one of component i would bring to q_i if the estimate took nothing.
+        n_groups: (2 L,) how many independent cells, or passes, tell what they share, once the estimate has taken its
+            part: the squared trace of P V_i over the trace of its square.
     """
 
     squares: FloatArray
-    expected: FloatArray
+    traces: FloatArray
     at_most: FloatArray
-    information: FloatArray
-    good: Good
+    n_groups: FloatArray
 
 
 class Looker:
@@ -80,18 +117,14 @@ class Looker:
     """
 
     def __init__(self, part: Part) -> None:
-        problem, components = part.problem, part.components
-        self.solution = Solution(part.start, (0.0,), "", converged=True, problem=problem)
-        self._odometry = _Kind(components.odometry, components.odometry_rest)
-        self._readings = _Kind(components.readings, components.readings_rest)
+        self.solution = Solution(part.start, (0.0,), "", converged=True, problem=part.problem)
+        self._components = part.components
         self._steps_left = _STEPS_IN_ALL
-        self._n_odometry = problem.odometry.motion.size
-        self._signs = _signs(self._n_odometry + problem.readings.value.size)
 
-    def look(self, variances: FloatArray, good: Good | None) -> Seen:
-        """Solves under variances (K,); `good` are no faults, where that is settled."""
-        weights = self._odometry.whitening(variances), self._readings.whitening(variances)
-        problem = self.solution.problem.reweighed(*weights)
+    def look(self, variances: FloatArray) -> Seen:
+        """Solves under (C,) variances, which are K of factors and two of each level."""
+        odometry, readings = self._components.covariances(variances)
+        problem = self.solution.problem.reweighed(whitening(odometry), whitening(readings))
         self.solution = replace(self.solution, problem=problem)  # lets go of the factorisation of the look before
         self.solution = solve(
             problem,
@@ -101,124 +134,162 @@ class Looker:
             most_steps=max(1, self._steps_left),
         )
         self._steps_left -= self.solution.n_linearised
-        state = self.solution.state
-        kinds = problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
-        jacobian, _ = stacked(kinds, problem.columns.n)
-        residuals = kinds[0].residual, kinds[1].residual
-        good = good or (_no_fault(residuals[0]), _no_fault(residuals[1]))
-        shares = (
-            self._odometry.shares(weights[0], variances, residuals[0], good[0]),
-            self._readings.shares(weights[1], variances, residuals[1], good[1]),
-        )
-        force = np.concatenate([share.force for share in shares], axis=1)
-        wanted = np.concatenate([self._signs, force.T], axis=1)
-        inner = np.asarray(jacobian.T @ wanted)
-        solved = self.solution.factorisation.solve_many(inner)
-        explained = np.asarray(jacobian @ solved[:, :_N_SIGNS])
-        left = _own_blocks_left(self._signs, explained, self._n_odometry)
-        kept = [_kept_of_square(each) for each in residuals]
-        return Seen(
-            force @ np.concatenate([each.reshape(-1) for each in residuals]),
-            kept[0] * shares[0].expected(left[0]) + kept[1] * shares[1].expected(left[1]),
-            kept[0] * shares[0].at_most + kept[1] * shares[1].at_most,
-            _positive(2.0 * (force @ force.T - inner[:, _N_SIGNS:].T @ solved[:, _N_SIGNS:])),
-            good,
-        )
+        rows = _Rows(self.solution, self._components)
+        n, rng = rows.n_components, np.random.default_rng(_SEED)
+        traces, lengths = np.empty((n, n)), np.empty(n)
+        for j in range(n):
+            drawn = rows.drawn(j, rng)
+            left = rows.left_over(drawn)
+            traces[:, j] = rows.squares(left).mean(axis=1)
+            lengths[j] = (drawn * left).sum(axis=0).mean()
+        shared = slice(n - self._components.n_shared, n)
+        n_groups = lengths[shared] ** 2 / np.maximum(np.diag(traces)[shared], 1e-300)
+        unscaled = rows.squares(rows.left_over(rows.drawn_unscaled(rng))).mean(axis=1)
+        return Seen(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, rows.at_most, n_groups)
 
 
-class _Shares(NamedTuple):
-    """Of variances in the whitened covariance of each factor of a kind.
+class _Rows:
+    """The whitened rows of a solution, weighed as its losses weighed them, and its variance components.
 
     Attributes:
-        of: (k,) which variances have one; matrices: (k, M, n, n); n_variances: K.
-        force: (K, M n) matrices times residuals.
-        at_most: (K,) traces.
+        residual: (R,) three rows a motion, then two a reading; faults cut to what noise may bring.
     """
 
-    of: IntArray
-    matrices: FloatArray
-    n_variances: int
-    force: FloatArray
-    at_most: FloatArray
+    def __init__(self, solution: Solution, components: Components) -> None:
+        problem, state = solution.problem, solution.state
+        kinds = problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
+        jacobian, residual = stacked(kinds, problem.columns.n)
+        _, weight = losses_and_weights(solution.losses.readings, kinds[1].residual)
+        self._n_odometry = kinds[0].residual.size
+        self._root = np.concatenate([np.ones(self._n_odometry), np.repeat(np.sqrt(weight), 2)])
+        self._jacobian = sparse.csr_array(jacobian * self._root[:, None])
+        self._factorisation = solution.factorisation
+        self.residual = residual * self._root * np.concatenate([_within_noise(each.residual) for each in kinds])
+        self._of_motions = _roots(problem.odometry.whitening, components.odometry)
+        self._of_readings = _roots(problem.readings.whitening, components.readings)
+        self._unscaled = (
+            _roots(problem.odometry.whitening, components.odometry_rest[None])[0],
+            _roots(problem.readings.whitening, components.readings_rest[None])[0],
+        )
+        self._cells = [
+            sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell))))) for cell in components.cells
+        ]
+        if components.shared_root is not None:
+            self._shared = problem.readings.whitening @ components.shared_root
+        self._common = components.common
+        if components.common_root is not None and components.picture is not None:
+            self._by_stamp = np.einsum("mij,mj->mi", problem.readings.whitening, components.common_root)
+            picture = components.picture
+            self._pictures = sparse.csr_array((np.ones(len(picture)), (picture, np.arange(len(picture)))))
+        self.n_components = len(components.odometry) + components.n_shared
 
-    def expected(self, left: FloatArray) -> FloatArray:
-        """(K,) traces of the shares times what the estimate leaves (M, n, n)."""
-        found = np.zeros(self.n_variances)
-        found[self.of] = self.matrices.reshape(len(self.of), left.size) @ left.reshape(-1)
-        return found
+    def left_over(self, errors: FloatArray) -> FloatArray:
+        """P e of (R, n) errors."""
+        solved = self._factorisation.solve_many(np.asarray(self._jacobian.T @ errors))
+        left: FloatArray = errors - self._jacobian @ solved
+        return left
+
+    def squares(self, rows: FloatArray) -> FloatArray:
+        """(C, n) the quadratic forms q of (R, n) rows."""
+        motions = rows[: self._n_odometry].reshape(-1, 3, rows.shape[1])
+        readings = rows[self._n_odometry :].reshape(-1, 2, rows.shape[1])
+        own = [
+            _form(of_motions, motions) + _form(of_readings, readings)
+            for of_motions, of_readings in zip(self._of_motions, self._of_readings, strict=True)
+        ]
+        if self._common is not None:
+            along = np.einsum("mi,min->mn", self._by_stamp, readings)
+            own[self._common] = (np.asarray(self._pictures @ along) ** 2).sum(axis=0)
+        shared = [
+            (np.asarray(cells @ np.einsum("mi,min->mn", self._shared[..., axis], readings)) ** 2).sum(axis=0)
+            for cells in self._cells
+            for axis in (0, 1)
+        ]
+        return np.array(own + shared).reshape(self.n_components, rows.shape[1])
+
+    def drawn(self, component: int, rng: np.random.Generator) -> FloatArray:
+        """(R, n) errors as component j brings with a variance of one, by random signs."""
+        rows = np.zeros((len(self.residual), _N_SIGNS))
+        if component == self._common:
+            signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
+            rows[self._n_odometry :] = (self._by_stamp[..., None] * signs[:, None, :]).reshape(-1, _N_SIGNS)
+        elif component < len(self._of_motions):
+            rows = self._drawn_by(self._of_motions[component], self._of_readings[component], rng)
+        else:
+            level, axis = divmod(component - len(self._of_motions), 2)
+            signs = self._cells[level].T @ rng.choice([-1.0, 1.0], (self._cells[level].shape[0], _N_SIGNS))
+            readings = self._shared[..., axis, None] * signs[:, None, :]
+            rows[self._n_odometry :] = readings.reshape(-1, _N_SIGNS)
+        drawn: FloatArray = rows * self._root[:, None]
+        return drawn
+
+    def drawn_unscaled(self, rng: np.random.Generator) -> FloatArray:
+        """(R, n) errors as the parts of the covariances bring that no variance scales."""
+        drawn: FloatArray = self._drawn_by(*self._unscaled, rng) * self._root[:, None]
+        return drawn
+
+    def _drawn_by(
+        self, of_motions: FloatArray | None, of_readings: FloatArray | None, rng: np.random.Generator
+    ) -> FloatArray:
+        rows = np.zeros((len(self.residual), _N_SIGNS))
+        for root, own in ((of_motions, rows[: self._n_odometry]), (of_readings, rows[self._n_odometry :])):
+            if root is not None:
+                signs = rng.choice([-1.0, 1.0], (len(root), root.shape[2], _N_SIGNS))
+                own[:] = (root @ signs).reshape(own.shape)
+        return rows
+
+    @property
+    def at_most(self) -> FloatArray:
+        """(C,) traces of S^-1 V_i, all rows counted in full."""
+        own = [
+            sum(0.0 if root is None else float((root**2).sum()) for root in both)
+            for both in zip(self._of_motions, self._of_readings, strict=True)
+        ]
+        return np.array(own + [float(each.sum()) for each in self._of_groups()])
+
+    def _of_groups(self) -> list[FloatArray]:
+        """For each level and component (n groups,) the squared length of what a shared error of one brings."""
+        return [
+            np.asarray(cells @ (self._shared[..., axis] ** 2).sum(axis=1)) for cells in self._cells for axis in (0, 1)
+        ]
 
 
-class _Kind:
-    """Motions or readings, and what their covariances are made of."""
-
-    def __init__(self, unit: FloatArray, rest: FloatArray) -> None:
-        self._n_variances, self._rest = len(unit), rest
-        self._of = np.flatnonzero(unit.any(axis=(1, 2, 3)))
-        self._unit = np.ascontiguousarray(unit[self._of])
-
-    def whitening(self, variances: FloatArray) -> FloatArray:
-        """(M, n, n) under variances (K,)."""
-        return whitening(np.tensordot(variances[self._of], self._unit, 1) + self._rest)
-
-    def shares(self, weights: FloatArray, variances: FloatArray, residual: FloatArray, good: BoolArray) -> _Shares:
-        """Those of factors (M,) that are good; the others have none."""
-        matrices = np.where(good[:, None, None], weights, 0.0)
-        turned = np.ascontiguousarray(matrices.swapaxes(-1, -2))
-        own = np.empty_like(self._unit)
-        for share, unit, variance in zip(own, self._unit, variances[self._of].tolist(), strict=True):
-            np.matmul(matrices @ unit, variance * turned, out=share)
-        force = np.zeros((self._n_variances, residual.size))
-        force[self._of] = np.einsum("kmij,mj->kmi", own, residual).reshape(len(own), residual.size)
-        at_most = np.zeros(self._n_variances)
-        at_most[self._of] = np.einsum("kmii->k", own)
-        return _Shares(self._of, own, self._n_variances, force, at_most)
+def _regular(covariances: FloatArray) -> FloatArray:
+    """(M, n, n) raised by what rounding may have taken: with variances near none they would have no square root."""
+    n = covariances.shape[-1]
+    level = np.trace(covariances, axis1=-2, axis2=-1) / n
+    return np.asarray(covariances + (_ROUNDING * level)[:, None, None] * np.eye(n))
 
 
-def _signs(n: int) -> FloatArray:
-    """(n, _N_SIGNS) random, and such that the products of two rows nearer than _N_SIGNS sum to nothing."""
-    random = np.random.default_rng(_SEED).choice([-1.0, 1.0], (n, 1))
-    signs: FloatArray = random * hadamard(_N_SIGNS)[np.arange(n) % _N_SIGNS]
-    return signs
+def _roots(whitenings: FloatArray, units: FloatArray) -> list[FloatArray | None]:
+    """(M, n, n) of each component, with root root' its whitened covariance for a variance of one; None if that is 0."""
+    roots: list[FloatArray | None] = []
+    for unit in units:
+        values, vectors = np.linalg.eigh(unit)
+        roots.append(whitenings @ (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) if unit.any() else None)
+    return roots
 
 
-def _own_blocks_left(signs: FloatArray, explained: FloatArray, n_odometry: int) -> tuple[FloatArray, FloatArray]:
-    """Estimates (M, 3, 3) and (N, 2, 2) of what the estimate leaves of each factor's whitened covariance.
+def _form(root: FloatArray | None, rows: FloatArray) -> FloatArray:
+    """(n,) sums of |root' r|^2 of rows (M, k, n)."""
+    if root is None:
+        return np.zeros(rows.shape[2])
+    return np.asarray(((root.swapaxes(-1, -2) @ rows) ** 2).sum(axis=(0, 1)))
 
-    Args:
-        signs: (rows, n) as `_signs` has them.
-        explained: (rows, n) what the estimate explains of them.
-        n_odometry: how many of the rows belong to motions.
+
+def _within_noise(residual: FloatArray) -> FloatArray:
+    """(M n,) by what to multiply whitened residuals (M, n) so that none is longer than noise makes them.
+
+    Where the sigmas are far too small that is measured in what most of them are.
     """
-    blocks = []
-    for rows, size in ((slice(0, n_odometry), 3), (slice(n_odometry, None), 2)):
-        before, after = (each[rows].reshape(-1, size, _N_SIGNS) for each in (signs, explained))
-        blocks.append(np.eye(size) - before @ after.swapaxes(-1, -2) / _N_SIGNS)
-    return blocks[0], blocks[1]
-
-
-def _positive(matrix: FloatArray) -> FloatArray:
-    """The nearest symmetric matrix without negative eigenvalues; faults left out of a few terms can cause them."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    nearest: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return nearest
-
-
-def _no_fault(residual: FloatArray) -> BoolArray:
-    """(M,) which whitened residuals (M, n) may be noise; all, where the sigmas are so far off that many look bad."""
-    if not len(residual):
-        return np.zeros(0, dtype=np.bool_)
     n = residual.shape[1]
     square = (residual**2).sum(axis=1)
-    level = max(1.0, float(np.median(square)) / float(chdtri(n, 0.5)))
-    good: BoolArray = square <= level * chdtri(n, _FAULT)
-    return good if good.mean() > 1.0 - _MAX_FAULTS else np.ones(len(good), dtype=np.bool_)
+    level = max(1.0, float(np.median(square)) / float(chi2.ppf(0.5, n))) if len(square) else 1.0
+    bound = level * chi2.isf(_FAULT, n)
+    return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)
 
 
-def _kept_of_square(residual: FloatArray) -> float:
-    """What is expected of the squares of good residuals (M, n), as a share, though the largest are taken for faults.
-
-    The mean of chi-square up to a bound, over the share of it that lies there: those left out would bring n times
-    P(chi-square with n + 2 degrees beyond the bound).
-    """
-    n = residual.shape[1]
-    return float(chdtr(n + 2, chdtri(n, _FAULT)) / (1.0 - _FAULT))
+def all_looks(lookers: list[Looker], variances: FloatArray) -> Seen:
+    """What all parts say together."""
+    seen: Iterator[Seen] = (each.look(variances) for each in lookers)
+    return Seen(*(np.asarray(sum(each)) for each in zip(*seen, strict=True)))

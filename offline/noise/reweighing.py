@@ -1,11 +1,11 @@
 """Under which noise the runs of one map are solved together: what they tell themselves, where they may be believed.
 
 One set of sigmas serves all runs: names, `--noise` and map.json have one, and robots of one make differ less in their
-wheels than a single drive can tell. It is fitted to the runs whose readings fit together. A run that contradicts itself
-says nothing of noise, and is believed no more than before, nor more than the others: of each sigma it gets the larger.
-
-A detector's bias repeats from picture to picture. One by one such readings look good, so what neighbouring readings of
-a tag share is fitted too (`local_map.correlated_errors`), and a reading that has many neighbours counts for less.
+wheels than a single drive can tell. It is fitted to the runs whose readings fit together; where none does, to those of
+robots that nobody measured.
+A run that contradicts itself beside others that do not says nothing of noise, and is believed no more than before, nor
+more than the others: of each sigma it gets the larger. What neighbouring readings share is fitted too
+(`shared_errors`).
 """
 
 from collections.abc import Sequence
@@ -14,20 +14,22 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.local_map import LocalMap, SharedErrors, fit_shared_errors
+from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import NOT_NEEDED, FittedNoise, FittedParameter
-from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared, least_shared_by_corners
-from groundsbot.offline.noise.fit import FittedPart, FittedSigma, fit_noise
-from groundsbot.offline.sam import State, solve, whitening
+from groundsbot.offline.measurements import ODOMETRY_NOISE
+from groundsbot.offline.noise.fit import FittedSigma, fit_noise
+from groundsbot.offline.noise.shared_errors import counted_for_less
+from groundsbot.offline.sam import solve, whitening
 
 _NO_RUN: Final = "no run has tag readings that fit together"
 _NOT_APART: Final = "too few readings tell how much of their errors they share"
-# Over so much of the way readings of a tag are taken to share an error; as in `local_map.goodness_of_fit`.
-_SHARED_OVER_M: Final = 2.5
 # Cells that tell what is shared, as many as leave a variance uncertain by a half.
-_LEAST_CELLS: Final = 8.0
+_LEAST_CELLS: Final = 4.0
+
+
+_SHARED: Final = ("shared_range", "shared_bearing", "pass_range", "pass_bearing")
 
 
 class WeighedMaps(NamedTuple):
@@ -45,32 +47,26 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         maps: solved under the prior.
         prior: what stays where the runs tell nothing.
     """
-    sound = [each for each in maps if _is_sound(each)]
+    sound = [each for each in maps if _is_sound(each)] or [each for each in maps if _is_unknown(each)]
     fit = fit_noise(sound, prior)
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
-    shared = np.zeros(2)
-    if noise != prior:
-        shared, is_told = _shared(fit.parts)
-        if not is_told:
-            found = {name: _at_least(each, getattr(prior, name)) for name, each in found.items()}
-            noise = noise.model_copy(update={name: each.value for name, each in found.items()})
+    is_told = bool(fit.n_groups[0, 0] >= _LEAST_CELLS)
+    shared = fit.shared if noise != prior else np.zeros((2, 2))
+    if noise != prior and not is_told:
+        found = {name: _at_least(each, getattr(prior, name)) for name, each in found.items()}
+        noise = noise.model_copy(update={name: each.value for name, each in found.items()})
     kept = NOT_NEEDED if sound else _NO_RUN
     parameters = (
         _parameter(found.get(name) or FittedSigma(name, getattr(prior, name), 0.0, 0.0, 0.0, kept))
         for name in NoiseParameters.model_fields
     )
     doubted = _larger(prior, noise)
-    solved = {each.chain.name: each.solution.state for each in fit.parts if each.is_whole}
     return WeighedMaps(
-        [
-            _under(each, noise if each.goodness.fits else doubted, shared, prior, solved.get(each.chain.name))
-            for each in maps
-        ],
+        [_under(each, noise if each.goodness.fits else doubted, shared, prior) for each in maps],
         noise,
         FittedNoise(
             tuple(parameters),
-            shared_range=float(shared[0]),
-            shared_bearing=float(shared[1]),
+            **dict(zip(_SHARED, shared.reshape(-1).tolist(), strict=True)),
             runs=tuple(each.chain.name for each in sound),
             contradicting=tuple(each.chain.name for each in maps if not each.goodness.fits),
         ),
@@ -79,7 +75,9 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
 
 def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
     """Maps solved under the noise of a map that is kept, with what readings share as it was found there."""
-    shared = np.zeros(2) if fitted is None else np.array([fitted.shared_range, fitted.shared_bearing])
+    shared = np.zeros((2, 2))
+    if fitted is not None:
+        shared = np.array([getattr(fitted, name) for name in _SHARED]).reshape(2, 2)
     # What the windows leave over is still a multiple of the same noise.
     return [replace(_under(each, noise, shared, noise), goodness=each.goodness) for each in maps]
 
@@ -89,62 +87,22 @@ def _is_sound(local_map: LocalMap) -> bool:
     return len(local_map.chain.tags) > 0 and local_map.goodness.fits and local_map.solution.converged
 
 
-def _shared(parts: Sequence[FittedPart]) -> tuple[FloatArray, bool]:
-    """(2,) variance that readings of a tag share within a cell, as a multiple of their own; and whether enough tell."""
-    read = [each for each in parts if len(each.chain.readings)]  # the beginning of a run may have none
-    if not read:
-        return np.zeros(2), False
-    errors: list[SharedErrors] = [fit_shared_errors(each.solution, _cells(each.chain)) for each in read]
-    weight = np.array([each.shared_redundancy for each in errors])
-    shared = (weight * np.array([each.shared for each in errors])).sum(axis=0) / weight.sum(axis=0)
-    return shared, bool(weight.sum(axis=0)[0] >= _LEAST_CELLS)
+def _is_unknown(local_map: LocalMap) -> bool:
+    """Whether nobody measured the robot of a map with tags: what it leaves over is all that is known of its noise."""
+    return local_map.chain.run.robot.is_left_open and len(local_map.chain.tags) > 0
 
 
-def _cells(chain: Chain) -> IntArray:
-    """(M,) of each reading: a number for each tag in each part of the way, from 0 without gaps."""
-    along_m = chain.along_m[chain.readings.keyframe]
-    part = (along_m / _SHARED_OVER_M).astype(np.int64)
-    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
-    return np.asarray(cell, dtype=np.int64)
-
-
-def in_cell(chain: Chain) -> IntArray:
-    """(M,) how many readings are in the cell of each."""
-    cell = _cells(chain)
-    return np.asarray(np.bincount(cell)[cell])
-
-
-def spread_of_corners(chain: Chain, n_in_cell: IntArray, sigma_corner_px: float, shared: float = 0.0) -> FloatArray:
-    """(M,) how many times their sigma corners count with, for what neighbouring readings share.
-
-    Args:
-        chain: with one reading at least.
-        n_in_cell: (M,) as of `in_cell`.
-        sigma_corner_px: of the corners' noise.
-        shared: variance that readings were found to share, as a multiple of their own.
-    """
-    at_least = np.maximum(shared, least_shared_by_corners(chain.readings, sigma_corner_px))
-    return np.asarray(np.sqrt(1.0 + n_in_cell * at_least))
-
-
-def _under(
-    local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters, near: State | None = None
-) -> LocalMap:
-    """The map solved under other noise and with readings that share errors; the fit may have ended near that."""
+def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
+    """The map solved under other noise and with readings that share errors."""
     if noise == prior and not shared.any() and not local_map.chain.readings.corner_bias_px.any():
         return local_map
-    chain = local_map.chain.weighed(noise)
-    if len(chain.readings):
-        n_in_cell = in_cell(chain)
-        sigmas = np.sqrt(1.0 + n_in_cell[:, None] * np.maximum(shared, least_shared(chain.readings)))
-        of_corners = spread_of_corners(chain, n_in_cell, noise.sigma_corner_px, float(shared.max()))
-        chain = replace(chain, readings=chain.readings.spread(sigmas, of_corners))
+    chain = counted_for_less(local_map.chain.weighed(noise), shared, noise.sigma_corner_px)
     weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
     graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
-    solution = solve(graph.problem, near or local_map.solution.state)
+    solution = solve(graph.problem, local_map.solution.state)
     graph.problem.arrowhead.without_scratch()
     return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness)
 

@@ -1,16 +1,16 @@
 """Variances of the measurements, from what the estimate leaves over of them: restricted maximum likelihood.
 
-The covariance of each factor is a sum of known matrices, each times a variance that many factors share. With P the
-information that the residuals keep once the estimate has taken its share (P = S^-1 - S^-1 J H^-1 J^T S^-1), the
-likelihood of the residuals has the score (r' S^-1 A S^-1 r - tr(P A)) / 2 and the average information f' P f / 2 with
-f = A S^-1 r. Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal" (1971);
-Gilmour, Thompson and Cullis, "Average information REML" (1995). The trace is an average over signs of its smaller part,
-that of the share taken (Hutchinson, 1989); signs that cancel between neighbours, where most of the share is (Bekas,
-Kokiopoulou and Saad, "An estimator for the diagonal of a matrix", 2007), need to be no more than sixteen.
+The covariance of all measurements is a sum of known matrices V_j, each times a variance that many factors share: those
+of wheels and readings, and of errors that the readings of a tag in one part of the way share. Each quadratic form q_i
+of the residuals (see `likelihood`) has an expectation that is linear in the variances: sum_j T_ij v_j. To solve T v = q
+is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance and covariance
+components", 1971); repeated with the weights that follow from it, it is restricted maximum likelihood (Patterson and
+Thompson, "Recovery of inter-block information when block sizes are unequal", 1971), whose information on the logarithm
+of a sigma is 2 v_i T_ij v_j. Readings that share errors are weighed as if they were independent with larger variances;
+the expectations are of the true structure all the same, so this makes no bias.
 
-Sigmas are searched by their logarithm, each with a wide prior about where it began: what the data cannot tell stays.
-From afar the information says little; there each variance is multiplied by what is left over for it, as a share of what
-should be (Helmert's method of 1907, as in Förstner and Wrobel, "Photogrammetric Computer Vision", 2016, 4.2.4).
+Each variance has a wide prior about where it began: what the data do not tell stays there. Variances of shared errors
+begin near none, and may come out as none. A fit always ends: with a number of repetitions, the last of which counts.
 """
 
 from collections.abc import Sequence
@@ -18,27 +18,29 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.optimize import nnls
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.noise.likelihood import Good, Looker, Part
+from groundsbot.offline.noise.likelihood import Looker, Part, Seen, all_looks
 from groundsbot.offline.sam import Solution
 
 # Of a logarithm of sigma: a factor of ten either way is one such sigma.
 PRIOR_SIGMA: Final = float(np.log(10.0))
-_MAX_ITERATIONS: Final = 12
+_MOST_LOOKS: Final = 15
 # As many squares as that leave a sigma uncertain by a third.
 LEAST_REDUNDANCY: Final = 5.0
-_CONTRADICTED: Final = 3.0  # sigmas of the score
-_LONGEST_STEP: Final = 1.2  # of a logarithm of sigma, by the information
-_FAR: Final = 0.4  # of a logarithm of sigma: from there the information shows the way
-_SMALL_STEP: Final = 0.05  # of its own standard deviation
-_ENOUGH: Final = 0.1  # of that as well: what may be left after the last step
-_STEPS_AFRESH: Final = 4
+_CONTRADICTED: Final = 3.0  # sigmas of the squares
+_LARGEST_STEP: Final = 10.0  # factor on a variance, from one look to the next
+_SMALL_STEP: Final = 0.1  # of its own standard deviation
+# Where shared errors begin, as a share of the readings' variance; and what is as good as none.
+_SHARED_START: Final = 0.05
+_NONE_SHARED: Final = 1e-6
+_MOST_TIMES: Final = 1e6  # where it began, as a variance: what nothing tells of must not run away
 
 
 @dataclass(frozen=True)
 class FittedVariances:
-    """What the residuals say of K sigmas.
+    """What the residuals say of K sigmas, and of what readings share.
 
     Attributes:
         sigma: (K,)
@@ -48,6 +50,9 @@ class FittedVariances:
         told: (K,) whether the data say enough of it; else it stands where it began, or where they are more content
             with if that is more, unless they speak against that.
         solutions: of the parts under these sigmas.
+        converged: whether the last repetition changed nothing that matters.
+        shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.shared_root`.
+        n_groups: (L, 2) of how many cells, or passes, each tells.
     """
 
     sigma: FloatArray
@@ -56,6 +61,8 @@ class FittedVariances:
     told: BoolArray
     solutions: tuple[Solution, ...]
     converged: bool
+    shared: FloatArray
+    n_groups: FloatArray
 
     def interval(self, quantile: float) -> tuple[FloatArray, FloatArray]:
         """Bounds (K,) between which each sigma lies, `quantile` normal deviations either way.
@@ -81,128 +88,105 @@ def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | 
     Raises:
         UnderDeterminedError: a part has something that nothing ties down.
     """
-    search = _Search(parts, np.log(sigma), np.full(len(sigma), -np.inf) if least is None else np.log(least))
-    search.look()
-    converged = search.run(np.ones(len(sigma), dtype=np.bool_))
-    fitted = search.log_sigma.copy()
+    n_shared = parts[0].components.n_shared if parts else 0
+    search = _Search(parts, sigma, np.zeros(len(sigma)) if least is None else least, n_shared)
+    n = len(sigma)
+    converged = search.run(np.ones(n + n_shared, dtype=np.bool_))
     told = search.redundancy() >= LEAST_REDUNDANCY
-    if not told.all():
-        # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
-        search.log_sigma = np.where(told, fitted, np.maximum(fitted, search.middle))
-        search.look()
-        contradicted = -search.score > _CONTRADICTED * np.sqrt(2.0 * np.maximum(search.expected, 1e-300))
-        if contradicted.any():
-            search.log_sigma = np.where(contradicted, fitted, search.log_sigma)
-            search.look()
-        converged &= search.run(told)
+    if not told[:n].all():
+        converged &= search.hold_untold(told)
+    log_covariance = search.log_covariance()
+    redundancy = search.redundancy()
     return FittedVariances(
-        np.exp(search.log_sigma), search.covariance(), search.redundancy(), told, search.solutions, converged
+        np.sqrt(search.variances[:n]),
+        log_covariance[:n, :n],
+        redundancy[:n],
+        told[:n],
+        tuple(each.solution for each in search.lookers),
+        converged,
+        np.where(search.variances[n:] > 2.0 * _NONE_SHARED, search.variances[n:], 0.0).reshape(-1, 2),
+        search.seen.n_groups.reshape(-1, 2),
     )
 
 
 class _Search:
-    """Newton's method on the logarithms of sigma.
+    """Repeats the estimate under its own weights.
 
     Attributes:
-        score: (K,) and information: (K, K) of the likelihood where `look` looked last.
-        squares: (K,) weighted squares that each sigma answers for there; expected: (K,) what they should be; at_most:
-            (K,) what they would be if the estimate had taken nothing. Where sigmas are far too large, residuals that
-            are far too small make the information far too small; what is expected does not depend on them.
+        variances: (C,) K of the sigmas, then those of shared errors.
+        seen: at these variances.
     """
 
-    def __init__(self, parts: Sequence[Part], log_sigma: FloatArray, least: FloatArray) -> None:
-        self._parts = [Looker(part) for part in parts]
-        self._least = least
-        self.middle = log_sigma
-        self.log_sigma = np.maximum(log_sigma, least)
-        self.score = np.zeros(len(log_sigma))
-        self.squares = np.zeros(len(log_sigma))
-        self.expected = np.zeros(len(log_sigma))
-        self.at_most = np.zeros(len(log_sigma))
-        self.information = np.zeros((len(log_sigma), len(log_sigma)))
-        self._good: list[Good] | None = None
-
-    def look(self, *, afresh: bool = True) -> None:
-        """Solves all parts under the sigmas as they are; what is a fault is looked at afresh or stays as it was."""
-        good = self._good if self._good is not None and not afresh else [None] * len(self._parts)
-        variances = np.exp(2.0 * self.log_sigma)
-        seen = [part.look(variances, each) for part, each in zip(self._parts, good, strict=True)]
-        self._good = [each.good for each in seen]
-        self.squares = np.sum([each.squares for each in seen], axis=0)
-        self.expected = np.sum([each.expected for each in seen], axis=0)
-        self.at_most = np.sum([each.at_most for each in seen], axis=0)
-        self.score = self.squares - self.expected
-        self.information = np.sum([each.information for each in seen], axis=0)
-
-    @property
-    def solutions(self) -> tuple[Solution, ...]:
-        """Of the parts, where `look` looked last."""
-        return tuple(part.solution for part in self._parts)
-
-    def covariance(self) -> FloatArray:
-        """(K, K) of the logarithms, prior included."""
-        prior = np.eye(len(self.middle)) / PRIOR_SIGMA**2
-        inverse: FloatArray = np.asarray(np.linalg.inv(self.information + prior), dtype=np.float64)
-        return inverse
-
-    def redundancy(self) -> FloatArray:
-        """(K,) see `FittedVariances`."""
-        return 0.5 * np.maximum(1.0 / np.diag(self.covariance()) - 1.0 / PRIOR_SIGMA**2, 0.0)
+    def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, n_shared: int) -> None:
+        self.lookers = [Looker(part) for part in parts]
+        self._n = len(sigma)
+        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START))
+        self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
+        self.variances = np.maximum(self._middle, self._least)
+        self.seen: Seen = all_looks(self.lookers, self.variances)
 
     def run(self, free: BoolArray) -> bool:
-        """Moves the sigmas that are free (K,) on from where `look` looked until those stand of which the data tell.
-
-        The last step is not looked at. False where they did not come to stand.
-        """
-        longest, before = np.full(len(free), _LONGEST_STEP), np.zeros(len(free))
-        for n_steps in range(_MAX_ITERATIONS):
-            by_share = np.where(free, self._step_by_share(), 0.0)
-            if np.abs(by_share).max(initial=0.0) > _FAR:
-                self._move(by_share)
-                continue
-            step = self._step_by_information(free)
-            told = self.redundancy() >= LEAST_REDUNDANCY
-            if (np.abs(step) < _SMALL_STEP * np.sqrt(np.diag(self.covariance())))[free & told].all():
+        """Repeats the estimate of those that are free (C,) until what the data tell stands; False if it does not."""
+        for _ in range(_MOST_LOOKS):
+            times = np.where(free, self._estimate(free), 1.0)
+            moved = 0.5 * np.log(np.clip(times, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
+            self.variances = np.clip(self.variances * np.exp(2.0 * moved), self._least, _MOST_TIMES * self._middle)
+            self.seen = all_looks(self.lookers, self.variances)
+            deviation = np.sqrt(np.diag(self.log_covariance()))
+            matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
+            if (np.abs(moved) < _SMALL_STEP * deviation)[matters].all():
                 return True
-            # Where a sigma is next to nothing its curvature says nothing of what lies beyond: steps that turn back
-            # shrink.
-            longest = np.where(step * before < 0.0, 0.5 * longest, longest)
-            before = np.clip(step, -longest, longest)
-            if (_left_by(before, np.sqrt(np.diag(self.covariance())))[free & told] < _ENOUGH).all():
-                self.log_sigma = np.maximum(self.log_sigma + before, self._least)
-                return True
-            # A residual that is a fault at one step and none at the next would keep the search from coming to an end.
-            self._move(before, afresh=n_steps < _STEPS_AFRESH)
         return False
 
-    def _step_by_share(self) -> FloatArray:
-        """(K,) to where what is left over is as much as should be, were that each one's own; none where that is little.
+    def hold_untold(self, told: BoolArray) -> bool:
+        """Puts sigmas of which little is told up to where they began, where the data do not speak against it."""
+        n = self._n
+        fitted = self.variances.copy()
+        untold = ~told & (np.arange(len(fitted)) < n)
+        # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
+        self.variances = np.where(untold, np.maximum(fitted, self._middle), fitted)
+        self.seen = all_looks(self.lookers, self.variances)
+        expected = self.seen.traces @ self.variances
+        excess = (expected - self.seen.squares) * self.variances
+        spread = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))
+        self.variances = np.where(untold & (excess > _CONTRADICTED * spread), fitted, self.variances)
+        return self.run(~untold)
 
-        Where more is left over than there was, sigmas are so far too small that the loss cuts off good readings, and
-        what is expected means nothing.
+    def log_covariance(self) -> FloatArray:
+        """(C, C) of the logarithms of the sigmas, prior included."""
+        return np.asarray(np.linalg.inv(self._information() + np.eye(len(self.variances)) / PRIOR_SIGMA**2))
+
+    def redundancy(self) -> FloatArray:
+        """(C,) see `FittedVariances`."""
+        return 0.5 * np.maximum(1.0 / np.diag(self.log_covariance()) - 1.0 / PRIOR_SIGMA**2, 0.0)
+
+    def _information(self) -> FloatArray:
+        """(C, C) on the logarithms of the sigmas, 2 v_i T_ij v_j; rounding and chance may leave it a little askew."""
+        both = self.variances[:, None] * self.seen.traces * self.variances
+        values, vectors = np.linalg.eigh(both + both.T)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+    def _estimate(self, free: BoolArray) -> FloatArray:
+        """(C,) by what to multiply the variances: T v = q under the prior, none below zero.
+
+        Where more is left over than there would be if the estimate had taken nothing, sigmas are so far too small that
+        the losses cut off good readings, and expectations mean nothing: those grow by what is left over alone.
         """
-        too_small = self.squares > self.at_most
-        expected = np.where(too_small, self.at_most, self.expected)
-        share = np.maximum(self.squares, 1e-6 * expected) / np.where(expected > 0.0, expected, 1.0)
-        return np.where(expected >= LEAST_REDUNDANCY, 0.5 * np.log(np.maximum(share, 1e-6)), 0.0)
-
-    def _step_by_information(self, free: BoolArray) -> FloatArray:
-        """(K,) Newton's; none for those that are not free (K,)."""
-        total = self.information + np.eye(len(free)) / PRIOR_SIGMA**2
-        pull = self.score - (self.log_sigma - self.middle) / PRIOR_SIGMA**2
-        step = np.zeros(len(free))
-        step[free] = np.linalg.solve(total[np.ix_(free, free)], pull[free])
-        return np.maximum(step, self._least - self.log_sigma)
-
-    def _move(self, step: FloatArray, *, afresh: bool = True) -> None:
-        self.log_sigma = np.maximum(self.log_sigma + step, self._least)
-        self.look(afresh=afresh)
-
-
-def _left_by(step: FloatArray, deviation: FloatArray) -> FloatArray:
-    """(K,) how far steps (K,) of a logarithm end from where they should, in its standard deviations.
-
-    By their square, as the likelihood is no parabola; and since the average information differs from its curvature by
-    chance, as a share by some two deviations.
-    """
-    return step**2 / deviation + 2.0 * np.abs(step)
+        v = self.variances
+        seen = self.seen
+        expected = seen.traces * v * v[:, None]
+        squares = np.maximum(seen.squares, 0.0) * v
+        too_small = (squares > seen.at_most * v) & (seen.at_most * v > LEAST_REDUNDANCY)
+        held = np.where(free, 0.0, 1.0)
+        # A sigma's prior on its logarithm, as one on the multiple of its variance near the last one.
+        weight = np.append(np.full(self._n, 0.25 / PRIOR_SIGMA**2), np.full(len(v) - self._n, 0.25 / PRIOR_SIGMA**2))
+        middle = np.clip(self._middle / v, 1.0 / _LARGEST_STEP, _LARGEST_STEP)
+        middle[self._n :] = 0.0
+        symmetric = 0.25 * (expected + expected.T)
+        left = symmetric + np.diag(weight + 1e9 * held)
+        right = 0.5 * squares + weight * middle + 1e9 * held
+        values, vectors = np.linalg.eigh(left)
+        root = np.sqrt(np.maximum(values, 1e-9))
+        found, _ = nnls((vectors * root).T, (vectors.T @ right) / root)
+        share = squares / np.maximum(seen.at_most * v, 1e-300)
+        return np.asarray(np.where(too_small, np.maximum(found, share), found))

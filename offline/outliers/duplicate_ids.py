@@ -14,8 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chained, se2
-from groundsbot.offline.measurements import Chain, Readings
-from groundsbot.offline.outliers.sightings import GAP_M
+from groundsbot.offline.measurements import GAP_M, Chain, Readings
 
 # Beside its covariance, how far a reading is off from what the last one made expect.
 _SLACK_M: Final = 0.01

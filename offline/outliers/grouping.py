@@ -40,7 +40,7 @@ def few_of_each_tag(graph: Graph, sightings: Sightings) -> Sightings:
     while is_many.any() and level <= _LEVELS + int(tree.n_poses).bit_length():
         wanted = np.column_stack([tag, sightings.chain, _piece_of(tree, level)[pose]])
         found = np.unique(wanted, axis=0, return_inverse=True)[1].reshape(-1)
-        group[is_many] = len(sightings) + found[is_many]
+        group[is_many] = (level + 1) * len(sightings) + found[is_many]  # no number of a level before
         is_many &= _n_groups(tag, group)[tag] > most
         level += 1
     return _together(sightings, group)

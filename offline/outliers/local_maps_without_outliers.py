@@ -1,17 +1,37 @@
 """Local maps of drives, with the tags that do not belong apart."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 from groundsbot.offline.foundation import Stages
-from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.local_map import LocalMap, judged, solve_local_map
 from groundsbot.offline.measurements import Chain
+from groundsbot.offline.outliers.false_readings import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_where_broken
 from groundsbot.offline.outliers.outliers import RunsAlone
 from groundsbot.offline.sam import efforts_of
 
 
-def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> tuple[list[LocalMap], list[str]]:
-    """Each chain solved alone, parted where its wheels lost the way, and what to say of that.
+class ExplainedMaps(NamedTuple):
+    """Local maps.
+
+    Attributes:
+        maps: of chains or of parts of such.
+        noisy: names of chains whose noise is far from what was told, in which nothing was looked for yet.
+        warnings: sentences about drives that were parted where their wheels lost the way.
+    """
+
+    maps: list[LocalMap]
+    noisy: frozenset[str]
+    warnings: list[str]
+
+
+def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> ExplainedMaps:
+    """Each chain solved alone, parted where its wheels lost the way, with tags that do not belong apart.
+
+    That is what explains a drive that contradicts itself though its wheels and readings are about as good as told. One
+    whose noise is far larger than that is left as it is: its noise comes first (`judged_under_own_noise`).
 
     Args:
         chains: stretches of runs.
@@ -26,8 +46,30 @@ def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> tu
             done()
     alone = RunsAlone()
     with stages.stage("tags that do not belong"):
-        maps = [alone.explained_by_tags(each) for each in maps]
+        maps = [each if each.is_noisy else alone.explained_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
         maps, broken = split_where_broken(maps, efforts)
     with stages.stage("tags that do not belong"):
-        return [alone.split(each).without_factors() for each in maps], broken
+        maps = [each if each.is_noisy else alone.split(each) for each in maps]
+    noisy = frozenset(each.chain.name for each in maps if each.is_noisy)
+    return ExplainedMaps([each.without_factors() for each in maps], noisy, broken)
+
+
+def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages) -> list[LocalMap]:
+    """Noisy maps without false detections, judged again under the noise that was fitted.
+
+    Where a drive does not fit even so, no tag of its component is taken for moved: something else is wrong. Where it
+    fits, tags that moved stand out when all drives are solved together.
+
+    Args:
+        maps: solved under the fitted noise.
+        noisy: names of the chains in question.
+        stages: told what is being done.
+    """
+    found = list(maps)
+    for i, each in enumerate(maps):
+        if each.chain.name in noisy and each.chain.tags:
+            with stages.stage("checking that it fits"):
+                again = judged(without_false_detections(each))
+            found[i] = replace(again, is_doubtful=not again.goodness.fits).without_factors()
+    return found

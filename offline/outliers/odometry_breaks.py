@@ -123,7 +123,7 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
     Nor is there one where the effort is spent before it is found; the whole log's where None.
     """
     chain, effort = local_map.chain, effort or _all_of(local_map)
-    if _fits(local_map):
+    if _fits(local_map) or local_map.is_noisy:
         return None
     grown = [grown_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)

@@ -14,11 +14,8 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, IntArray
-from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.measurements import Chain, TagKey, passes_of
 
-# Longer out of sight, by the way driven or by the clock, and it is another sighting.
-GAP_M: Final = 2.0
-_GAP_S: Final = 10.0
 _INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
 
 
@@ -120,20 +117,14 @@ def sightings_of(chains: Sequence[Chain], begins: BoolArray | None = None) -> Si
 
 def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:
     """(s, 4) tag, first and last stamp, number of readings of each sighting; and (M,) the sighting of each reading."""
-    readings = chain.readings
-    order = np.lexsort((readings.keyframe, readings.tag))
-    tag, keyframe = readings.tag[order], readings.keyframe[order]
-    along_m = chain.along_m[keyframe]
-    stamps_ns = chain.stamps_ns[keyframe]
-    begins = np.ones(len(order), dtype=np.bool_)
-    begins[1:] = cut[order][1:] | (np.diff(tag) != 0) | (np.diff(along_m) > GAP_M) | (np.diff(stamps_ns) > _GAP_S * 1e9)
-    number = np.cumsum(begins) - 1
-    starts = np.flatnonzero(begins)
-    count = np.diff(np.append(starts, len(order)))
-    of_reading = np.empty(len(order), dtype=np.int64)
-    of_reading[order] = number
-    ends = starts + count - 1
-    return np.column_stack([tag[starts], stamps_ns[starts], stamps_ns[ends], count]).reshape(-1, 4), of_reading
+    of_reading = passes_of(chain, cut)
+    order = np.lexsort((chain.readings.keyframe, chain.readings.tag))
+    count = np.bincount(of_reading)
+    ends = np.cumsum(count) - 1
+    first, last = order[ends - count + 1], order[ends]
+    stamps_ns = chain.stamps_ns[chain.readings.keyframe]
+    rows = [chain.readings.tag[first], stamps_ns[first], stamps_ns[last], count]
+    return np.column_stack(rows).reshape(-1, 4), of_reading
 
 
 def places_told_apart(chains: Sequence[Chain], sightings: Sightings) -> IntArray:

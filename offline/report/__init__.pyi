@@ -1,9 +1,10 @@
 from .picture import write_picture
 from .report import write_report
-from .sentences import advice_sentence
+from .sentences import advice_sentence, contradiction_sentence
 
 __all__ = [
     "advice_sentence",
+    "contradiction_sentence",
     "write_picture",
     "write_report",
 ]

@@ -18,9 +18,41 @@ _MOST_NAMED: Final = 4
 
 
 def sentences(document: dict[str, Any]) -> list[str]:
-    """Three to six sentences in plain English."""
-    told = [_joined(document), _how_good(document), _scale(document), *_mistrust(document), *_next(document)]
+    """Three to seven sentences in plain English, the first what the model does not explain."""
+    told = [
+        contradiction_sentence(document),
+        _joined(document),
+        _how_good(document),
+        _scale(document),
+        *_mistrust(document),
+        *_next(document),
+    ]
     return [sentence for sentence in told if sentence]
+
+
+def contradiction_sentence(document: dict[str, Any]) -> str:
+    """That drives contradict the model, how sure that is, and what to do; empty where they do not."""
+    components = document["components"]
+    worst = max(range(len(components)), key=lambda i: float(components[i]["sigma_factor"]), default=0)
+    misfit = components[worst]["misfit"] if components else None
+    if misfit is None:
+        return ""
+    where = f"In component {worst + 1} drives" if len(components) > 1 else "These drives"
+    if len(components[worst]["runs"]) == 1:
+        where = f"The drive {misfit['run']}"
+    what, look = _MISFITS[misfit["kind"]]
+    times, run = components[worst]["sigma_factor"], misfit["run"]
+    return (
+        f"{where} {'contradicts' if where.startswith('The ') else 'contradict'} {what} by more than chance explains "
+        f"({misfit['chi_square']:.0f} squared sigmas, {misfit['expected']} expected): all sigmas are {times:.1f} times "
+        f"as large as computed. Look at {look}; {run} fits worst: look at its log, or drive it again."
+    )
+
+
+_MISFITS: Final = {
+    "joins": ("each other", "suspect tags, wheels held against tags and calibration in the report"),
+    "windows": ("the model", "suspect tags and at the drive's residuals in the report"),
+}
 
 
 def largest_sigma_m(covariance: Sequence[Sequence[float | None]]) -> float | None:
@@ -153,6 +185,8 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
     n_warnings = len(document["warnings"])
     if n_warnings:
         told.append(f"The map comes with {counted(n_warnings, 'warning')}, below.")
+    if contradiction_sentence(document):
+        return told
     return told or ["Nothing in it contradicts anything else by more than chance allows."]
 
 

@@ -188,7 +188,7 @@ def _reading_factors(
         by_camera = readings.in_camera[:, None]
         mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
         mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(chain.run.robot)), 0))
-        camera_parameters.append(np.where(by_camera, _indices(parameters, camera_parameters_of(chain)), 0))
+        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(chain)), (len(readings), 1)))
         scale_parameter.append(scales[readings.tag])
     return ReadingFactors(
         pose=np.concatenate(pose),
@@ -207,8 +207,9 @@ def _reading_factors(
 def _parameters(chain: Chain) -> list[Parameter]:
     robot = chain.run.robot
     found = parameters_of_wheels(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
+    found += camera_parameters_of(chain)
     if chain.readings.in_camera.any():
-        found += mount_parameters_of(robot) + camera_parameters_of(chain)
+        found += mount_parameters_of(robot)
     return [p for p in found if p != NO_PARAMETER]
 
 

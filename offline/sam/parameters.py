@@ -56,21 +56,22 @@ def mount_parameters_of(robot: Robot) -> list[Parameter]:
 
 
 def camera_parameters_of(chain: Chain) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS; none of them is known to positions that somebody else worked out."""
-    if not chain.readings.by_camera.any():
-        return [NO_PARAMETER] * len(CAMERA_PARAMETERS)
-    return parameters_of_camera(chain.run.robot)
+    """In the order of CAMERA_PARAMETERS; none where no reading of the chain depends on it."""
+    by_camera = chain.readings.by_camera
+    parameters = parameters_of_camera(chain.run.robot)
+    return [each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)]
 
 
 def parameters_of_camera(robot: Robot) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS, for readings of corners."""
+    """In the order of CAMERA_PARAMETERS."""
     mount = robot.mount
     nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
     sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
-    *of_mount_and_time, of_edges = CAMERA_PARAMETERS
+    *of_mount_and_time, of_edges, of_range = CAMERA_PARAMETERS
     return [
         *(Parameter(robot.robot_id, *each) for each in zip(of_mount_and_time, [nominal] * 3, sigmas, strict=True)),
         Parameter(robot.robot_id, of_edges, (robot.edge_shift_px,), robot.edge_shift_px_sigma),
+        Parameter(robot.robot_id, of_range, (robot.imported_range_offset_m,), robot.imported_range_offset_m_sigma),
     ]
 
 

@@ -1,3 +1,4 @@
+from .left_open import with_start_values
 from .option import AUTO, OFF, Calibrate, parse_calibrate
 from .robot import Learnt, Owned, corrected
 from .self_calibration import TIMES_MAPPED, about_the_files, free_what_is_told, refocused
@@ -18,4 +19,5 @@ __all__ = [
     "learnt_lines",
     "parse_calibrate",
     "refocused",
+    "with_start_values",
 ]

@@ -5,7 +5,6 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from groundsbot.calib.robot import (
-    CAMERA_PARAMETERS,
     EDGE_SHIFT,
     FOCAL_SCALE,
     IMPORTED_BATCH,
@@ -19,7 +18,7 @@ from groundsbot.calib.robot import (
     Wheels,
 )
 
-_WHEEL_SCALE, _WHEEL_RATIO, _TRACK_SCALE = WHEEL_PARAMETERS
+_WHEEL_SCALE, _WHEEL_RATIO, TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"
 
 # What may be freed, and how far off a robot can be at all: what lies beyond is no error of calibration but the file of
@@ -28,7 +27,7 @@ _MOUNT: Final = "mount_"
 LIMITS: Final[Mapping[str, float]] = MappingProxyType(
     {
         **dict.fromkeys(WHEEL_PARAMETERS, 0.1),
-        **dict.fromkeys((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), 0.2),  # rad; 11 degrees
+        **dict.fromkeys((*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad"), 0.2),  # rad; 11 degrees
         "mount_x_m": 0.2,
         "mount_y_m": 0.2,
         TIME_OFFSET: 0.2,
@@ -60,7 +59,7 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
         return freed.get(Owned(robot.robot_id, name))
 
     wheels, mount = robot.wheels, robot.mount
-    track = sigma(_TRACK_SCALE)
+    track = sigma(TRACK_SCALE)
     changed: dict[str, object] = {
         "radii_scale_sigma": sigma(_WHEEL_SCALE) or wheels.radii_scale_sigma,
         "radii_ratio_sigma": sigma(_WHEEL_RATIO) or wheels.radii_ratio_sigma,
@@ -97,7 +96,7 @@ def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
         return learnt.get(Owned(robot.robot_id, name))
 
     changed: dict[str, object] = {
-        "wheels": _corrected_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(_TRACK_SCALE)),
+        "wheels": _corrected_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(TRACK_SCALE)),
         "mount": _corrected_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
         "tags": [_corrected_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
     }

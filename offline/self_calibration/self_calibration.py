@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from groundsbot.calib.camera import CameraModel
-from groundsbot.calib.robot import FOCAL_SCALE, IMPORTED_BATCH, TAG_SCALE, NoiseParameters
+from groundsbot.calib.robot import FOCAL_SCALE, IMPORTED_BATCH, TAG_SCALE, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Chain, Run
@@ -18,7 +18,10 @@ from groundsbot.offline.self_calibration.selection import choose
 # metres by then, and stamps on one clock; both are as good to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
 TIMES_MAPPED: Final = 2  # the runs are, where this comes before their map
-_ADDED: Final = frozenset({"mount_x_m", "mount_y_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad"})
+_ADDED: Final = frozenset({"mount_x_m", "mount_y_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad", TIME_OFFSET})
+
+
+_NOTHING: Final = Learnt(0.0, 0.0)
 
 
 class Freed(NamedTuple):
@@ -48,7 +51,7 @@ def free_what_is_told(
     return Freed(
         [
             replace(
-                run,
+                run.retimed(right.get(Owned(run.robot_id, TIME_OFFSET), _NOTHING).value),
                 robot=opened(corrected(run.robot, right), freed),
                 camera=refocused(run.camera, right.get(Owned(run.robot_id, FOCAL_SCALE))),
             )
@@ -71,15 +74,22 @@ def about_the_files(
     """Corrections to the files as they were given: what was put right before is part of them."""
     right, found = _put_right(choices), []
     for each in calibration:
-        before = right.get(Owned(each.owner, each.name), Learnt(0.0, 0.0)).value
-        together = each.value + before + (each.value * before if each.name in _SCALES else 0.0)
-        found.append(replace(each, value=together))
+        before = right.get(Owned(each.owner, each.name), _NOTHING).value
+        found.append(replace(each, value=_one_after_the_other(each.name, before, each.value)))
     return found
 
 
 def _put_right(choices: Sequence[CalibrationChoice]) -> dict[Owned, Learnt]:
-    return {
-        Owned(each.owner, each.name): Learnt(each.value, each.sigma)
-        for each in choices
-        if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH)
-    }
+    """What was put into robots' files before the map was made; of a number that was twice, both together."""
+    right: dict[Owned, Learnt] = {}
+    for each in choices:
+        if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH):
+            owned = Owned(each.owner, each.name)
+            before = right.get(owned, _NOTHING).value
+            right[owned] = Learnt(_one_after_the_other(each.name, before, each.value), each.sigma)
+    return right
+
+
+def _one_after_the_other(name: str, before: float, after: float) -> float:
+    """Two corrections of one number: shares of shares, or sums."""
+    return before + after + (before * after if name in _SCALES else 0.0)

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from groundsbot.offline.cli import app
-from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.logs import run_info_of
 from tests.support.paper_recordings import RECORDINGS, needs_recordings
 from tests.support.paths import ROOT
 
@@ -30,7 +28,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def merged(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     folder = tmp_path_factory.mktemp("merged") / "map"
-    _succeeds("map", logs, "-o", folder)
+    done = _run("map", logs, "-o", folder)
+    assert done.exit_code in (0, 3), done.output  # 3: the drives contradict each other, which its first line says
     found: dict[str, object] = json.loads((folder / "map.json").read_text())
     return found
 
@@ -41,7 +40,7 @@ def test_the_two_runs_merge_into_one_map_of_all_tags(merged: dict[str, list[dict
     (alignment,) = merged["alignments"]
     assert alignment["n_shared"] == 12
     assert isinstance(alignment["n_inliers"], int)
-    assert alignment["n_inliers"] >= 10
+    assert alignment["n_inliers"] >= 11
     assert alignment["is_sure"]
 
 
@@ -56,40 +55,34 @@ def test_readme_quotes_the_distance_found(merged: dict[str, list[dict[str, float
     assert float(quoted[3]) == MEASURED_BY_HAND_M
 
 
-def test_that_wheels_and_tags_disagree_about_the_metre_is_said_with_its_sigma(
-    merged: dict[str, list[Any]],
-) -> None:
-    scales = [check for check in merged["checks"] if check["name"] == "scale"]
-    assert [check["robot_id"] for check in scales] == ["hallway", "loop"]
-    for check in scales:
-        assert check["value"] > 0.0
-        assert check["sigmas"] > 4.0
-        figures = f"{100.0 * check['value']:.2f} % (sigma {100.0 * check['sigma']:.2f} %) longer by the wheels of"
-        (said,) = [warning for warning in merged["warnings"] if f"{figures} {check['robot_id']}" in warning]
-        assert "outer edge of the black border" in said
+def test_clocks_and_lever_arm_are_found(merged: dict[str, list[Any]]) -> None:
+    """Detections were late by 0.42 s (the data's description), and the authors' code has a lever arm of 0.932 m."""
+    found = {(each["owner"], each["name"]): each for each in merged["calibration"]}
+    for drive in ("hallway", "loop"):
+        assert found[drive, "time_offset_s"]["value"] == pytest.approx(0.42, abs=0.05)
+        arm = found[drive, "mount_x_m"]
+        assert abs(arm["value"] - 0.932) < 2.0 * arm["sigma"]
 
 
-def test_readme_quotes_the_distance_with_the_size_of_tags_open_too(logs: Path, tmp_path: Path) -> None:
-    """Wheels then carry the metre, as the robots' files have them."""
-    given: list[object] = []
-    for log in find_logs([logs]):
-        robot = tmp_path / f"{log.name}.yaml"
-        robot.write_text(run_info_of(log).robot_yaml + "imported_tag_scale_sigma: 0.3\n")
-        given += ["--robot", robot]
-    _succeeds("map", logs, "-o", tmp_path / "map", *given)
-    found: dict[str, Any] = json.loads((tmp_path / "map" / "map.json").read_text())
-    (pair,), (scale,) = found["start_to_start"], [each for each in found["calibration"] if each["name"] == "tag_scale"]
-    quoted = re.search(
-        r"it is ([\d.]+) m \(sigma ([\d.]+) m\), tags ([\d.]+) % \(([\d.]+) %\) larger",
-        (ROOT / "README.md").read_text(),
-    )
-    assert quoted is not None
-    assert float(quoted[1]) == pytest.approx(pair["distance_m"], abs=0.005)
-    assert float(quoted[2]) == pytest.approx(pair["sigma_m"], abs=0.005)
-    assert float(quoted[3]) == pytest.approx(100.0 * scale["value"], abs=0.05)
-    assert float(quoted[4]) == pytest.approx(100.0 * scale["sigma"], abs=0.05)
+def test_no_tag_is_named_and_the_truth_lies_within_two_sigmas(merged: dict[str, list[Any]]) -> None:
+    assert merged["suspect_tags"] == []
+    (pair,) = merged["start_to_start"]
+    assert abs(pair["distance_m"] - MEASURED_BY_HAND_M) < 2.0 * pair["sigma_m"]
+    assert pair["sigma_m"] < 1.5
+
+
+def test_sigmas_that_were_widened_are_said_first(merged: dict[str, list[Any]], logs: Path, tmp_path: Path) -> None:
+    (component,) = merged["components"]
+    assert component["sigma_factor"] > 1.0
+    done = _run("map", logs, "-o", tmp_path / "map")
+    assert done.exit_code == 3
+    assert f"{component['sigma_factor']:.1f} times as large as computed" in done.stdout.splitlines()[0]
 
 
 def _succeeds(*words: object) -> None:
-    done = CliRunner().invoke(app, [str(word) for word in words])
+    done = _run(*words)
     assert done.exit_code == 0, done.output
+
+
+def _run(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])

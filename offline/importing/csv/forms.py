@@ -4,7 +4,7 @@ Every form ends as the same two things: cumulative distances of both wheels, and
 LEFT. docs/formats.md describes the forms for people.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import hypot, pi
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import CsvTable, read_table
-from groundsbot.offline.importing.robot import WheelScale
+from groundsbot.offline.importing.robot import NOMINAL_TRACK_M, WheelScale
 from groundsbot.offline.measurements import MAX_RANGE_M
 
 MAX_WHEEL_SPEED_M_S: Final = 20.0  # beyond it the unit is wrong, a counter was reset, or a time is
@@ -26,11 +26,16 @@ _MAX_SIGMA: Final = MAX_RANGE_M  # a map leaves out a position that is known no 
 
 @dataclass(frozen=True)
 class WheelPath:
-    """Cumulative distances of both wheels: the first entry is the run's start, at zero."""
+    """Cumulative distances of both wheels: the first entry is the run's start, at zero.
+
+    Attributes:
+        needs_track: whether turns follow from the distance between the wheels; the file may hold them itself.
+    """
 
     stamps_ns: list[int]
     left_m: list[float]
     right_m: list[float]
+    needs_track: bool = True
 
     @property
     def distance_m(self) -> float:
@@ -76,7 +81,7 @@ def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
         said = "wheel speeds, each the mean since the row before"
     else:
         left, right = _wheel_speeds(table, scale)
-        wheels = _from_speeds(stamps, left, right)
+        wheels = replace(_from_speeds(stamps, left, right), needs_track=False)
         said = "forward and turning speeds, each the mean since the row before"
     _check_speeds(table, form[0], wheels)
     return wheels, said
@@ -220,10 +225,8 @@ def _from_ticks(table: CsvTable, stamps_ns: list[int], scale: WheelScale) -> Whe
 
 
 def _wheel_speeds(table: CsvTable, scale: WheelScale) -> tuple[list[float], list[float]]:
-    if scale.track_m is None:
-        raise OfflineError(f"{table.path}: omega_rad_s needs the wheels' distance; give --track-width-m, or --robot")
     forward, turning = table.numbers("v_m_s"), table.numbers("omega_rad_s")
-    half_m = scale.track_m / 2
+    half_m = (scale.track_m or NOMINAL_TRACK_M) / 2
     left = [v - omega * half_m for v, omega in zip(forward, turning, strict=True)]
     right = [v + omega * half_m for v, omega in zip(forward, turning, strict=True)]
     return left, right

@@ -20,7 +20,17 @@ from groundsbot.offline.importing.csv.forms import (
     read_paper_odometry,
     refuse_tick_options,
 )
-from groundsbot.offline.importing.robot import ImportOptions, describe_robot, safe_name, wheel_scale
+from groundsbot.offline.importing.robot import (
+    ENCODER_SCALE_SIGMA,
+    RANGE_SCALE_SIGMA,
+    SPEED_SCALE_SIGMA,
+    TOLD_SIZE_SIGMA,
+    ImportOptions,
+    KnownRobot,
+    describe_robot,
+    safe_name,
+    wheel_scale,
+)
 from groundsbot.offline.importing.run_writer import Entry, ImportReport, check_output, write_run
 from groundsbot.onboard.log import PlanarOdometry, RunInfo, TagObservation, TagObservations
 
@@ -36,6 +46,7 @@ class _Drive:
     n_odometry: int
     observations: list[Observation]
     in_camera: bool
+    range_scale_sigma: float
     remarks: list[str]
 
 
@@ -55,7 +66,12 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
     drive = _read_drive(folder, options)
-    robot, robot_yaml, robot_remarks = describe_robot(folder, options, drive.in_camera)
+    known = KnownRobot(
+        needs_track=drive.wheels.needs_track,
+        wheel_scale_sigma=ENCODER_SCALE_SIGMA if drive.wheels.needs_track else SPEED_SCALE_SIGMA,
+        range_scale_sigma=drive.range_scale_sigma,
+    )
+    robot, robot_yaml, robot_remarks = describe_robot(folder, options, drive.in_camera, known)
     info = RunInfo(
         run_id=run_id,
         robot_id=robot.robot_id,
@@ -101,9 +117,10 @@ def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
         raise OfflineError(f"{folder}: --state-rate-hz is for odom.csv; odometry.csv holds its own times, leave it out")
     wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options))
     observations = read_observations(folder / _HEADER_PAIR[1], family_size(options.tag_family) - 1)
-    where = "the camera's frame" if options.has_mount else "base (no --camera option given)"
+    in_camera = options.has_mount or options.robot is None
+    where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot, and no --camera option)"
     remarks = [f"odometry.csv: {form}", f"observations.csv: taken to be in {where}, y to the left"]
-    return _Drive(wheels, len(wheels.stamps_ns), observations, options.has_mount, remarks)
+    return _Drive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks)
 
 
 def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
@@ -120,7 +137,7 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
         f"odom.csv: the paper's form, {rate_hz:g} states a second",
         "landmarks.csv: the paper's form, in the camera's frame, y turned from right to left",
     ]
-    return _Drive(wheels, n_states, observations, True, remarks)
+    return _Drive(wheels, n_states, observations, True, TOLD_SIZE_SIGMA, remarks)
 
 
 def _n_outside(drive: _Drive) -> int:

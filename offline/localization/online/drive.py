@@ -33,7 +33,7 @@ class TagReading:
         family, tag_id: of the tag.
         value: (2,) range_m and bearing_rad, left positive; or x_m and y_m.
         covariance: (2, 2) of the value.
-        by_camera: (2, 4) its derivative by `readings.CAMERA_PARAMETERS`; None where not known.
+        by_camera: (2, 5) its derivative by `readings.CAMERA_PARAMETERS`; None where not known.
         polar: which form.
         in_camera: about the camera's place and yaw, else about base.
     """

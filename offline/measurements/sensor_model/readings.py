@@ -22,7 +22,7 @@ class Readings:
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
         parts: what the covariance is made of.
-        by_camera: (M, 2, 4) derivative of the value by CAMERA_PARAMETERS.
+        by_camera: (M, 2, 5) derivative of the value by CAMERA_PARAMETERS.
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
         corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.

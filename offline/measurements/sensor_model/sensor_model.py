@@ -8,7 +8,7 @@ from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.calib.robot import CAMERA_PARAMETERS, NoiseParameters, Robot
+from groundsbot.calib.robot import CAMERA_PARAMETERS, RANGE_OFFSET, TIME_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
@@ -28,7 +28,8 @@ from groundsbot.offline.measurements.sensor_model.tilted_tags import (
 from groundsbot.offline.measurements.tags import Detections, Positions
 
 # What the covariance of an imported position without one is made of.
-POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad")
+STAMP_NOISE: Final = "sigma_stamp_s"  # an error of it is common to all that a picture shows
+POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad", STAMP_NOISE)
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -162,12 +163,22 @@ def _sides_m(run: Run, tag: IntArray) -> FloatArray:
     return np.array([run.robot.tag_size_m(run.tags[t].family, run.tags[t].tag_id)[0] for t in seen])[index]
 
 
-def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParameters) -> tuple[Readings, list[str]]:
+def read_positions(
+    robot: Robot, positions: Positions, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
+) -> tuple[Readings, list[str]]:
     """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's.
+
+    Args:
+        robot: whose sensor it is: its mount, and by how much it reads ranges too long.
+        positions: (M,) of one stretch.
+        keyframe: (M,) the keyframe of each.
+        twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
+        noise: for the sigmas of range and bearing.
 
     Returns:
         The readings, and a sentence if some were left out.
     """
+    positions = _with_right_ranges(robot, positions)
     first, second = positions.value[:, 0], positions.value[:, 1]
     range_m = np.where(positions.polar, first, np.hypot(first, second))
     with np.errstate(invalid="ignore"):
@@ -178,20 +189,21 @@ def read_positions(positions: Positions, keyframe: IntArray, noise: NoiseParamet
     value[convert] = np.stack([range_m, np.arctan2(second, first)], axis=-1)[convert]
     covariance = positions.covariance.copy()
     modelled = unknown & good
-    covariance[modelled] = 0.0
-    covariance[modelled, 0, 0] = noise.sigma_range_m**2 + (noise.sigma_range_per_m * range_m[modelled]) ** 2
-    covariance[modelled, 1, 1] = noise.sigma_bearing_rad**2
+    polar = positions.polar | unknown
+    usable = np.where(good[:, None], value, 1.0)  # others may be no numbers, and are left out below
+    by_camera = _by_sensor(robot, usable, polar, positions.in_camera, twist[keyframe])
+    by_stamp = by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+    parts = _position_parts(range_m, modelled, covariance, by_stamp)
+    covariance[modelled] = parts.under(noise)[modelled]
     good &= _are_covariances(covariance)
-    parts = _position_parts(range_m, modelled, covariance)
-    unaffected = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
     readings = Readings(
         keyframe,
         positions.tag,
         value,
         covariance,
         parts,
-        unaffected,
-        positions.polar | unknown,
+        by_camera,
+        polar,
         positions.in_camera,
         corners_px=np.full((len(value), 4, 2), np.nan),
         corner_bias_px=np.zeros((len(value), 2)),
@@ -214,7 +226,7 @@ def _are_covariances(matrices: FloatArray) -> BoolArray:
 
 
 def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArray:
-    """(M, 2, 4) derivative of readings by CAMERA_PARAMETERS.
+    """(M, 2, 5) derivative of readings of corners by CAMERA_PARAMETERS.
 
     Args:
         robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
@@ -222,14 +234,61 @@ def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArra
         twist: (M, 2) speed and turning rate.
     """
     range_m, bearing_rad = found.range_bearing.T
-    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
-    speed, turning = twist.T
-    # How a tag moves as seen from the camera, whose place moves with base: a picture that was taken later shows that.
-    x_rate = -speed + turning * (robot.mount.y_m + range_m * sin)
-    y_rate = -turning * (robot.mount.x_m + range_m * cos)
-    by_time = np.stack([cos * x_rate + sin * y_rate, (cos * y_rate - sin * x_rate) / range_m], axis=-1)
+    apart_m = range_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad)], axis=-1)
+    rates = _rates(np.array([robot.mount.x_m, robot.mount.y_m]) + apart_m, twist)
+    by_time = _by_place(apart_m, np.ones(len(range_m), dtype=np.bool_), rates)
     by_turn = found.by_turn @ _mount_axes(robot).T
-    return np.concatenate([by_turn, by_time[..., None], found.by_edge[..., None]], axis=-1)
+    none = np.zeros_like(by_time)  # an offset of ranges belongs to imported positions
+    return np.concatenate([by_turn, np.stack([by_time, found.by_edge, none], axis=-1)], axis=-1)
+
+
+def _by_sensor(
+    robot: Robot, value: FloatArray, polar: BoolArray, in_camera: BoolArray, twist: FloatArray
+) -> FloatArray:
+    """(M, 2, 5) derivative of imported positions by CAMERA_PARAMETERS: by time offset and range offset only.
+
+    Args:
+        robot: whose mount holds for those that are in_camera.
+        value: (M, 2) in either form.
+        polar: (M,) which.
+        in_camera: (M,) about the camera's place and yaw, else about base.
+        twist: (M, 2) speed and turning rate.
+    """
+    mount = np.where(in_camera[:, None], [robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad], 0.0)
+    cos, sin = np.cos(value[:, 1]), np.sin(value[:, 1])
+    in_sensor = np.where(polar[:, None], value[:, :1] * np.stack([cos, sin], axis=-1), value)
+    to_sensor = np.column_stack([np.zeros((len(value), 2)), -mount[:, 2]])
+    rates = se2.apply(to_sensor, _rates(se2.apply(mount, in_sensor), twist))
+    found = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
+    found[..., CAMERA_PARAMETERS.index(TIME_OFFSET)] = _by_place(in_sensor, polar, rates)
+    range_m = np.maximum(np.hypot(in_sensor[:, 0], in_sensor[:, 1]), 1e-6)
+    outwards = np.where(polar[:, None], [1.0, 0.0], in_sensor / range_m[:, None])
+    found[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)] = -outwards
+    return found
+
+
+def _rates(in_base_m: FloatArray, twist: FloatArray) -> FloatArray:
+    """(M, 2) m/s by which tags (M, 2) move in base: a picture that was taken later shows them there."""
+    speed, turning = twist.T
+    return np.stack([turning * in_base_m[:, 1] - speed, -turning * in_base_m[:, 0]], axis=-1)
+
+
+def _by_place(in_sensor_m: FloatArray, polar: BoolArray, moved: FloatArray) -> FloatArray:
+    """(M, 2) change of readings where tags (M, 2) move by (M, 2) in the sensor's axes."""
+    x, y = in_sensor_m.T
+    range_m = np.maximum(np.hypot(x, y), 1e-6)
+    along, across = (x * moved[:, 0] + y * moved[:, 1]) / range_m, (x * moved[:, 1] - y * moved[:, 0]) / range_m
+    return np.where(polar[:, None], np.stack([along, across / range_m], axis=-1), moved)
+
+
+def _with_right_ranges(robot: Robot, positions: Positions) -> Positions:
+    """Positions with ranges as they are, where robot.yaml says how the sensor reads them."""
+    if not robot.imported_range_offset_m:
+        return positions
+    range_m = np.where(positions.polar, positions.value[:, 0], np.hypot(*positions.value.T))
+    shorter = 1.0 - robot.imported_range_offset_m / np.maximum(range_m, 1e-6)
+    times = np.where(positions.polar[:, None], np.stack([shorter, np.ones_like(shorter)], axis=-1), shorter[:, None])
+    return replace(positions, value=positions.value * times)
 
 
 def _mount_axes(robot: Robot) -> FloatArray:
@@ -253,10 +312,13 @@ def _corner_parts(
     return CovarianceParts(("sigma_corner_px",), unit[None], rest)
 
 
-def _position_parts(range_m: FloatArray, modelled: BoolArray, covariance: FloatArray) -> CovarianceParts:
-    """Of imported positions: by the noise model, or as the log says."""
+def _position_parts(
+    range_m: FloatArray, modelled: BoolArray, covariance: FloatArray, by_stamp: FloatArray
+) -> CovarianceParts:
+    """Of imported positions: by the noise model, or as the log says; (M, 2) is their change in a second."""
     unit = np.zeros((len(POSITION_NOISE), len(range_m), 2, 2))
     unit[0, modelled, 0, 0] = 1.0
     unit[1, modelled, 0, 0] = range_m[modelled] ** 2
     unit[2, modelled, 1, 1] = 1.0
+    unit[3, modelled] = (by_stamp[:, :, None] * by_stamp[:, None, :])[modelled]
     return CovarianceParts(POSITION_NOISE, unit, np.where(modelled[:, None, None], 0.0, covariance))

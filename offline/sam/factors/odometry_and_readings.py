@@ -131,7 +131,7 @@ class ReadingFactors:
         whitening: (M, 2, 2).
         mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
         mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
-        by_camera: (M, 2, 4) derivative of the value by four more calibration numbers, camera_parameters: (M, 4).
+        by_camera: (M, 2, 5) derivative of the value by five more calibration numbers, camera_parameters: (M, 5).
     """
 
     pose: IntArray

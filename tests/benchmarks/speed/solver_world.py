@@ -11,6 +11,7 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
@@ -71,8 +72,8 @@ def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
         ),
         readings=ReadingFactors(
             pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_READING), (n, 1, 1)),
-            np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros((n, 2, 4)),
-            np.zeros((n, 4), dtype=np.int64),
+            np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64),
+            np.zeros((n, 2, len(CAMERA_PARAMETERS))), np.zeros((n, len(CAMERA_PARAMETERS)), dtype=np.int64),
         ),
         prior=CalibrationPrior(np.zeros(1)),
         columns=_columns(len(poses), len(seen)),

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.corners.factors import CornerFactors, Looks, SpatialColumns, SpatialState
 from groundsbot.offline.corners.floor_noise import guessed_wobble
 from groundsbot.offline.corners.multifrontal.fronts import (
@@ -99,8 +100,8 @@ def made_problem(
             np.zeros((0, 3)),
             np.zeros((0, 3), dtype=int),
             none,
-            np.zeros((0, 2, 4)),
-            np.zeros((0, 4), dtype=int),
+            np.zeros((0, 2, len(CAMERA_PARAMETERS))),
+            np.zeros((0, len(CAMERA_PARAMETERS)), dtype=int),
         ),
         prior=CalibrationPrior(SIGMAS),
         measured=NOTHING_MEASURED,

@@ -13,6 +13,7 @@ from tests.support.programs import Run, on_terminal
 
 ALL = [
     "reading logs",
+    "start values of robots",
     "keyframes and readings",
     "local maps",
     "tags that do not belong",
@@ -21,9 +22,9 @@ ALL = [
     "aligning local maps",
     "building the graph",
     "solving all runs together",
+    "checking that it fits",
     "covariances",
     "advice",
-    "checking that it fits",
     "writing files",
     "drawing the picture",
     "writing the report",

@@ -14,6 +14,7 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.global_map.weak_constraints import weak_parts
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
@@ -161,8 +162,8 @@ def test_a_long_drive_past_one_tag_is_solved_and_says_what_rounding_does() -> No
             np.zeros((1, 3)),
             no_mount,
             one,
-            np.zeros((1, 2, 4)),
-            np.zeros((1, 4), dtype=np.int64),
+            np.zeros((1, 2, len(CAMERA_PARAMETERS))),
+            np.zeros((1, len(CAMERA_PARAMETERS)), dtype=np.int64),
         ),
         CalibrationPrior(np.array([0.0, 0.005, 0.007, 0.01])),
         Columns(by_kind[0].reshape(-1, 3), by_kind[1].reshape(-1, 2), by_kind[2], 3 * n + 5),

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.importing.bags.importer import import_bag
 from groundsbot.offline.importing.bags.topics import BagOptions
 from groundsbot.offline.importing.robot import ImportOptions
@@ -16,7 +17,7 @@ from groundsbot.offline.importing.run_writer import ImportReport
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.run import RobotFile, load_run
 from groundsbot.onboard.detection.tag_detector import TagDetector
 from groundsbot.onboard.log.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log
@@ -34,6 +35,7 @@ SHORT = made_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)])
 PICTURES = CameraModel("c", 640, 480, 600.0, 601.0, 320.5, 239.5, "plumb_bob", (-0.18, 0.07, 0.0006, -0.0004, 0.0))
 OPTIONS = ImportOptions(run_id="one", robot_id="carl", track_width_m=0.5)
 SIZED = BagOptions(tag_size_m=0.15)
+NOISE = NoiseParameters()  # given: how noise is fitted is no matter of bags
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +59,12 @@ def bare_position_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def corner_map(corner_log: Path) -> MapResult:
-    return build_map(read_runs([corner_log]))
+    return build_map(read_runs([corner_log]), noise=NOISE)
 
 
 @pytest.fixture(scope="module")
 def position_map(position_log: Path) -> MapResult:
-    return build_map(read_runs([position_log]))
+    return build_map(read_runs([position_log]), noise=NOISE)
 
 
 def _position_log(folder: Path, *, with_covariances: bool = True) -> Path:
@@ -105,6 +107,14 @@ def imported(
     return import_bag(bag, tmp_path / "logs", options, bag_options, lambda *_: None)
 
 
+def map_of(imported_run: Path, log: Path) -> MapResult:
+    """With the robot.yaml of the log that the bag was made of: the import's own leaves more open."""
+    robot, of_log = load_run(imported_run).robot, load_run(log)
+    np.testing.assert_allclose(robot.mount.T_base_camera.as_matrix(), of_log.robot.mount.T_base_camera.as_matrix())
+    assert robot.wheels.track_m == of_log.robot.wheels.track_m
+    return build_map(read_runs([imported_run], {robot.robot_id: RobotFile(of_log.robot, None)}), noise=NOISE)
+
+
 def assert_same_map(a: MapResult, b: MapResult, tolerance: float = 1e-6) -> None:
     """Places within a micrometre, covariances within a millionth."""
     (one,), (other,) = a.components, b.components
@@ -131,7 +141,7 @@ def test_a_bag_of_corners_gives_the_map_of_its_log(
         (bag,) = bag.glob("*.mcap")
     options = replace(OPTIONS, wheel_radius_m=0.1) if form == "joints" else OPTIONS
     report = imported(bag, tmp_path, options)
-    assert_same_map(corner_map, build_map(read_runs([report.run_folder])))
+    assert_same_map(corner_map, map_of(report.run_folder, corner_log))
 
 
 @pytest.mark.parametrize("form", ["apriltag_ros", "isaac"])
@@ -143,7 +153,7 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
     made = made.apriltag_ros() if form == "apriltag_ros" else made.isaac_poses()
     bag = made.write(tmp_path / ("drive.bag" if form == "apriltag_ros" else "drive"))
     report = imported(bag, tmp_path, bag_options=BagOptions())
-    assert_same_map(position_map, build_map(read_runs([report.run_folder])))
+    assert_same_map(position_map, map_of(report.run_folder, position_log))
     n_without = sum(not each.covariance for message in made.observations for each in message.observations)
     assert any(f"those of {n_without} readings of {report.n_observations} are zeros" in each for each in report.remarks)
 
@@ -151,7 +161,9 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
 def test_a_bag_with_tags_in_tf_gives_the_map_of_its_log(tmp_path: Path, bare_position_log: Path) -> None:
     bag = BagOfLog.of(bare_position_log).mount().odometry().tag_transforms().write(tmp_path / "drive")
     report = imported(bag, tmp_path, bag_options=BagOptions())
-    assert_same_map(build_map(read_runs([bare_position_log])), build_map(read_runs([report.run_folder])))
+    assert_same_map(
+        build_map(read_runs([bare_position_log]), noise=NOISE), map_of(report.run_folder, bare_position_log)
+    )
 
 
 def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: Path, corner_map: MapResult) -> None:
@@ -161,11 +173,22 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
     bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulated(made.poses, steps))
     report = imported(bag.write(tmp_path / "drive"), tmp_path)
     assert "covariances of the odometry are used: by how much each step adds to those of the pose" in report.remarks
-    expected = build_map(read_runs([_with_covariances(corner_log, made.poses, steps, tmp_path / "expected")]))
-    found = build_map(read_runs([report.run_folder]))
+    log = _with_covariances(corner_log, made.poses, steps, tmp_path / "expected")
+    expected = build_map(read_runs([log]), noise=NOISE)
+    found = map_of(report.run_folder, corner_log)
     assert_same_map(expected, found)
     (plain,), (given,) = corner_map.components, found.components
     assert not np.allclose(plain.tags[0].covariance, given.tags[0].covariance, rtol=0.05)
+
+
+def test_a_bag_leaves_open_what_it_does_not_tell(tmp_path: Path, position_log: Path) -> None:
+    """tf tells of the mount; neither clocks nor wheels nor who measured ranges are in a bag."""
+    bag = BagOfLog.of(position_log).mount().odometry().isaac_poses().write(tmp_path / "drive")
+    robot = load_run(imported(bag, tmp_path, replace(OPTIONS, track_width_m=None), BagOptions()).run_folder).robot
+    assert (robot.time_offset_s_sigma, robot.imported_range_offset_m_sigma) == (0.3, 0.1)
+    assert robot.wheels.track_m_sigma == pytest.approx(0.3 * robot.wheels.track_m)
+    assert (robot.wheels.radii_scale_sigma, robot.wheels.radii_ratio_sigma) == (0.01, 0.02)
+    assert robot.mount.x_m_sigma < 0.01
 
 
 def _with_covariances(log: Path, poses: FloatArray, steps: FloatArray, folder: Path) -> Path:

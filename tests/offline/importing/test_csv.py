@@ -43,10 +43,10 @@ def test_speeds_become_cumulative_distances(tmp_path: Path) -> None:
     assert report.distance_m == pytest.approx(1.75)
 
 
-def test_tags_of_one_time_are_one_message_in_base(tmp_path: Path) -> None:
+def test_tags_of_one_time_are_one_message(tmp_path: Path) -> None:
     report = imported(tmp_path)
     first, second = observations_of(report.run_folder)
-    assert (first.frame, first.stamp_ns) == ("base", 500_000_000)
+    assert (first.frame, first.stamp_ns) == ("camera_planar", 500_000_000)
     assert [(o.family, o.tag_id) for o in second.observations] == [("tag36h11", 7), ("tag36h11", 9)]
     assert [(o.cartesian.x_m, o.cartesian.y_m) for o in second.observations] == [(2, 1), (4, -1)]
     assert not second.observations[0].cartesian.has_z
@@ -178,9 +178,11 @@ def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> 
     files = {"odom.csv": "1,0,0\n", "landmarks.csv": "1,5,1,0.5,0\n"}
     folder = folder_with(tmp_path, files)
     unknown = import_folder(folder, tmp_path / "a", PAPER)
-    assert any("not given, so taken as 0 with a wide sigma: x (sigma 0.2 m)" in line for line in unknown.lines())
+    said = "not given, so taken as 0 with a wide sigma: x (sigma 0.5 m), y (sigma 0.5 m), yaw (sigma 8 deg)"
+    assert any(said in line for line in unknown.lines())
     mount = parse_robot_yaml(run_of(unknown.run_folder).robot_yaml, "log").mount
-    assert (mount.x_m, mount.x_m_sigma) == (0, 0.2)
+    assert (mount.x_m, mount.y_m, mount.yaw_rad) == (0, 0, 0)
+    assert (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma) == pytest.approx((0.5, 0.5, radians(8)))
     options = ImportOptions(track_width_m=0.5, state_rate_hz=4, camera_x_m=0.3, camera_y_m=0, camera_yaw_deg=90)
     known = import_folder(folder, tmp_path / "b", options)
     assert not any("not given" in line for line in known.lines())
@@ -189,10 +191,87 @@ def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> 
     assert mount.x_m_sigma < 0.01
 
 
-def test_a_camera_option_says_that_observations_are_in_the_cameras_frame(tmp_path: Path) -> None:
-    report = imported(tmp_path, options=ImportOptions(track_width_m=0.5, camera_x_m=0.2))
-    assert {message.frame for message in observations_of(report.run_folder)} == {"camera_planar"}
-    assert any("camera's frame" in line for line in report.lines())
+def test_of_a_mount_given_in_part_the_rest_is_open(tmp_path: Path) -> None:
+    log = imported(tmp_path, options=ImportOptions(track_width_m=0.5, camera_x_m=0.3)).run_folder
+    mount = parse_robot_yaml(run_of(log).robot_yaml, "log").mount
+    assert (mount.x_m, mount.y_m, mount.y_m_sigma) == (0.3, 0, 0.5)
+    assert mount.x_m_sigma < 0.01
+
+
+FRAMES = [
+    ({}, False, "camera_planar", "the frame of the camera (or other sensor)"),
+    ({"camera_x_m": 0.2}, False, "camera_planar", "the frame of the camera (or other sensor)"),
+    ({"camera_x_m": 0.2}, True, "camera_planar", "the frame of the camera (or other sensor)"),
+    ({}, True, "base", "base (--robot, and no --camera option)"),
+]
+
+
+@pytest.mark.parametrize(("options", "with_robot", "frame", "said"), FRAMES)
+def test_observations_are_in_base_only_where_a_robot_yaml_is_given_and_no_camera_option(
+    tmp_path: Path, options: dict[str, Any], with_robot: bool, frame: str, said: str
+) -> None:
+    robot = robot_yaml_in(tmp_path) if with_robot else None
+    report = imported(tmp_path, options=ImportOptions(robot=robot, track_width_m=0.5, **options))
+    assert {message.frame for message in observations_of(report.run_folder)} == {frame}
+    assert any(f"observations.csv: taken to be in {said}" in line for line in report.lines())
+
+
+def robot_yaml_in(folder: Path) -> Path:
+    path = folder / "robot.yaml"
+    wheels_section = {"radius_left_m": 0.1, "radius_right_m": 0.1, "track_m": 0.4, "ticks_per_turn": 100}
+    path.write_text(yaml.safe_dump({"robot_id": "carl", "wheels": wheels_section, "time_offset_s_sigma": 0.001}))
+    return path
+
+
+TWISTS = "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0.5\n"
+
+
+def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
+    """A mount, a clock, a track and offsets of ranges: unlike the defaults, which a person's own robot.yaml has."""
+    robot = parse_robot_yaml(run_of(imported(tmp_path).run_folder).robot_yaml, "log")
+    assert (robot.time_offset_s, robot.time_offset_s_sigma) == (0.0, 0.3)
+    assert (robot.imported_range_offset_m, robot.imported_range_offset_m_sigma) == (0.0, 0.1)
+    assert (robot.mount.x_m_sigma, robot.mount.y_m_sigma) == (0.5, 0.5)
+    assert robot.mount.yaw_rad_sigma == pytest.approx(radians(8))
+    assert robot.wheels.track_m == 0.5
+    assert robot.wheels.track_m_sigma == pytest.approx(0.3 * 0.5)
+    assert robot.wheels.radii_ratio_sigma == 0.02
+
+
+@pytest.mark.parametrize(
+    ("files", "options", "wheels_sigma", "ranges_sigma"),
+    [
+        ({"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS}, TRACK, 0.01, 0.02),
+        ({"odometry.csv": TWISTS, "observations.csv": OBSERVATIONS}, TRACK, 0.05, 0.02),
+        ({"odom.csv": "1,0,0\n", "landmarks.csv": "1,5,1,0.5,0\n"}, PAPER, 0.01, 0.15),
+    ],
+    ids=["encoders", "speeds of the robot", "paper"],
+)
+def test_who_vouches_for_the_metre_depends_on_the_form(
+    tmp_path: Path, files: dict[str, str], options: ImportOptions, wheels_sigma: float, ranges_sigma: float
+) -> None:
+    report = import_folder(folder_with(tmp_path, files), tmp_path / "logs", options)
+    robot = parse_robot_yaml(run_of(report.run_folder).robot_yaml, "log")
+    assert robot.wheels.radii_scale_sigma == wheels_sigma
+    assert robot.imported_tag_scale_sigma == ranges_sigma
+
+
+def test_a_robot_yaml_that_is_given_keeps_its_sigmas(tmp_path: Path) -> None:
+    options = ImportOptions(robot=robot_yaml_in(tmp_path))
+    robot = parse_robot_yaml(run_of(imported(tmp_path, options=options).run_folder).robot_yaml, "log")
+    assert (robot.time_offset_s_sigma, robot.imported_range_offset_m_sigma) == (0.001, 0.0)
+    assert robot.wheels.track_m_sigma == pytest.approx(0.004)
+    assert (robot.wheels.radii_scale_sigma, robot.imported_tag_scale_sigma) == (None, 0.005)
+
+
+def test_turning_speeds_need_no_track_width(tmp_path: Path) -> None:
+    """Whatever track stands in robot.yaml, the log's wheels turn by it as the file says."""
+    report = imported(tmp_path, TWISTS, options=ImportOptions())
+    robot = parse_robot_yaml(run_of(report.run_folder).robot_yaml, "log")
+    last = odometry_of(report.run_folder)[-1].wheels
+    moved = wheels.advance(np.array(last.left_m), np.array(last.right_m), robot.wheels.track_m)
+    np.testing.assert_allclose(moved, se2.exp(np.array([1.0, 0.0, 0.5])), atol=1e-12)
+    assert robot.wheels.track_m_sigma == pytest.approx(0.3 * robot.wheels.track_m)
 
 
 def test_a_drive_without_tags_is_imported(tmp_path: Path) -> None:

@@ -139,6 +139,35 @@ def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
     assert (run.detections.stamps_ns - START_NS).tolist() == [6_000_000]
 
 
+def test_imported_positions_that_run_ahead_are_set_back(tmp_path: Path) -> None:
+    seen = TagObservation(family=FAMILY, tag_id=4, cartesian=TagObservation.Cartesian(x_m=1.0, y_m=2.0))
+    messages: list[tuple[str, Message]] = [
+        (
+            "/tags/observations",
+            TagObservations(stamp_ns=START_NS + stamp_ns, frame=frame, observations=[seen]),
+        )
+        for stamp_ns, frame in ((10_000_000, "base"), (20_000_000, "camera_planar"))
+    ]
+    robot = made_robot(time_offset_s=0.004)
+    head = log_head(robot, robot.model_dump_json(), CAMERA, "one", START_NS, 0)
+    run = load_run(write_log(tmp_path, [wheel_odometry(0.0, 0.0, 0.0), *messages, wheel_odometry(0.1, 0.1, 0.1)], head))
+    assert (run.positions.stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
+    assert run.stretches[0].stamps_ns[0] == START_NS
+
+
+def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
+    seen = TagObservation(family=FAMILY, tag_id=4, cartesian=TagObservation.Cartesian(x_m=1.0, y_m=2.0))
+    sent = TagObservations(stamp_ns=START_NS + 30_000_000, frame="base", observations=[seen])
+    run = load_run(
+        write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02), ("/tags/observations", sent)])
+    )
+    other = run.retimed(-0.003)
+    assert (other.picture_stamps_ns - run.picture_stamps_ns).tolist() == [3_000_000] * 2
+    assert (other.detections.stamps_ns - run.detections.stamps_ns).tolist() == [3_000_000]
+    assert (other.positions.stamps_ns - run.positions.stamps_ns).tolist() == [3_000_000]
+    np.testing.assert_array_equal(other.stretches[0].stamps_ns, run.stretches[0].stamps_ns)
+
+
 def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> None:
     log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
     write_robot_yaml(made_robot(edge_shift_px=-0.25), tmp_path / "robot.yaml")

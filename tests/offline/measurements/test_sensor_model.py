@@ -1,4 +1,4 @@
-"""Detections and imported positions become readings that can be believed, or are left out with a word."""
+"""Detections become readings that can be believed, or are left out with a word."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,20 +10,20 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, EDGE_SHIFT, RANGE_OFFSET, TIME_OFFSET
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.calib.tags.edges import moved_out
 from groundsbot.offline.mapping.inputs import check_tag_sizes
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
 from groundsbot.offline.measurements.sensor_model.readings import Readings
-from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections, read_positions
-from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
+from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
+from groundsbot.offline.measurements.tags import Detections, TagKey
 from tests.support.data.drives import (
     CAMERA,
     FAMILY,
     MadeTag,
     made_drive,
-    made_positions,
     made_robot,
     made_run,
     seen_corners_px,
@@ -255,54 +255,6 @@ def test_nothing_seen_is_no_reading() -> None:
     assert (len(readings), warnings) == (0, [])
 
 
-def positions(value: list[list[float]], *, polar: bool, covariance: object = np.nan) -> Positions:
-    n = len(value)
-    made = made_positions(np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.array(value))
-    whole = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (n, 2, 2)).copy()
-    return replace(made, polar=np.full(n, polar), covariance=whole)
-
-
-def test_imported_positions_without_covariance_get_that_of_the_noise_model() -> None:
-    sigma = np.array([np.hypot(NOISE.sigma_range_m, NOISE.sigma_range_per_m * 5.0), NOISE.sigma_bearing_rad])
-    for given in (positions([[3.0, -4.0]], polar=False), positions([[5.0, np.arctan2(-4, 3)]], polar=True)):
-        readings, _ = read_positions(given, np.array([0]), NOISE)
-        assert readings.polar.all()
-        np.testing.assert_allclose(readings.value, [[5.0, np.arctan2(-4, 3)]])
-        np.testing.assert_allclose(readings.covariance[0], np.diag(sigma**2))
-
-
-def test_imported_covariances_are_kept() -> None:
-    covariance = [[0.04, 0.01], [0.01, 0.09]]
-    given = positions([[3.0, -4.0]], polar=False, covariance=covariance)
-    readings, warnings = read_positions(given, np.array([0]), NOISE)
-    assert not readings.polar.any()
-    np.testing.assert_array_equal(readings.value, [[3.0, -4.0]])
-    np.testing.assert_array_equal(readings.covariance[0], covariance)
-    assert warnings == []
-
-
-@pytest.mark.parametrize("value", [[np.nan, 1.0], [1.0, np.inf], [0.01, 0.02], [1e300, 1.0], [1e200, -1e200]])
-@pytest.mark.parametrize("covariance", [np.nan, 0.01 * np.eye(2)])
-def test_imported_positions_that_cannot_be_are_left_out(value: list[float], covariance: object) -> None:
-    given = positions([value, [3.0, 1.0]], polar=False, covariance=covariance)
-    readings, warnings = read_positions(given, np.array([0, 1]), NOISE)
-    assert readings.keyframe.tolist() == [1]
-    assert "1 of 2 tag positions left out" in warnings[0]
-    assert np.isfinite(readings.covariance).all()
-
-
-@pytest.mark.parametrize(
-    "covariance",
-    [[[0.0, 0.0], [0.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1e300, 0], [0, 1e300]]],
-)
-def test_imported_covariances_that_are_none_are_left_out(covariance: object) -> None:
-    readings, warnings = read_positions(
-        positions([[3.0, 1.0]], polar=False, covariance=covariance), np.array([0]), NOISE
-    )
-    assert len(readings) == 0
-    assert len(warnings) == 1
-
-
 def run_with_size(size_m: float | None, name: str = "carl", sizes_m: dict[int, float] | None = None) -> Run:
     batch: dict[str, object] = {"family": FAMILY, "sizes_m": sizes_m or {99: 0.1}}
     if size_m is not None:
@@ -348,7 +300,12 @@ def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
         other = read(run.robot.model_copy(update={"mount": mount}), np.zeros(3))
         np.testing.assert_allclose(here.by_camera[0, :, k], (other.value - here.value)[0] / 1e-5, rtol=1e-2, atol=1e-3)
     later = read(run.robot, se2.exp(1e-4 * np.array([speed_m_s, 0.0, turning_rad_s])))
-    np.testing.assert_allclose(here.by_camera[0, :, 2], (later.value - here.value)[0] / 1e-4, rtol=1e-2, atol=1e-3)
+    np.testing.assert_allclose(
+        here.by_camera[0, :, CAMERA_PARAMETERS.index(TIME_OFFSET)],
+        (later.value - here.value)[0] / 1e-4,
+        rtol=1e-2,
+        atol=1e-3,
+    )
 
 
 @pytest.mark.parametrize(("tag", "rtol"), [(UPRIGHT[0], 1e-4), (LEANING, 0.2)], ids=["upright", "askew"])
@@ -366,5 +323,12 @@ def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) 
     assert len(here) == 3
     by_hand = (read(1e-3).value - read(-1e-3).value)[0] / 2e-3
     assert by_hand[0] > 0.0
-    np.testing.assert_allclose(here.by_camera[0, 0, 3], by_hand[0], rtol=rtol)
-    np.testing.assert_allclose(here.by_camera[0, 1, 3], by_hand[1], atol=1e-6 if tag is UPRIGHT[0] else 1e-3)
+    by_edge = here.by_camera[0, :, CAMERA_PARAMETERS.index(EDGE_SHIFT)]
+    np.testing.assert_allclose(by_edge[0], by_hand[0], rtol=rtol)
+    np.testing.assert_allclose(by_edge[1], by_hand[1], atol=1e-6 if tag is UPRIGHT[0] else 1e-3)
+
+
+def test_an_offset_of_imported_ranges_is_nothing_to_corners() -> None:
+    readings, _ = read_many(UPRIGHT, n=1)
+    assert readings.by_camera.shape == (5, 2, len(CAMERA_PARAMETERS))
+    assert not readings.by_camera[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)].any()

@@ -122,17 +122,20 @@ def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     assert result.noise == PRIOR
 
 
-def test_what_no_noise_explains_leaves_all_as_it_was(maps: list[LocalMap]) -> None:
-    """Wheels that err a hundred times as much as they are taken to: no wheels do, so something else is wrong."""
+def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[LocalMap]) -> None:
+    """Wheels that err fifty times as much as they are taken to."""
     odometry = maps[0].chain.odometry
-    parts = replace(odometry.parts, unit=odometry.parts.unit / 100.0**2)
+    parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
     odd = replace(maps[0].chain, odometry=replace(odometry, parts=parts))
     found = fit_and_weigh([replace(maps[0], chain=odd)], PRIOR)
-    assert found.noise == PRIOR
-    told = {each.kept for each in found.fitted.parameters} - {NOT_NEEDED}
-    (why,) = told
-    assert why.startswith(ODOMETRY_NOISE)
-    assert why.endswith(" times the default: what is left over is no noise")
+    as_told = fit_and_weigh([maps[0]], PRIOR)
+    ratio = found.noise.sigma_distance_m_per_sqrt_m / as_told.noise.sigma_distance_m_per_sqrt_m
+    assert ratio == pytest.approx(50.0, rel=0.15)
+    (sigma,) = [each for each in found.fitted.parameters if each.name == "sigma_distance_m_per_sqrt_m"]
+    assert not sigma.kept
+    assert sigma.low is not None
+    assert sigma.high is not None
+    assert sigma.low < sigma.value < sigma.high
 
 
 def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:

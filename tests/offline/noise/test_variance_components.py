@@ -53,7 +53,14 @@ def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
     """Only what comes out large is believed, so it may have done so by chance; a sigma of many squares may not."""
     deviation = np.array([1.0 / np.sqrt(10.0), 0.01])
     fitted = FittedVariances(
-        np.array([2.0, 2.0]), np.diag(deviation**2), np.array([5.0, 5000.0]), np.ones(2) > 0, (), True
+        np.array([2.0, 2.0]),
+        np.diag(deviation**2),
+        np.array([5.0, 5000.0]),
+        np.ones(2) > 0,
+        (),
+        True,
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
     )
     low, high = fitted.interval(norm.ppf(0.995))
     assert low[0] == 0.0

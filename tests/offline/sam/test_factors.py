@@ -20,7 +20,7 @@ from groundsbot.offline.sam.factors.robust_losses import (
 )
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.support.data.problems import CALIBRATION_SIGMA, N_CALIBRATION, made_problem, random_state
+from tests.support.data.problems import BATCHES, CALIBRATION_SIGMA, N_CALIBRATION, WHEELS, made_problem, random_state
 
 KINDS = ("odometry", "readings", "prior")
 SEEDS = range(5)
@@ -122,12 +122,13 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
     by_wheels[:, 0, 0] = straight[:, 0]
     odometry = replace(problem.odometry, motion=straight, jacobian=by_wheels)
     at_base, no_mount = np.zeros_like(problem.readings.mount), np.zeros_like(problem.readings.mount_parameters)
-    scaled = 7 + problem.readings.tag % 2
+    scaled = BATCHES[problem.readings.tag % 2]
     readings = replace(problem.readings, mount=at_base, mount_parameters=no_mount, scale_parameter=scaled)
 
     nominal = random_state(1)
     state = State(nominal.poses, nominal.tags, np.zeros(N_CALIBRATION))
-    change = -0.1 * np.array([0, 1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0])
+    change = np.zeros(N_CALIBRATION)
+    change[[WHEELS[0], *BATCHES]] = -0.1
     shrunk = State(0.9 ** np.array([1, 1, 0]) * state.poses, 0.9 * state.tags, change)
     np.testing.assert_allclose(odometry.residual(shrunk), odometry.residual(state), atol=1e-8)
     np.testing.assert_allclose(readings.residual(shrunk), readings.residual(state), atol=1e-8)

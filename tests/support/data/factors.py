@@ -6,6 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, ReadingFactors, State, whitening
 
 
@@ -57,8 +58,8 @@ def readings_of(
         tag: (N,) which.
         polar: (N,) as range and bearing.
         mounted: (N,) about a camera that stands off base.
-        parameters: (N, 3) of the mount, (N,) of the tag's scale, (N, 4) of what else a mounted camera has: indices
-            into the calibration.
+        parameters: (N, 3) of the mount, (N,) of the tag's scale, (N, C) of CAMERA_PARAMETERS, of a mounted camera:
+            indices into the calibration.
         spoil: makes some of the values (N, 2) wrong.
         rng: draws covariances, derivatives and errors.
         noise: as of `odometry_of`.
@@ -73,8 +74,9 @@ def readings_of(
     value = np.where(polar[:, None], as_polar, place)
     value += noise * np.einsum("nij,nj->ni", root, rng.standard_normal((n, 2)))
     spoil(value)
-    # The last column by a generator of its own, which leaves all other draws as they were without it.
-    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), rng.spawn(1)[0].standard_normal((n, 2, 1))], axis=-1)
+    # All but three columns by a generator of their own: another parameter leaves all other draws as they were.
+    more = rng.spawn(1)[0].standard_normal((len(CAMERA_PARAMETERS) - 3, n, 2))
+    drawn = np.concatenate([rng.standard_normal((n, 2, 3)), np.moveaxis(more, 0, -1)], axis=-1)
     by_camera = 0.5 * mounted[:, None, None] * drawn
     camera_parameters = np.where(mounted[:, None], parameters[2], 0)
     value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])

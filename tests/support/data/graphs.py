@@ -20,7 +20,7 @@ from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, Sta
 from groundsbot.offline.sam.solver import Problem
 from tests.support.data.factors import odometry_of, readings_of
 
-_ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * 8)  # wheels, mount, what else of the camera
+_ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * (4 + len(CAMERA_PARAMETERS)))  # wheels, mount, what else of the camera
 _OF_ROBOT: Final = len(_ROBOT_SIGMA)
 _BATCH_SIGMA: Final = (0.005, 0.005)
 N_ROBOTS: Final = 2
@@ -55,10 +55,10 @@ def made_graph(
 
 
 def _drawn(rng: np.random.Generator) -> FloatArray:
-    """Calibration in sigmas; of each robot the last number by a generator of its own."""
-    others = rng.standard_normal(1 + N_ROBOTS * (_OF_ROBOT - 1) + len(_BATCH_SIGMA))
-    at = [1 + (i + 1) * (_OF_ROBOT - 1) for i in range(N_ROBOTS)]
-    drawn: FloatArray = np.insert(others, at, rng.spawn(1)[0].standard_normal(N_ROBOTS))
+    """Calibration in sigmas; of each robot all but nine numbers by a generator of their own."""
+    others = rng.standard_normal(1 + N_ROBOTS * 9 + len(_BATCH_SIGMA))
+    at = np.tile([1 + (i + 1) * 9 for i in range(N_ROBOTS)], _OF_ROBOT - 9)
+    drawn: FloatArray = np.insert(others, at, rng.spawn(1)[0].standard_normal(len(at)))
     return drawn
 
 

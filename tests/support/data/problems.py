@@ -6,14 +6,17 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, Columns, ReadingFactors, State
 from groundsbot.offline.sam.solver import Problem
 from tests.support.data.factors import odometry_of, readings_of
 
-# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, four more of the camera.
-CALIBRATION_SIGMA = np.array([0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, 0.01, 0.01, 0.01, 0.01])
-WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.arange(9, 13)
+# Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, more of the camera.
+CALIBRATION_SIGMA = np.array(
+    [0.0, 0.004, 0.007, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005, *(0.01,) * len(CAMERA_PARAMETERS)]
+)
 N_CALIBRATION = len(CALIBRATION_SIGMA)
+WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.arange(9, N_CALIBRATION)
 CHAINS = (9, 7)  # poses in each
 N_TAGS = 6
 
@@ -81,9 +84,9 @@ def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> S
 
 
 def _drawn(rng: np.random.Generator) -> FloatArray:
-    """Calibration in sigmas; the last number by a generator of its own."""
-    others, last = rng.standard_normal(N_CALIBRATION - 1), rng.spawn(1)[0].standard_normal(1)
-    return np.concatenate([others, last])
+    """Calibration in sigmas; all but twelve numbers by a generator of their own."""
+    others, more = rng.standard_normal(12), rng.spawn(1)[0].standard_normal(N_CALIBRATION - 12)
+    return np.concatenate([others, more])
 
 
 def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Generator) -> ReadingFactors:

@@ -1,0 +1,124 @@
+"""By how many times a joint solve leaves over more than chance explains, so that its covariances say too little.
+
+What it costs that drives which fit together each by itself share tags and calibration is chi-square with as many
+degrees of freedom as there are conditions (nested linear models, see `local_map.goodness_of_fit`). Cost over freedom is
+by how many times errors between drives have more variance than the solve was told (Birge, "The calculation of errors by
+the method of least squares", 1932). The same holds within drives, for joining their windows. Only what chance hardly
+explains counts: else a good map's sigmas would grow by the luck of the draw.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.local_map import Goodness, LocalMap, freedom_of
+from groundsbot.offline.maps import Misfit
+from groundsbot.offline.sam import Graph, Solution, build_graph, losses_and_weights, solve
+
+# Joins of a good map are taken for bad ones so rarely.
+_FALSE_ALARM: Final = 1e-2
+
+
+def misfit_of(
+    maps: Sequence[LocalMap], graph: Graph, solution: Solution, together: Goodness | None = None
+) -> Misfit | None:
+    """What contradicts the model most; None where chance explains all of it.
+
+    Args:
+        maps: of the graph's chains in order, solved under the noise that the graph has.
+        graph: of the component.
+        solution: of it, on places of tags.
+        together: whether all windows of several drives are one map; None where a drive alone does not fit.
+    """
+    alone = [_alone(each, graph, solution, chain) for chain, each in enumerate(maps)]
+    found = (_of_joins(maps, graph, solution, alone), _of_windows(maps, graph, solution, alone, together))
+    misfits = [each for each in found if each is not None and each.variance_factor > 1.0]
+    return max(misfits, key=lambda each: each.variance_factor, default=None)
+
+
+def noise_freedom(maps: Sequence[LocalMap]) -> int:
+    """What chi-square's degrees of freedom the noise is known like, by what joins the windows of drives."""
+    return max(1, sum(each.goodness.expected for each in maps))
+
+
+def _of_joins(maps: Sequence[LocalMap], graph: Graph, solution: Solution, alone: Sequence[Solution]) -> Misfit | None:
+    """What sharing tags and calibration costs; what somebody measured is not among it, and is judged on its own."""
+    measured = graph.problem.measured
+    n = freedom_of(graph.problem) - measured.n_residuals - sum(freedom_of(each.problem) for each in alone)
+    if len(maps) == 1 or n <= 0:
+        return None
+    rise = 2.0 * (solution.cost - sum(each.cost for each in alone)) - measured.sum_of_squares(solution.state)
+    if rise <= n * float(stats.f.isf(_FALSE_ALARM, n, noise_freedom(maps))):
+        return None
+    return Misfit("joins", graph.chains[_worst(graph, solution, alone)].name, rise, n)
+
+
+def _of_windows(
+    maps: Sequence[LocalMap],
+    graph: Graph,
+    solution: Solution,
+    alone: Sequence[Solution],
+    together: Goodness | None,
+) -> Misfit | None:
+    """What joining windows of a drive, or of all drives, costs."""
+    runs = [each.goodness for each in maps]
+    if not all(each.fits for each in runs):
+        cost = [_cost(each) for each in runs]
+        worst = int(np.argmax([square / max(1, each.expected) for square, each in zip(cost, runs, strict=True)]))
+        return Misfit("windows", graph.chains[worst].name, sum(cost), noise_freedom(maps))
+    if together is None or together.fits:
+        return None
+    name = graph.chains[_worst(graph, solution, alone)].name
+    return Misfit("windows", name, _cost(together), max(1, together.expected))
+
+
+def _cost(goodness: Goodness) -> float:
+    """In squared sigmas of the noise that windows show, or of that which the solve had where it was told more."""
+    return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
+
+
+def _alone(local_map: LocalMap, graph: Graph, solution: Solution, chain: int) -> Solution:
+    """Of one chain of the graph: its local map's, unless its tags were told apart otherwise since."""
+    now = graph.chains[chain]
+    if _same_places(local_map.chain.readings.tag, now.readings.tag):
+        return local_map.solution
+    own = build_graph([now])
+    poses, tags = graph.poses_of(solution.state, chain), graph.tags_of(solution.state)
+    back = se2.inverse(poses[0])
+    start = own.start(
+        se2.compose(back, poses),
+        {tag: se2.apply(back, tags[tag]) for tag in now.tags},
+        graph.calibration_of(solution.state),
+    )
+    return solve(own.problem, start)
+
+
+def _same_places(tag: IntArray, other: IntArray) -> bool:
+    """Whether readings (M,) are gathered alike under two ways to number tags."""
+    if len(tag) != len(other):
+        return False
+    pairs = len(np.unique(np.column_stack([tag, other]), axis=0))
+    return pairs == len(np.unique(tag)) == len(np.unique(other))
+
+
+def _worst(graph: Graph, solution: Solution, alone: Sequence[Solution]) -> int:
+    """The chain whose motions and readings cost most beyond what they cost alone."""
+    together = np.zeros(len(alone))
+    for first, losses in zip(
+        (graph.problem.odometry.first, graph.problem.readings.pose), _losses(solution), strict=True
+    ):
+        chain = np.searchsorted(graph.first_pose, first, side="right") - 1
+        together += np.bincount(chain, losses, len(alone))
+    return int(np.argmax(together - [sum(losses.sum() for losses in _losses(each)) for each in alone]))
+
+
+def _losses(solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """(M,) of motions and (N,) of readings."""
+    problem, state = solution.problem, solution.state
+    odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
+    readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))
+    return odometry, readings

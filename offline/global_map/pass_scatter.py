@@ -1,0 +1,95 @@
+"""Tags that the drives saw in several places: how far the places of a tag by its passes scatter about the map's.
+
+About the solved poses each pass of a tag, the readings of it while a drive passed by once, has a place for it with the
+information of its readings. The map's place is their mean. Poses give in to readings, so the passes scatter by less
+than chi-square; what lies beyond it is in no covariance. Then the tag is known as the scatter of its passes tells, each
+of their variances grown alike (Birge, "The calculation of errors by the method of least squares", 1932).
+"""
+
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.maps import TagScatter
+from groundsbot.offline.measurements import passes_of
+from groundsbot.offline.sam import Graph, Solution, losses_and_weights
+
+# One good map in a thousand has a tag that is taken for a bad one.
+_FALSE_ALARM: Final = 1e-3
+_MOST_NAMED: Final = 12
+
+
+def scatter_of_passes(graph: Graph, solution: Solution, variance_factor: float, freedom: float) -> TagScatter:
+    """Of each tag of a component.
+
+    Args:
+        graph: of the component.
+        solution: of it, on places of tags.
+        variance_factor: by which all covariances of the component grow anyway.
+        freedom: what chi-square's degrees of freedom the noise is known like.
+    """
+    n_tags = len(graph.tags)
+    factors, added_m2 = np.ones(n_tags), np.zeros((n_tags, 2, 2))
+    of_pass, tag_of_pass = _passes(graph)
+    information, pull = _sums(graph, solution, of_pass, len(tag_of_pass))
+    squares = np.einsum("pi,pi->p", pull, np.linalg.solve(information, pull[..., None])[..., 0])
+    n_free = 2 * (np.bincount(tag_of_pass, minlength=n_tags) - 1)
+    tested = np.flatnonzero(n_free > 0)
+    if not len(tested):
+        return TagScatter(factors, added_m2)
+    ratio = np.bincount(tag_of_pass, squares, n_tags)[tested] / (variance_factor * n_free[tested])
+    found = ratio > stats.f.isf(_FALSE_ALARM / len(tested), n_free[tested], freedom)
+    whole = np.zeros((n_tags, 2, 2))
+    np.add.at(whole, tag_of_pass, information)
+    which, grown = tested[found], ratio[found]
+    factors[which] = np.sqrt(grown)
+    added_m2[which] = variance_factor * (grown - 1.0)[:, None, None] * np.linalg.inv(whole[which])
+    return TagScatter(factors, added_m2)
+
+
+def scatter_warnings(graph: Graph, scatter: TagScatter) -> list[str]:
+    """Of tags whose passes contradict each other."""
+    which = np.flatnonzero(scatter.factors > 1.0)
+    if not len(which):
+        return []
+    worst = which[np.argsort(-scatter.factors[which], kind="stable")]
+    named = [
+        f"{graph.tags[t].tag_id}{graph.tags[t].instance} ({scatter.factors[t]:.1f} times)" for t in worst[:_MOST_NAMED]
+    ]
+    more = f" and {len(worst) - _MOST_NAMED} more" if len(worst) > _MOST_NAMED else ""
+    sentence = (
+        f"passes of tags {', '.join(named)}{more} scatter by so many times what chance explains: their sigmas were "
+        "made as large as that; look whether they hang firmly and flat, and drive past them again"
+    )
+    return [sentence]
+
+
+def _passes(graph: Graph) -> tuple[IntArray, IntArray]:
+    """(M,) the pass of each reading, through all chains; (P,) the tag of each pass."""
+    n_passes, of_pass = 0, []
+    for chain in graph.chains:
+        own = passes_of(chain)
+        of_pass.append(n_passes + own)
+        n_passes += int(own.max(initial=-1)) + 1
+    found = np.concatenate(of_pass)
+    tag_of_pass = np.zeros(n_passes, dtype=np.int64)
+    tag_of_pass[found] = graph.problem.readings.tag
+    return found, tag_of_pass
+
+
+def _sums(graph: Graph, solution: Solution, of_pass: IntArray, n_passes: int) -> tuple[FloatArray, FloatArray]:
+    """(P, 2, 2) what the readings of each pass tell of the tag's place, about the solved poses; (P, 2) their pull."""
+    readings, state = graph.problem.readings, solution.state
+    residual, blocks = readings.linearise(state, graph.problem.columns)
+    _, weight = losses_and_weights(solution.losses.readings, residual)
+    theta = state.poses[readings.pose, 2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    to_base = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
+    by_place = -blocks[0][1][..., :2] @ to_base  # whitened; a step of the pose moves the place in base against it
+    weighted = weight[:, None, None] * by_place.swapaxes(-1, -2)
+    information, pull = np.zeros((n_passes, 2, 2)), np.zeros((n_passes, 2))
+    np.add.at(information, of_pass, weighted @ by_place)
+    np.add.at(pull, of_pass, -(weighted @ residual[..., None])[..., 0])
+    return information, pull

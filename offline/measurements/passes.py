@@ -1,0 +1,60 @@
+"""Readings of a tag in passes: what a drive saw of it while it passed by once."""
+
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.foundation import BoolArray, IntArray
+from groundsbot.offline.measurements.chain import Chain
+
+# Longer out of sight, by the way driven or by the clock, and it is another pass.
+GAP_M: Final = 2.0
+_GAP_S: Final = 10.0
+# A pass of no more readings may be of another tag, mistaken for this one.
+FEW_READINGS: Final = 2
+# Over so much of the way readings of a tag are taken from much the same side.
+_CELL_M: Final = 2.5
+
+
+def passes_of(chain: Chain, cut: BoolArray | None = None) -> IntArray:
+    """(M,) the pass of each reading, from 0 without gaps, in order of tag and time.
+
+    Args:
+        chain: whose M readings.
+        cut: (M,) readings with which another pass begins though the tag was not out of sight.
+    """
+    readings = chain.readings
+    order = np.lexsort((readings.keyframe, readings.tag))
+    tag, keyframe = readings.tag[order], readings.keyframe[order]
+    begins = np.ones(len(order), dtype=np.bool_)
+    begins[1:] = (
+        (np.diff(tag) != 0)
+        | (np.diff(chain.along_m[keyframe]) > GAP_M)
+        | (np.diff(chain.stamps_ns[keyframe]) > _GAP_S * 1e9)
+    )
+    if cut is not None:
+        begins[1:] |= cut[order][1:]
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.cumsum(begins) - 1
+    return number
+
+
+def confirmed(chain: Chain) -> Chain:
+    """The chain without passes of one or two readings of tags that have passes of more.
+
+    A detector that takes one tag for another does so in a picture or two; tags that pass by are read in several.
+    """
+    readings, pass_of = chain.readings, passes_of(chain)
+    if not len(readings):
+        return chain
+    n_in_pass = np.bincount(pass_of)[pass_of]
+    most = np.zeros(len(chain.tags), dtype=np.int64)
+    np.maximum.at(most, readings.tag, n_in_pass)
+    return chain.with_readings((n_in_pass > FEW_READINGS) | (most[readings.tag] <= FEW_READINGS))
+
+
+def cells_of(chain: Chain) -> IntArray:
+    """(M,) of each reading: a number for each tag in each 2.5 m of the way, from 0 without gaps."""
+    part = (chain.along_m[chain.readings.keyframe] / _CELL_M).astype(np.int64)
+    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    return np.asarray(cell, dtype=np.int64)

@@ -1,0 +1,89 @@
+"""Readings of one tag that were taken for another: one or two at a time, metres from where their tag is.
+
+A tag that was moved is read in several pictures from its new place; a misread code is in one picture or two. So a
+reading far from the others of its pass, or a pass of one or two that lies beyond chance from its tag, which other
+passes with more readings place, is no second tag.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.local_map import LocalMap
+from groundsbot.offline.measurements import FEW_READINGS, passes_of
+from groundsbot.offline.outliers.search import FALSE_ALARM
+from groundsbot.offline.sam import build_graph, solve
+
+# A standard deviation is so many times the median of normal numbers' sizes.
+_SIGMA_BY_MEDIAN: Final = 1.4826
+# Readings scatter with heavy tails: a tenth of a percent of them lies beyond 13 of a Student distribution of 3 degrees.
+_FAR_SIGMAS: Final = 13.0
+_LEAST_FAR_M: Final = 0.5  # a drive that stands for long scatters by next to nothing
+
+
+def false_readings(local_map: LocalMap) -> BoolArray:
+    """(M,) readings of the map's chain that are of another tag, or of none.
+
+    Args:
+        local_map: solved under noise that its readings fit.
+    """
+    if not len(local_map.chain.readings):
+        return np.zeros(0, dtype=np.bool_)
+    return _far_within_pass(local_map) | _far_passes(local_map)
+
+
+def _far_within_pass(local_map: LocalMap) -> BoolArray:
+    """(M,) readings that put their tag far from where the others of their pass do, as these scatter in this drive."""
+    pass_of = passes_of(local_map.chain)
+    places = local_map.graph.problem.readings.places_in_map(local_map.solution.state)
+    middle = np.column_stack([_medians(places[:, axis], pass_of) for axis in (0, 1)])
+    off_m = np.linalg.norm(places - middle[pass_of], axis=1)
+    several = np.bincount(pass_of)[pass_of] > FEW_READINGS
+    if not several.any():
+        return several
+    bound_m = max(_FAR_SIGMAS * _SIGMA_BY_MEDIAN * float(np.median(off_m[several])), _LEAST_FAR_M)
+    return np.asarray(several & (off_m > bound_m))
+
+
+def _far_passes(local_map: LocalMap) -> BoolArray:
+    """(M,) readings of passes of one or two that lie elsewhere than passes of more place their tag."""
+    readings, pass_of = local_map.chain.readings, passes_of(local_map.chain)
+    n_in_pass = np.bincount(pass_of)
+    squares = (local_map.graph.problem.readings.residual(local_map.solution.state) ** 2).sum(axis=1)
+    is_few = n_in_pass <= FEW_READINGS
+    least = np.full(len(n_in_pass), np.inf)
+    np.minimum.at(least, pass_of, squares)
+    tag_of = np.zeros(len(n_in_pass), dtype=np.int64)
+    tag_of[pass_of] = readings.tag
+    is_placed = np.zeros(len(local_map.chain.tags), dtype=np.bool_)
+    is_placed[tag_of[~is_few]] = True
+    is_false = is_few & is_placed[tag_of] & (least > chi2.isf(FALSE_ALARM / max(int(is_few.sum()), 1), 2))
+    return np.asarray(is_false[pass_of])
+
+
+def _medians(values: FloatArray, group: IntArray) -> FloatArray:
+    """(G,) of values (M,) in groups (M,) numbered from 0 without gaps."""
+    order = np.lexsort((values, group))
+    n = np.bincount(group)
+    first = np.cumsum(n) - n
+    low, high = order[first + (n - 1) // 2], order[first + n // 2]
+    return np.asarray(0.5 * (values[low] + values[high]))
+
+
+def without_false_detections(local_map: LocalMap) -> LocalMap:
+    """The map solved without them; the chain's warnings say how many there were."""
+    wrong = false_readings(local_map)
+    if not wrong.any():
+        return local_map
+    n, n_all, name = int(wrong.sum()), len(wrong), local_map.chain.name
+    told = f"{name}: {n} of {n_all} readings lie far from their tags, single ones: taken for misread, left out"
+    chain = local_map.chain.with_readings(~wrong)
+    chain = replace(chain, warnings=(*chain.warnings, told))
+    graph = build_graph([chain])
+    start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
+    solution = solve(graph.problem, start)
+    graph.problem.arrowhead.without_scratch()
+    return replace(local_map, chain=chain, graph=graph, solution=solution)

@@ -1,0 +1,233 @@
+"""By how much the stamps of a robot's sensor of tags are late, over two seconds, from passes of tags alone.
+
+The likelihood of all passes is profiled over a grid of offsets: at each offset the other parameters (pass_model) and
+the places of tags are estimated. From the best points of the grid on the offset is estimated with them. Errors have
+Student's t distribution, so that false readings have a bounded force (Lange, Little and Taylor 1989, Robust statistical
+modeling using the t distribution); its scales are estimated too. Only the offset is of use: wheels err within a pass,
+and the other parameters take that up.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.measurements import Run
+from groundsbot.offline.self_calibration.pass_model import (
+    PARAMETERS,
+    PRIOR_SIGMA,
+    Linearised,
+    linearise,
+    places_of_tags,
+)
+from groundsbot.offline.self_calibration.passes import REACH_S, Passes, gather_passes
+
+_STEP_S: Final = 0.1
+_GRID_STEPS: Final = 5
+_FINAL_STEPS: Final = 15
+_MOST_STARTS: Final = 2
+_CONVERGED: Final = 1e-3  # in sigmas of the prior
+_NEARLY: Final = 1e-2  # good enough for the curve
+# One Gauss-Newton step goes no farther.
+_LONGEST_STEP: Final = np.array([0.2, 0.02, 0.2, 0.3, 0.3, 0.1, 0.1, 0.1])
+_LONGEST_TAG_STEP_M: Final = 1.0
+# Farther off no step takes them: at -1 turn factor and tag scale make no sense.
+_LARGEST: Final = np.array([2.0, 0.5, 0.9, 5.0, 5.0, 2.0, 5.0, 0.9])
+_DEGREES_OF_FREEDOM: Final = 3.0
+
+# Fewer have no blocks to compare.
+_FEWEST_PASSES: Final = 12
+_BLOCKS: Final = 20
+_PASSES_OF_A_BLOCK: Final = 2
+_FEWEST_BLOCKS: Final = 4
+# What all blocks err by alike: a driver who answers what the floor does to the robot makes stamps look late. In ten
+# simulated floors of the paper it is 4 ms on average.
+_COMMON_SIGMA_S: Final = 0.005
+# All offsets so far from the best one must be worse by so much in chi-square, dependent errors taken into account.
+_APART_S: Final = 0.3
+_CLEAR_CHI2: Final = 10.0
+_LARGEST_SIGMA_S: Final = 0.1
+
+
+@dataclass(frozen=True)
+class TimeOffsetSearch:
+    """A time offset of a robot's sensor of tags against its wheels.
+
+    Attributes:
+        offset_s: by so much stamps are late, beyond what robot.yaml says.
+        sigma_s: its standard deviation, by how blocks of the drives differ.
+        grid_s: (G,) offsets that were tried, rising.
+        cost: (G,) negative log-likelihood at each, less that of `offset_s` and divided by how many times errors within
+            a block are repeated: 0.5 is one sigma.
+    """
+
+    offset_s: float
+    sigma_s: float
+    grid_s: FloatArray
+    cost: FloatArray
+
+
+class _Estimate(NamedTuple):
+    """Where an iteration is: parameters (8,), places of tags (G, 2) and scales (2,) of the sigmas."""
+
+    parameters: FloatArray
+    tags_m: FloatArray
+    scale: FloatArray
+
+    def moved_to(self, offset_s: float) -> "_Estimate":
+        return self._replace(parameters=np.concatenate([[offset_s], self.parameters[1:]]))
+
+
+class _Pulls(NamedTuple):
+    """What each of G passes says of the parameters, its tag's place eliminated."""
+
+    information: FloatArray  # (G, 8, 8)
+    gradient: FloatArray  # (G, 8)
+    tag_step_m: FloatArray  # (G, 2) to the best place by the parameters as they are
+    tag_by_parameters: FloatArray  # (G, 2, 8) by which the best place moves with them
+
+
+def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
+    """The time offset that drives of one robot tell, within a second to either side of robot.yaml's.
+
+    Neither a map nor a good guess is needed: in each pass of a tag the wheels carry the robot on, and only with the
+    right offset do readings of all passes agree with one mounting of the sensor.
+
+    Args:
+        runs: all with the same robot.yaml, their stamps shifted by its time_offset_s as `load_run` does.
+
+    Returns:
+        None where drives do not tell it: robots that stand, or drive all the time at one speed and turning rate; too
+        few readings; an offset beyond a second; several offsets that are as good.
+    """
+    passes = gather_passes(runs)
+    if passes is None or len(passes) < _FEWEST_PASSES:
+        return None
+    curve = _curve(passes)
+    grid_s = np.array(sorted(curve))
+    costs = np.array([curve[offset_s][1] for offset_s in grid_s.tolist()])
+    found, least = min((_iterated(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
+    if not (np.isfinite(costs).all() and np.isfinite(least)):
+        return None
+    offset_s, (sigma_s, repeats) = float(found.parameters[0]), _spread(passes, found)
+    cost = (costs - least) / repeats
+    is_inside = abs(offset_s) < REACH_S - _STEP_S / 2
+    if not (is_inside and sigma_s < _LARGEST_SIGMA_S):
+        return None
+    apart = np.abs(grid_s - offset_s) > _APART_S
+    if 2.0 * cost[apart].min() < _CLEAR_CHI2:
+        return None
+    return TimeOffsetSearch(offset_s, sigma_s, grid_s, cost)
+
+
+def _curve(passes: Passes) -> dict[float, tuple[_Estimate, float]]:
+    """By offset what is best there, and its cost; each begins where its neighbour towards zero ended."""
+    zero = np.zeros(len(PARAMETERS))
+    start = _Estimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
+    found = {0.0: _iterated(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
+    for sign in (1.0, -1.0):
+        last = found[0.0][0]
+        for i in range(1, round(REACH_S / _STEP_S) + 1):
+            offset_s = sign * i * _STEP_S
+            found[offset_s] = _iterated(passes, last.moved_to(offset_s), free_offset=False, most_steps=_GRID_STEPS)
+            last = found[offset_s][0]
+    return found
+
+
+def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
+    """The lowest minima of the curve."""
+    padded = np.pad(costs, 1, constant_values=np.inf)
+    minima = np.flatnonzero((costs <= padded[:-2]) & (costs <= padded[2:]))
+    lowest = minima[np.argsort(costs[minima])][:_MOST_STARTS]
+    return [float(each) for each in grid_s[lowest if len(lowest) else [len(costs) // 2]]]
+
+
+def _iterated(
+    passes: Passes, estimate: _Estimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
+) -> tuple[_Estimate, float]:
+    """Gauss-Newton steps under weights of Student's t; the estimate, and its cost."""
+    free = slice(0 if free_offset else 1, None)
+    for _ in range(most_steps):
+        model = linearise(passes, estimate.parameters, estimate.tags_m)
+        estimate = estimate._replace(scale=_scale(passes, model.residual, estimate.scale))
+        weights = _weights(passes, model.residual, estimate.scale)[0]
+        pulls = _pulls(passes, model, weights)
+        information = pulls.information.sum(axis=0) + np.diag(PRIOR_SIGMA**-2)
+        gradient = pulls.gradient.sum(axis=0) + estimate.parameters / PRIOR_SIGMA**2
+        step = np.zeros(len(PARAMETERS))
+        step[free] = -np.linalg.solve(information[free, free], gradient[free])
+        step /= max(1.0, float(np.abs(step / _LONGEST_STEP).max()))
+        tag_step_m = pulls.tag_step_m + pulls.tag_by_parameters @ step
+        estimate = estimate._replace(
+            parameters=np.clip(estimate.parameters + step, -_LARGEST, _LARGEST),
+            tags_m=estimate.tags_m + np.clip(tag_step_m, -_LONGEST_TAG_STEP_M, _LONGEST_TAG_STEP_M),
+        )
+        if np.abs(step / PRIOR_SIGMA).max() < (_CONVERGED if free_offset else _NEARLY):
+            break
+    return estimate, _cost(passes, estimate)
+
+
+def _scale(passes: Passes, residual: FloatArray, scale: FloatArray) -> FloatArray:
+    """(2,) maximum likelihood scales of the sigmas, by a few steps of expectation maximisation; a pass spends one."""
+    square = (residual / passes.sigma) ** 2
+    for _ in range(3):
+        weighed = (_DEGREES_OF_FREEDOM + 1.0) / (_DEGREES_OF_FREEDOM + square / scale**2) * square
+        scale = np.sqrt(weighed.sum(axis=0) / (len(square) - len(passes)))
+    return np.maximum(scale, 1e-3)
+
+
+def _weights(passes: Passes, residual: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(M, 2) weights of squared residuals, and (2,) by how much less than that errors of this spread curve the cost."""
+    sigma, nu = passes.sigma * scale, _DEGREES_OF_FREEDOM
+    square = (residual / sigma) ** 2
+    weights = (nu + 1.0) / (nu + square)
+    curvature = (nu + 1.0) * (nu - square) / (nu + square) ** 2
+    return weights / sigma**2, np.maximum(curvature.mean(axis=0) / weights.mean(axis=0), 0.1)
+
+
+def _cost(passes: Passes, estimate: _Estimate) -> float:
+    """Negative log-likelihood with the priors, but for a constant."""
+    residual, nu = linearise(passes, estimate.parameters, estimate.tags_m).residual, _DEGREES_OF_FREEDOM
+    losses = 0.5 * (nu + 1.0) * np.log1p((residual / (passes.sigma * estimate.scale)) ** 2 / nu)
+    of_scales = (len(residual) - len(passes)) * np.log(estimate.scale).sum()
+    return float(losses.sum() + of_scales + 0.5 * ((estimate.parameters / PRIOR_SIGMA) ** 2).sum())
+
+
+def _pulls(passes: Passes, model: Linearised, weights: FloatArray) -> _Pulls:
+    """Sums of weighed squares (M, 2) over each pass, and the place of its tag eliminated by Schur's complement."""
+    rows = np.concatenate([model.by_tag, model.by_parameters, model.residual[..., None]], axis=-1)
+    squares = (rows * weights[..., None]).swapaxes(-1, -2) @ rows
+    sums = np.add.reduceat(squares, passes.first)
+    of_tag, cross, own = sums[:, :2, :2], sums[:, :2, 2:], sums[:, 2:, 2:]
+    least = 1e-9 * (1.0 + np.trace(of_tag, axis1=-2, axis2=-1))
+    solved = np.linalg.solve(of_tag + least[:, None, None] * np.eye(2), cross)
+    left = own - cross.swapaxes(-1, -2) @ solved
+    return _Pulls(left[:, :-1, :-1], left[:, :-1, -1], -solved[..., -1], -solved[..., :-1])
+
+
+def _spread(passes: Passes, found: _Estimate) -> tuple[float, float]:
+    """Sigma of the offset, and how many times errors within blocks of the drives are repeated, at least once.
+
+    By the jackknife: by how much the estimate moves when a block of passes is left out, to first order (CR3 of Bell and
+    McCaffrey 2002, Bias reduction in standard errors for linear regression with multi-stage samples). A block is a
+    stretch of the drives, and all blocks tell about as much of the offset. Infinite where there are too few of them.
+    """
+    model = linearise(passes, found.parameters, found.tags_m)
+    weights, curvature = _weights(passes, model.residual, found.scale)
+    gradient = _pulls(passes, model, weights).gradient
+    information = _pulls(passes, model, weights * curvature).information
+    whole = information.sum(axis=0) + np.diag(PRIOR_SIGMA**-2)
+    by_offset = np.linalg.inv(whole)[0]
+    until = np.cumsum(by_offset @ information @ by_offset)
+    n = min(_BLOCKS, len(passes) // _PASSES_OF_A_BLOCK)
+    first = np.unique(np.searchsorted(until, until[-1] * np.arange(n) / n))
+    n = len(first)
+    if n < _FEWEST_BLOCKS:
+        return np.inf, 1.0
+    blocks, pulls = np.add.reduceat(information, first), np.add.reduceat(gradient, first)
+    moves = np.linalg.solve(whole - blocks, pulls[..., None])[:, 0, 0]
+    variance = (n - 1) / n * float((moves**2).sum())
+    alone = float(by_offset[0])
+    return float(np.sqrt(max(variance, alone) + _COMMON_SIGMA_S**2)), max(variance / alone, 1.0)
