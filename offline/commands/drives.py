@@ -8,7 +8,7 @@ import typer
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES
 from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
 from groundsbot.offline.maps import MapModel
-from groundsbot.offline.self_calibration import AUTO, OFF
+from groundsbot.offline.self_calibration import AUTO
 
 RobotFiles = Annotated[
     list[Path] | None,
@@ -63,7 +63,7 @@ def map_command(
             "contradict), or names.",
             metavar="off|auto|PARAM,...",
         ),
-    ] = OFF,
+    ] = AUTO,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")

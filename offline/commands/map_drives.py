@@ -32,7 +32,7 @@ from groundsbot.offline.maps import (
 )
 from groundsbot.offline.measurements import TapeOptions
 from groundsbot.offline.report import advice_sentence, contradiction_sentence, write_picture
-from groundsbot.offline.self_calibration import OFF, freed_lines, parse_calibrate
+from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refused_lines, verdict_lines
 from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
@@ -56,7 +56,7 @@ class MapOptions:
     corners: bool = False
     upright_deg: float | None = None
     extend: Path | None = None
-    calibrate: str = OFF
+    calibrate: str = AUTO
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -138,7 +138,7 @@ def summary(result: MapResult, output: Path) -> list[str]:
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
     lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
-    lines += freed_lines(result)
+    lines += [*verdict_lines(result.robot_numbers), *refused_lines(result)]
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     if result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)

@@ -25,7 +25,9 @@ def joined_goodness(maps: Sequence[LocalMap], solution: Solution) -> Goodness:
         solution: of all of them.
     """
     runs = [each.goodness for each in maps]
-    is_fitted = all(each.odometry_factor == each.reading_factor == 1.0 for each in runs)
+    is_fitted = all(
+        each.is_noisy or each.goodness.odometry_factor == each.goodness.reading_factor == 1.0 for each in maps
+    )
     if not is_fitted or len(solution.problem.measured):
         return fitted_windows(solution.problem).judge(solution.state)
     alone = [each.solution for each in maps]

@@ -1,6 +1,7 @@
 """All runs of a component in one solve, and the typed result."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -25,7 +26,10 @@ from groundsbot.offline.maps import (
     nominal_row,
 )
 from groundsbot.offline.measurements import Measurements, TagKey
-from groundsbot.offline.sam import Graph, Parameter, Solution, State, build_graph, solve
+from groundsbot.offline.sam import COST_TOLERANCE, Graph, Parameter, Solution, State, build_graph, solve
+
+# Where many readings lie beyond the loss's threshold steps become short; a hundredth of a sigma is near enough there.
+_NOISY_COST_TOLERANCE: Final = 1e-6
 
 
 def solve_global_map(
@@ -44,7 +48,8 @@ def solve_global_map(
         start = graph.start(poses, _mean_tags(members, group), _mean_calibration(members))
         _ = graph.problem.arrowhead  # the order of elimination is part of it, and made when first asked for
     with stages.stage("solving all runs together"):
-        return graph, solve(graph.problem, start)
+        noisy = any(member.is_noisy for member in members)
+        return graph, solve(graph.problem, start, _NOISY_COST_TOLERANCE if noisy else COST_TOLERANCE)
 
 
 def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:

@@ -1,18 +1,28 @@
 """The components of a map: each solved on places, tags that do not belong apart, then on corners; and what they say."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+from groundsbot.calib.foundation import counted
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import Refined, refine
 from groundsbot.offline.foundation import Stages
+from groundsbot.offline.global_map.goodness_of_fit import joined_goodness
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import (
     SuspectTag,
 )
-from groundsbot.offline.measurements import Measurements
-from groundsbot.offline.outliers import joined, split_together, suspect_tags
+from groundsbot.offline.measurements import Measurements, TagKey
+from groundsbot.offline.outliers import (
+    Searched,
+    joined,
+    phantoms,
+    split_together,
+    stray_passes,
+    suspect_tags,
+    without_tags,
+)
 from groundsbot.offline.sam import Graph, Solution
 
 
@@ -25,7 +35,7 @@ class SolvedComponent(NamedTuple):
         solution: of the graph, on places of tags.
         suspects: tags that do not belong.
         refined: on corners; None where it is not.
-        told: why it is not, where anybody asked; or which tags do not hang as was said.
+        told: what was left out; why it is not refined, where anybody asked; or which tags do not hang as was said.
     """
 
     members: Group
@@ -49,17 +59,55 @@ def solved_component(
     """Solves the members of a group together, tags that do not belong apart unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
     suspects: list[SuspectTag] = []
-    # Where a drive does not fit whatever its noise, what tags seem to have done is that drive's doing.
-    if not any(maps[m].is_doubtful for m in members.members):
-        with stages.stage("tags that do not belong"):
-            searched = split_together(graph, solution, [maps[m] for m in members.members])
-            suspects = suspect_tags(searched)
-        graph, solution = searched.graph, searched.solution
+    told: list[str] = []
+    with stages.stage("tags that do not belong"):
+        searched = _searched(graph, solution, [maps[m] for m in members.members])
+        if searched is not None:
+            suspects, gone, told = _judged(searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members))
+            graph, solution = without_tags(searched.graph, searched.solution, gone)
     if keep_suspects and suspects:
         graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
-    solved = SolvedComponent(members, graph, solution, suspects)
+    solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told))
     if not corners or not graph.has_corners:
         return solved
     with stages.stage("refining on tag corners"):
-        refined, told = refine(graph, solution, upright_sigma_rad)
-    return solved._replace(refined=refined, told=tuple(told))
+        refined, more = refine(graph, solution, upright_sigma_rad)
+    return solved._replace(refined=refined, told=(*told, *more))
+
+
+def _searched(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
+    """Tags that do not belong apart; None where the drives do not fit even so.
+
+    Where a drive whose noise was fitted does not fit, or all do not fit together, what tags seem to have done is not
+    theirs: there is something else that the model does not know.
+    """
+    if any(each.is_doubtful for each in maps):
+        return None
+    searched = split_together(graph, solution, maps)
+    if searched is None or not any(each.is_noisy for each in maps):
+        return searched
+    return searched if len(maps) == 1 or joined_goodness(maps, searched.solution).fits else None
+
+
+def _judged(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
+    """The tags that do not belong, those that are left out, and a sentence of the latter that are not named.
+
+    Noise that was fitted has heavier tails than normal errors have: there a pass that goes astray names no tag.
+    """
+    suspects, stray = suspect_tags(searched), set[TagKey]()
+    told = []
+    if noise_is_fitted and (stray := stray_passes(searched)):
+        ids = {(tag.family, tag.tag_id) for tag in stray}
+        suspects = [each for each in suspects if (each.family, each.tag_id) not in ids]
+        n = sum(
+            n for tag, n in zip(searched.graph.tags, searched.graph.n_readings().tolist(), strict=True) if tag in stray
+        )
+        told.append(
+            f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({counted(n, 'reading')}) of tags {_listed(ids)} "
+            "went astray from where all others have them: left out"
+        )
+    return suspects, stray | phantoms(searched.graph, suspects), told
+
+
+def _listed(ids: Collection[tuple[str, int]]) -> str:
+    return ", ".join(str(tag_id) for _, tag_id in sorted(ids))

@@ -9,6 +9,7 @@ is fitted. A reading that is simply wrong costs the same on either side. Errors 
 share are invisible one by one, but not where a tag is met again; `correlated_errors` fits how large they are.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -51,6 +52,8 @@ _MAX_FITS: Final = 20
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
 _ROUNDING: Final = 1e-6
+_WORST_SHARE: Final = 0.2
+_FEWEST_WINDOWS: Final = 3
 _N_SIGNS: Final = 8
 _AT_ONCE: Final = 4096  # motions: a Jacobian of all of them takes as much memory as the solve
 _SEED: Final = 7
@@ -100,6 +103,8 @@ class Windows:
         problem: the whole, by the sigmas that the estimate was told.
         losses: of wheels and readings.
         factors: (2,) the noise of wheels and of readings as a multiple of those sigmas.
+        usual_factors: (2,) the same in most windows, less those that leave most over: a tag that moves, or a robot that
+            is carried, spoils a few of them. 0 where there are too few windows.
         sharing: (M, 2) what else multiplies each reading's sigmas, for errors that it shares with its neighbours.
         freedom: what chi-square's degrees of freedom the noise is known like.
         cost: of all windows apart, under that noise.
@@ -110,6 +115,7 @@ class Windows:
     problem: Problem
     losses: Losses
     factors: FloatArray
+    usual_factors: FloatArray
     sharing: FloatArray
     freedom: float
     cost: float
@@ -192,13 +198,37 @@ def fitted_windows(
         if effort:
             effort.spend(solution)
         sharing, known_like = _sharing(problem, solution, least_shared / factors[1] ** 2)
+        sharing = np.maximum(sharing, least_factor / factors[1])
         freedom, state = min(freedom, known_like), solution.state
         del solution
         shared = _scaled(apart, factors[0], factors[1] * sharing)
         solution = solve(shared, state, losses=losses, most_tries=most_tries)
     if effort:
         effort.spend(solution)
-    return Windows(problem, losses, factors, sharing, freedom, solution.cost, n_conditions, effort, share)
+    usual = factors * _without_the_worst(solution)
+    return Windows(problem, losses, factors, usual, sharing, freedom, solution.cost, n_conditions, effort, share)
+
+
+def _without_the_worst(solution: Solution) -> FloatArray:
+    """(2,) how many times the sigmas of wheels and of readings what windows leave over has, the worst fifth aside."""
+    problem, state = solution.problem, solution.state
+    begins = np.ones(len(state.poses), dtype=np.bool_)
+    begins[problem.odometry.first + 1] = False
+    window = np.cumsum(begins) - 1
+    found = np.ones(2)
+    of_wheels = solution.losses.odometry, problem.odometry.residual(state), problem.odometry.first
+    of_readings = solution.losses.readings, problem.readings.residual(state), problem.readings.pose
+    for kind, (loss, residual, pose) in enumerate((of_wheels, of_readings)):
+        losses, _ = losses_and_weights(loss, residual)
+        n = np.bincount(window[pose], minlength=int(begins.sum())).astype(np.float64)
+        left = np.bincount(window[pose], losses, len(n))[n > 0.0]
+        n = n[n > 0.0]
+        kept = np.argsort(left / n, kind="stable")[: len(n) - math.ceil(_WORST_SHARE * len(n))]
+        if len(n) < _FEWEST_WINDOWS:
+            found[kind] = 0.0  # nobody knows what is usual
+        elif left.sum() > 0.0:
+            found[kind] = np.sqrt(left[kept].sum() / n[kept].sum() * n.sum() / left.sum())
+    return found
 
 
 def _sharing(problem: Problem, solution: Solution, least_shared: FloatArray | float) -> tuple[FloatArray, float]:

@@ -50,6 +50,8 @@ _LEAST_GAIN: Final = 0.01
 # Building up allows for the noise that windows show where it is so many times as large as told. Where it is not much
 # more, that would leave room for wrong places.
 _FAR_LARGER: Final = 1.5
+# Of pixels: what corners err by beyond that is something else's error, the stamp's, the tag's or the mount's.
+_MOST_CORNER_PX: Final = 1.0
 # Keyframes that the test of goodness looks at, spread over the drive where there are more.
 _MOST_CHECKED: Final = 2500
 _LEAST_SHARE: Final = 0.25
@@ -64,6 +66,8 @@ class LocalMap:
     graph: Graph
     solution: Solution
     goodness: Goodness
+    is_noisy: bool = False  # its windows show far more noise than was told: that comes first, what does not fit after
+    whole: Chain | None = None  # with readings that nothing confirms, where these were left out of a noisy one
     is_doubtful: bool = False  # it does not fit even under the noise that was fitted to it: no tag of it is named
 
     @property
@@ -81,15 +85,6 @@ class LocalMap:
         """What the chain says of the calibration."""
         return self.graph.calibration_of(self.solution.state)
 
-    @property
-    def is_noisy(self) -> bool:
-        """Whether nobody measured the robot and its windows show far more noise than was told.
-
-        Then the noise comes first, and what does not fit in afterwards.
-        """
-        factors = self.goodness.odometry_factor, self.goodness.reading_factor
-        return self.chain.run.robot.is_left_open and max(factors) > _FAR_LARGER
-
     def without_factors(self) -> "LocalMap":
         """The same, less the factorisation that its solution keeps for whoever asks again: it may be most of a map."""
         return replace(self, solution=replace(self.solution))
@@ -104,7 +99,9 @@ class _BuiltUp(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(chain: Chain, effort: Effort | None = None, other_starts: int | None = None) -> LocalMap:
+def solve_local_map(
+    chain: Chain, effort: Effort | None = None, other_starts: int | None = None, *, noise_is_open: bool = False
+) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
@@ -114,6 +111,8 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, other_starts: in
         chain: what was measured.
         effort: what the stretch is worth; the whole log's where None.
         other_starts: how many may be tried; eight where None.
+        noise_is_open: the noise that the chain is under is a first guess, to be fitted later. Where its windows show
+            far more, it is taken for unknown, as it always is for robots that nobody measured.
 
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
@@ -123,8 +122,16 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, other_starts: in
     effort.check(graph.problem, chain.run.log, chain.name)
     keyframes = coarse_keyframes(chain)
     check = _Check(graph, effort)
-    coarse = coarsened(confirmed(chain) if chain.run.robot.is_left_open else chain, keyframes)
-    far_larger = chain.run.robot.is_left_open and max(check.noise_factors) > _FAR_LARGER
+    noise_is_open = noise_is_open or chain.run.robot.is_left_open
+    factors = check.noise_factors if chain.run.robot.is_left_open else check.usual_noise_factors
+    far_larger = noise_is_open and max(factors) > _FAR_LARGER
+    whole = None
+    if far_larger:
+        whole = chain.with_unknown_noise() if factors[1] * chain.readings.corner_sigma_px > _MOST_CORNER_PX else chain
+        chain = confirmed(whole)
+        graph = build_graph([chain])
+        check = _Check(graph, effort)
+    coarse = coarsened(chain, keyframes)
     known = _built_up(_as_shown(coarse, check.noise_factors) if far_larger else coarse, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
@@ -136,7 +143,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, other_starts: in
         effort.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
-            best = LocalMap(chain, graph, solution, check.judge(solution))
+            best = LocalMap(chain, graph, solution, check.judge(solution), is_noisy=far_larger, whole=whole)
             n_in_vain = 0
             if best.goodness.fits:
                 break
@@ -184,6 +191,12 @@ class _Check:
     def noise_factors(self) -> tuple[float, float]:
         """The noise of wheels and of readings as a multiple of what was told."""
         wheels, readings = self._windows.factors.tolist()
+        return wheels, readings
+
+    @property
+    def usual_noise_factors(self) -> tuple[float, float]:
+        """The same in most of the windows."""
+        wheels, readings = self._windows.usual_factors.tolist()
         return wheels, readings
 
     def judge(self, solution: Solution) -> Goodness:

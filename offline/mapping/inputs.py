@@ -51,7 +51,7 @@ def check_new(
     check_can_be_extended(extending)
     if corners:
         raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
-    if calibrate.is_on:
+    if calibrate.names:
         raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")

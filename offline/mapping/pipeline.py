@@ -37,9 +37,11 @@ from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, t
 from groundsbot.offline.self_calibration import (
     TIMES_MAPPED,
     Calibrate,
+    TimeOffsetSearch,
     about_the_files,
     free_what_is_told,
-    with_start_values,
+    start_left_open,
+    verdicts,
 )
 
 
@@ -53,7 +55,7 @@ def build_map(
     keep_suspects: bool = False,
     corners: bool = False,
     upright_sigma_rad: float | None = None,
-    calibrate: Calibrate = Calibrate(),
+    calibrate: Calibrate = Calibrate(is_on=True),
     workings: Workings | None = None,
     extending: MapResult | None = None,
 ) -> MapResult:
@@ -82,13 +84,17 @@ def build_map(
     noise_fit = None
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
+        calibrate = Calibrate()  # a kept map has its calibration
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
     workings = workings or Workings()
     workings.runs += runs
-    runs, chains, choices = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
+    given = runs
+    runs, chains, choices, searches = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
+    workings.searches |= searches
     measurements = _measurements(tape, runs, chains, extending)
     known = _known_maps(extending, stages)
-    maps, noisy, broken = local_maps_of(chains, stages, TIMES_MAPPED if calibrate.is_on else 1)
+    times = TIMES_MAPPED if calibrate.is_on else 1
+    maps, noisy, broken = local_maps_of(chains, stages, times, noise_is_open=noise is None)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
@@ -107,11 +113,13 @@ def build_map(
     found.measured += unused(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
+    calibration = about_the_files(found.calibration, choices)
     return MapResult(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged) + joined,
         noise=noise,
-        calibration=tuple(about_the_files(found.calibration, choices)),
+        calibration=tuple(calibration),
+        robot_numbers=verdicts(given, calibration, choices),
         measurements=tuple(found.measured),
         checks=tuple(found.checks),
         metres=tuple(found.metres),
@@ -129,18 +137,16 @@ def build_map(
 
 def _calibrated(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
-) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...]]:
-    """The runs as their robots are to be taken, their stretches, and what self-calibration freed."""
+) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...], dict[str, TimeOffsetSearch]]:
+    """The runs as their robots are to be taken, their stretches, what was freed, and searches for time offsets."""
     with stages.stage("start values of robots"):
-        runs, started, _ = with_start_values(runs, noise)
-    chains = _chains(runs, noise, stages)
-    if not calibrate.is_on:
-        return runs, chains, started
-    with stages.stage("self-calibration"):
-        freed, choices = free_what_is_told(runs, chains, noise, calibrate.names, corners=corners)
-    if any(each.is_freed for each in choices):
-        chains = _chains(freed, noise, stages)
-    return freed, chains, (*started, *choices)
+        runs, started, searches = start_left_open(runs, noise)
+    choices: tuple[CalibrationChoice, ...] = ()
+    if calibrate.is_on:
+        with stages.stage("self-calibration"):
+            runs, choices, more = free_what_is_told(runs, noise, calibrate.names, corners=corners)
+        searches |= more
+    return runs, _chains(runs, noise, stages), (*started, *choices), searches
 
 
 def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:

@@ -8,6 +8,7 @@ from groundsbot.offline.alignment import Group
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.sam import Graph, Solution
+from groundsbot.offline.self_calibration import TimeOffsetSearch
 
 
 class Solved(NamedTuple):
@@ -39,8 +40,10 @@ class Workings:
         maps: the local maps as they were aligned.
         solved: the components, largest first.
         runs: as they were given.
+        searches: for time offsets, by robot.
     """
 
     maps: list[LocalMap] = field(default_factory=list)
     solved: list[Solved] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
+    searches: dict[str, TimeOffsetSearch] = field(default_factory=dict)

@@ -13,6 +13,7 @@ from .parameter_results import (
     FittedNoise,
     FittedParameter,
     MetreResult,
+    RobotNumber,
 )
 from .result import (
     AdviceResult,
@@ -52,6 +53,7 @@ __all__ = [
     "MetreResult",
     "Misfit",
     "RivalResult",
+    "RobotNumber",
     "RunResult",
     "StartToStart",
     "SuspectTag",

@@ -35,7 +35,7 @@ from groundsbot.offline.maps.json_document import (
     tag_from,
 )
 from groundsbot.offline.maps.model import MapModel
-from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, MetreResult
+from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, MetreResult, RobotNumber
 from groundsbot.offline.maps.result import Component, GraphEdges, MapResult, RunResult, StartToStart
 from groundsbot.offline.maps.tags_table import tags_csv
 from groundsbot.offline.maps.tum import read_tum, write_tum
@@ -103,6 +103,7 @@ def read_map(folder: Path) -> MapResult:
             noise_fit=noise_fit_from(data.get("noise_fit")),
             calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
             choices=tuple(CalibrationChoice(**entry) for entry in data.get("choices", ())),
+            robot_numbers=tuple(RobotNumber(**entry) for entry in data.get("robot_numbers", ())),
             measurements=tuple(measurement_from(entry) for entry in data["measurements"]),
             checks=tuple(check_from(entry) for entry in data["checks"]),
             metres=tuple(MetreResult(**entry) for entry in data["metres"]),

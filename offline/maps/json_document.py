@@ -51,6 +51,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "noise_fit": None if result.noise_fit is None else _plain(asdict(result.noise_fit)),
         "calibration": [_plain(vars(entry)) for entry in result.calibration],
         "choices": [_plain(vars(entry)) for entry in result.choices],
+        "robot_numbers": [_plain(vars(entry)) for entry in result.robot_numbers],
         "measurements": [_plain(vars(entry)) for entry in result.measurements],
         "checks": [_plain({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
         "metres": [_plain(vars(entry)) for entry in result.metres],

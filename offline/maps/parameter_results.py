@@ -53,6 +53,32 @@ class CalibrationChoice:
 
 
 @dataclass(frozen=True)
+class RobotNumber:
+    """What drives say of one number of a robot's file.
+
+    Attributes:
+        owner: robot id, or the printed batch of tags.
+        name: as in CalibrationResult.
+        component: whose solve found it.
+        what: the field of robot.yaml, or what the number is, with its unit.
+        in_file: as the file has it.
+        found: by the map, with its sigma.
+        verdict: what to think of the file.
+        to_do: what to do about it; empty for nothing.
+    """
+
+    owner: str
+    name: str
+    component: int
+    what: str
+    in_file: float
+    found: float
+    sigma: float
+    verdict: str
+    to_do: str
+
+
+@dataclass(frozen=True)
 class CheckResult:
     """Two ways to know one thing, held against each other: wheels and tags."""
 

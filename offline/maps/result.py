@@ -19,6 +19,7 @@ from groundsbot.offline.maps.parameter_results import (
     CheckResult,
     FittedNoise,
     MetreResult,
+    RobotNumber,
 )
 
 
@@ -221,6 +222,7 @@ class MapResult:
     noise_fit: FittedNoise | None = None  # None: the noise was given
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
     choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none where it was off
+    robot_numbers: tuple[RobotNumber, ...] = ()  # what the drives say of each number of robots' files
     kept: tuple[KeptChain, ...] = ()  # each run's measurements, to solve them again together with another run's
 
     @property

@@ -15,7 +15,11 @@ from groundsbot.offline.measurements.keyframes import (
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, joined
-from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections, read_positions
+from groundsbot.offline.measurements.sensor_model.sensor_model import (
+    read_detections,
+    read_positions,
+    with_position_noise,
+)
 from groundsbot.offline.measurements.tags import TagKey
 
 
@@ -80,6 +84,10 @@ class Chain:
     def weighed(self, noise: NoiseParameters) -> "Chain":
         """The same measurements under other noise."""
         return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
+
+    def with_unknown_noise(self) -> "Chain":
+        """The same measurements with readings of which no more is known than of any sensor's."""
+        return replace(self, readings=with_position_noise(self.readings))
 
 
 def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:

@@ -47,10 +47,10 @@ _MOST_TAGS: Final = 652
 # A reading that was measured takes twelve bytes at least: noise cannot be compressed.
 _FREE_READINGS: Final = 60_000
 _LEAST_BYTES_A_READING: Final = 10
-# What is used of them: a recorded reading takes 200 bytes and more, and a dense import 33 with what lies around it, of
-# which beyond a megabyte every second look will do. 24,000 at 1 MiB take some 7 s of a processor.
+# What is used of them: all that a robot could have recorded. A recorded reading takes 200 bytes and more, one of an
+# import of millimetres and tenths of a milliradian, ten to a look, 20 with what lies around it.
 _FREE_TO_USE: Final = 8000
-_BYTES_TO_USE: Final = 64
+_BYTES_TO_USE: Final = 12
 
 
 class RunReadings:

@@ -1,8 +1,8 @@
 """Under which noise the runs of one map are solved together: what they tell themselves, where they may be believed.
 
 One set of sigmas serves all runs: names, `--noise` and map.json have one, and robots of one make differ less in their
-wheels than a single drive can tell. It is fitted to the runs whose readings fit together; where none does, to those of
-robots that nobody measured.
+wheels than a single drive can tell. It is fitted to the runs whose readings fit together, and to those whose noise is
+far from what was told: whether these fit together is asked under the noise that they have.
 A run that contradicts itself beside others that do not says nothing of noise, and is believed no more than before, nor
 more than the others: of each sigma it gets the larger. What neighbouring readings share is fitted too
 (`shared_errors`).
@@ -47,8 +47,8 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         maps: solved under the prior.
         prior: what stays where the runs tell nothing.
     """
-    sound = [each for each in maps if _is_sound(each)] or [each for each in maps if _is_unknown(each)]
-    fit = fit_noise(sound, prior)
+    sound = [each for each in maps if _is_sound(each)]
+    fit = fit_noise(sound, _as_shown(sound, prior))
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
     is_told = bool(fit.n_groups[0, 0] >= _LEAST_CELLS)
     shared = fit.shared if noise != prior else np.zeros((2, 2))
@@ -62,13 +62,13 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
     )
     doubted = _larger(prior, noise)
     return WeighedMaps(
-        [_under(each, noise if each.goodness.fits else doubted, shared, prior) for each in maps],
+        [_under(each, noise if each.goodness.fits or each.is_noisy else doubted, shared, prior) for each in maps],
         noise,
         FittedNoise(
             tuple(parameters),
             **dict(zip(_SHARED, shared.reshape(-1).tolist(), strict=True)),
             runs=tuple(each.chain.name for each in sound),
-            contradicting=tuple(each.chain.name for each in maps if not each.goodness.fits),
+            contradicting=tuple(each.chain.name for each in maps if not (each.goodness.fits or each.is_noisy)),
         ),
     )
 
@@ -82,14 +82,19 @@ def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedN
     return [replace(_under(each, noise, shared, noise), goodness=each.goodness) for each in maps]
 
 
+def _as_shown(maps: Sequence[LocalMap], prior: NoiseParameters) -> NoiseParameters:
+    """The prior, wheels as much worse as windows of noisy drives show; from far too small sigmas nothing is told."""
+    times = max([1.0, *(each.goodness.odometry_factor for each in maps if each.is_noisy)])
+    return prior.model_copy(update={name: times * getattr(prior, name) for name in ODOMETRY_NOISE})
+
+
 def _is_sound(local_map: LocalMap) -> bool:
-    """Whether what a map leaves over is noise; where its solve did not come to its end, nobody knows."""
-    return len(local_map.chain.tags) > 0 and local_map.goodness.fits and local_map.solution.converged
+    """Whether what a map leaves over is noise; where its solve did not come to its end, nobody knows.
 
-
-def _is_unknown(local_map: LocalMap) -> bool:
-    """Whether nobody measured the robot of a map with tags: what it leaves over is all that is known of its noise."""
-    return local_map.chain.run.robot.is_left_open and len(local_map.chain.tags) > 0
+    Of one whose noise is unknown it is all that is known of that; whether it fits is asked afterwards.
+    """
+    fits = local_map.is_noisy or (local_map.goodness.fits and local_map.solution.converged)
+    return len(local_map.chain.tags) > 0 and fits
 
 
 def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
@@ -104,7 +109,10 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
     solution = solve(graph.problem, local_map.solution.state)
     graph.problem.arrowhead.without_scratch()
-    return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness)
+    whole = local_map.whole
+    if whole is not None:
+        whole = counted_for_less(whole.weighed(noise), shared, noise.sigma_corner_px)
+    return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness, whole=whole)
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:

@@ -31,6 +31,7 @@ _MOST_LOOKS: Final = 15
 LEAST_REDUNDANCY: Final = 5.0
 _CONTRADICTED: Final = 3.0  # sigmas of the squares
 _LARGEST_STEP: Final = 10.0  # factor on a variance, from one look to the next
+_GROWING: Final = 0.5  # of the logarithm of a sigma in one step
 _SMALL_STEP: Final = 0.1  # of its own standard deviation
 # Where shared errors begin, as a share of the readings' variance; and what is as good as none.
 _SHARED_START: Final = 0.05
@@ -109,6 +110,21 @@ def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | 
     )
 
 
+def _own_by_shared(parts: Sequence[Part], sigma: FloatArray) -> float:
+    """How large the own errors of readings are where the fit begins, in units of those that shared ones are told in.
+
+    At most one: shared errors that dwarf the own ones would leave nothing to be said of these.
+    """
+    own, shared = 0.0, 0.0
+    for each in parts:
+        found = each.components
+        if found.shared_root is not None and len(found.readings_rest):
+            readings = np.tensordot(sigma**2, found.readings, 1) + found.readings_rest
+            own += float(np.trace(readings, axis1=-2, axis2=-1).sum())
+            shared += float((found.shared_root**2).sum())
+    return min(1.0, own / shared) if shared > 0.0 else 1.0
+
+
 class _Search:
     """Repeats the estimate under its own weights.
 
@@ -120,7 +136,7 @@ class _Search:
     def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, n_shared: int) -> None:
         self.lookers = [Looker(part) for part in parts]
         self._n = len(sigma)
-        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START))
+        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
         self.variances = np.maximum(self._middle, self._least)
         self.seen: Seen = all_looks(self.lookers, self.variances)
@@ -134,7 +150,9 @@ class _Search:
             self.seen = all_looks(self.lookers, self.variances)
             deviation = np.sqrt(np.diag(self.log_covariance()))
             matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
-            if (np.abs(moved) < _SMALL_STEP * deviation)[matters].all():
+            # Far too small, all readings are cut off as faults, and nothing is told until sigmas have grown.
+            is_growing = bool((free & (moved > _GROWING)).any())
+            if not is_growing and (np.abs(moved) < _SMALL_STEP * deviation)[matters].all():
                 return True
         return False
 

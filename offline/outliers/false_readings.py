@@ -74,16 +74,27 @@ def _medians(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 def without_false_detections(local_map: LocalMap) -> LocalMap:
-    """The map solved without them; the chain's warnings say how many there were."""
+    """The map solved without them, but with all others; the chain's warnings say how many there were."""
+    local_map = _with_all_readings(local_map)
     wrong = false_readings(local_map)
-    if not wrong.any():
-        return local_map
     n, n_all, name = int(wrong.sum()), len(wrong), local_map.chain.name
     told = f"{name}: {n} of {n_all} readings lie far from their tags, single ones: taken for misread, left out"
     chain = local_map.chain.with_readings(~wrong)
-    chain = replace(chain, warnings=(*chain.warnings, told))
+    if n:
+        chain = replace(chain, warnings=(*chain.warnings, told))
     graph = build_graph([chain])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start)
     graph.problem.arrowhead.without_scratch()
     return replace(local_map, chain=chain, graph=graph, solution=solution)
+
+
+def _with_all_readings(local_map: LocalMap) -> LocalMap:
+    """The map, not solved again, with the readings that were left out of it because nothing confirmed them."""
+    chain = local_map.whole
+    if chain is None:
+        return local_map
+    graph = build_graph([chain])
+    state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
+    solution = replace(local_map.solution, state=state, problem=graph.problem)
+    return replace(local_map, chain=chain, graph=graph, solution=solution, whole=None)

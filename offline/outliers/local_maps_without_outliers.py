@@ -27,7 +27,9 @@ class ExplainedMaps(NamedTuple):
     warnings: list[str]
 
 
-def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> ExplainedMaps:
+def local_maps_of(
+    chains: Sequence[Chain], stages: Stages, times: int = 1, *, noise_is_open: bool = False
+) -> ExplainedMaps:
     """Each chain solved alone, parted where its wheels lost the way, with tags that do not belong apart.
 
     That is what explains a drive that contradicts itself though its wheels and readings are about as good as told. One
@@ -37,12 +39,13 @@ def local_maps_of(chains: Sequence[Chain], stages: Stages, times: int = 1) -> Ex
         chains: stretches of runs.
         stages: told what is being done.
         times: how often the command maps the runs; what they are worth is shared out.
+        noise_is_open: as for `solve_local_map`.
     """
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(chains)) as done:
         efforts = efforts_of(chains, times)
         for chain, effort in zip(chains, efforts, strict=True):
-            maps.append(solve_local_map(chain, effort))
+            maps.append(solve_local_map(chain, effort, noise_is_open=noise_is_open))
             done()
     alone = RunsAlone()
     with stages.stage("tags that do not belong"):

@@ -27,7 +27,7 @@ from groundsbot.offline.outliers.evidence import (
 )
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.places import Places, settled
-from groundsbot.offline.outliers.search import FALSE_ALARM, bound, excess, search
+from groundsbot.offline.outliers.search import FALSE_ALARM, bound, excess, freedom_of_places, search
 from groundsbot.offline.outliers.sightings import Sightings, instances, places_told_apart, sightings_of, with_instances
 from groundsbot.offline.sam import Graph, Measured, Solution, build_graph, solve
 
@@ -36,6 +36,8 @@ _MOST_SEARCHES: Final = 5
 _LOOSER: Final = 1e3
 # Two tags have one id now and then, three hardly: then other ways to join its sightings are tried, so many at most.
 _MANY_PLACES: Final = 3
+# Where a half of the tags that a drive came back to seem to have moved, something else is wrong; of so many or fewer.
+_FEW_AGAIN: Final = 3
 _MOST_JOINS: Final = 12
 
 
@@ -88,7 +90,7 @@ class RunsAlone:
         sightings = sightings_of([before.chain])
         n_again = int((np.bincount(sightings.id) > 1).sum())
         n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
-        return after if after.goodness.fits and 2 * n_split < max(n_again, 3) else before
+        return after if after.goodness.fits and 2 * n_split < max(n_again, _FEW_AGAIN) else before
 
 
 def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalMap:
@@ -162,7 +164,7 @@ def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     for _ in range(_MOST_SEARCHES):
         seen = _looked_at(found.graph, found.solution, scales)
         wanted = _wanted(seen, false_alarm)
-        if _same(wanted, seen.place):
+        if wanted is None or _same(wanted, seen.place):
             break
         found = _relabelled(found, seen.sightings, wanted)
     return found
@@ -190,10 +192,11 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
     return [renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
 
 
-def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
     """Splits and joins the tags of a component until nothing changes.
 
-    What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault.
+    What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault. None
+    where most tags of drives whose noise was fitted seem to have several places: then it is not the tags.
 
     Args:
         graph: of the component.
@@ -203,16 +206,21 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
     if len(graph.problem.measured):
         loose = replace(graph, problem=replace(graph.problem, measured=_loosened(graph.problem.measured)))
         seen = _split(loose, solve(loose.problem, solution.state), maps)
+        if seen is None:
+            return None
         problem = replace(seen.graph.problem, measured=_measured_again(graph, seen.graph))
         return replace(seen, graph=replace(seen.graph, problem=problem), solution=solve(problem, seen.solution.state))
     return _split(graph, solution, maps)
 
 
-def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched:
+def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
     scales = noise_scales([each.goodness for each in maps])
     seen = _looked_at(graph, solution, scales)
+    noise_is_fitted = any(each.is_noisy for each in maps)
     for _ in range(_MOST_SEARCHES):
-        wanted = _wanted(seen, FALSE_ALARM)
+        wanted = _wanted(seen, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
+        if wanted is None:
+            return None
         if instances(seen.sightings, wanted) == seen.tags:
             break
         seen = _looked_at(*_solved_again(seen, wanted), scales)
@@ -234,13 +242,21 @@ def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched
     return Searched(graph, solution, sightings, place, evidence, settled(evidence, place[evidence.which]))
 
 
-def _wanted(seen: Searched, false_alarm: float) -> IntArray:
-    """(S,) the places that the evidence asks for."""
+def _wanted(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
+    """(S,) the places that the evidence asks for.
+
+    None where most ids ask for several though the noise was fitted to the same passes: then it is not the tags.
+    """
     which = seen.evidence.which
     found = seen.place.copy()
     if len(which):
-        least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm)
-        found[which] = seen.place.max() + 1 + search(seen.evidence, seen.sightings, seen.places, least_gain)
+        freedom = freedom_of_places(seen.places) if noise_is_fitted else np.inf
+        least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm, freedom)
+        most_ids = max(int((np.bincount(seen.sightings.id) > 1).sum()), _FEW_AGAIN) // 2
+        label = search(seen.evidence, seen.sightings, seen.places, least_gain, most_ids if noise_is_fitted else None)
+        if label is None:
+            return None
+        found[which] = seen.place.max() + 1 + label
     return found
 
 

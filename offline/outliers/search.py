@@ -12,6 +12,7 @@ from itertools import product
 from typing import Final
 
 import numpy as np
+from scipy import stats
 from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
@@ -28,10 +29,23 @@ _MOST_SPLITS: Final = 200
 _MANY: Final = 5
 
 
-def bound(sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_ALARM) -> float:
-    """By how many squared sigmas a split must lower the cost, all that could be looked at counted."""
+def bound(sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf) -> float:
+    """By how many squared sigmas a split must lower the cost, all that could be looked at counted.
+
+    Args:
+        sightings: S of them.
+        evidence: of some.
+        false_alarm: how rarely a good map has a split.
+        freedom: what chi-square's degrees of freedom the noise is known like.
+    """
     n_tests = sum(len(_splits_of(sightings, own)) for own in _by_label(sightings.id[evidence.which], evidence.which))
-    return float(chdtri(2, false_alarm / max(n_tests, 1)))
+    share = false_alarm / max(n_tests, 1)
+    return float(chdtri(2, share) if np.isinf(freedom) else 2.0 * stats.f.isf(share, 2, max(freedom, 1.0)))
+
+
+def freedom_of_places(places: Places) -> int:
+    """What chi-square's degrees of freedom noise is known like that was fitted to how sightings of tags differ."""
+    return sum(2 * len(each.members) - 2 for each in places.held)
 
 
 def excess(places: Places) -> float:
@@ -49,15 +63,20 @@ def excess(places: Places) -> float:
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _MANY else 1.0
 
 
-def search(evidence: Evidence, sightings: Sightings, begin: Places, least_gain: float) -> IntArray:
-    """(K,) the places that the evidence asks for.
+def search(
+    evidence: Evidence, sightings: Sightings, begin: Places, least_gain: float, most_ids: int | None = None
+) -> IntArray | None:
+    """(K,) the places that the evidence asks for; None where more ids than are plausible ask for several.
 
     Args:
         evidence: of K sightings.
         sightings: they are of these.
         begin: see `settled`.
         least_gain: see `bound`.
+        most_ids: that are plausible; None: any number.
     """
+    id_of = sightings.id[evidence.which]
+    split: set[int] = set()
     labels, held = begin.place.copy(), list(begin.held)
     masks = [_masks(sightings, evidence.which[each.members]) for each in held]
     gone: list[tuple[FloatArray, FloatArray]] = []  # what is free already, felt by all
@@ -72,6 +91,9 @@ def search(evidence: Evidence, sightings: Sightings, begin: Places, least_gain: 
         label, which = best
         own = held[label].of(which)
         members = own.members
+        split.add(int(id_of[members[0]]))
+        if most_ids is not None and len(split) > most_ids:
+            return None
         labels[members] = len(held)
         freed = begin.stiffness.against(members)
         for against, inner in gone:

@@ -14,6 +14,7 @@ from groundsbot.offline.mapping import Solved, Workings
 from groundsbot.offline.report.picture import RUN_COLOURS
 from groundsbot.offline.report.sentences import advice_sentence, has_several_families, tag_label, would_help
 from groundsbot.offline.report.timeline import events_of, timeline
+from groundsbot.offline.self_calibration import TimeOffsetSearch
 
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
 _MOST_POINTS: Final = 1500
@@ -39,7 +40,22 @@ def figures(document: dict[str, Any], workings: Workings) -> dict[str, Any]:
                 data = timeline(chain, sigmas[chain_of_reading(solved) == i], events[chain.name])
                 timelines.append(data | {"colour": colours[chain.name]})
     n_timelines = sum(len(solved.graph.chains) for solved in workings.solved)
-    return {"components": components, "timelines": timelines, "n_timelines": n_timelines}
+    return {
+        "components": components,
+        "timelines": timelines,
+        "n_timelines": n_timelines,
+        "searches": [_search(robot, each) for robot, each in sorted(workings.searches.items())],
+    }
+
+
+def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
+    """The cost over the time offset of one robot."""
+    return {
+        "robot": f"{robot}: {search.offset_s:+.3f} s (sigma {search.sigma_s:.3f} s)",
+        "offset_s": round(search.offset_s, 4),
+        "grid_s": search.grid_s.round(3).tolist(),
+        "cost": search.cost.round(2).tolist(),
+    }
 
 
 def run_colours(document: dict[str, Any]) -> dict[str, str]:

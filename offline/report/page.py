@@ -17,8 +17,8 @@ _ASSETS: Final = "groundsbot.offline.report.assets"
 # Longer tables are folded away.
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)
-_MIDDLE: Final = ("advice", "alignments", "holding", "starts", "checks", "metres", "measurements")
-_BELOW: Final = ("runs", "tags", "noise", "calibration", "choices")
+_MIDDLE: Final = ("advice", "alignments", "holding", "starts", "robots", "checks", "metres", "measurements")
+_BELOW: Final = ("runs", "tags", "noise")
 
 
 def page(
@@ -40,6 +40,7 @@ def page(
     _add_map(main, figures["components"])
     _add_before(main, figures["components"])
     _add_tables(main, by_key, _MIDDLE)
+    _add_searches(main, figures["searches"])
     _add_timelines(main, figures["timelines"], figures["n_timelines"])
     _add_tables(main, by_key, _BELOW)
     title_element = Element("title")
@@ -94,6 +95,20 @@ def _add_before(main: Element, components: Sequence[dict[str, Any]]) -> None:
     for index, component in enumerate(components):
         if component["is_merged"]:
             _figure(section, "before", index, f"Component {index + 1}" if len(components) > 1 else "")
+
+
+def _add_searches(main: Element, searches: Sequence[dict[str, Any]]) -> None:
+    if not searches:
+        return
+    section = _section(
+        main,
+        "searches",
+        "Search for time offsets",
+        "What it costs to take stamps of pictures for late by so much, beyond what robot.yaml says; half a unit is one "
+        "sigma. The line is where the search ended. One deep, narrow valley is a clock that is known.",
+    )
+    for index, each in enumerate(searches):
+        _figure(section, "search", index, each["robot"])
 
 
 def _add_timelines(main: Element, timelines: Sequence[dict[str, Any]], n_timelines: int) -> None:

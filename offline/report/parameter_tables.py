@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from groundsbot.offline.report.cells import UNKNOWN, Table, number, numbers, table_of
+from groundsbot.offline.report.cells import Table, number, numbers, table_of
 from groundsbot.offline.report.sentences import check_contradicts
 
 
@@ -100,41 +100,20 @@ def noise(document: dict[str, Any]) -> Table:
     )
 
 
-def calibration(document: dict[str, Any]) -> Table:
-    """Corrections of robot.yaml."""
+def robots(document: dict[str, Any]) -> Table:
+    """What the drives say of robots' files."""
     rows = [
         (
             each["owner"],
-            each["name"],
-            str(each["component"] + 1),
-            _correction(each["value"], signed=True),
-            _correction(each["sigma"]),
-            _correction(each["prior_sigma"]),
+            each["what"],
+            number(each["in_file"], 4),
+            number(each["found"], 4),
+            number(each["sigma"], 4),
+            each["verdict"],
+            each["to_do"],
         )
-        for each in document["calibration"]
+        for each in document["robot_numbers"]
     ]
-    columns = ("of", "correction", "component", "value", "sigma", "sigma before")
-    note = "What the map corrects of robot.yaml: scales as a share, the mount in metres and radians."
-    return table_of("calibration", "Calibration", note, columns, rows)
-
-
-def choices(document: dict[str, Any]) -> Table:
-    """What self-calibration looked at."""
-    rows = [
-        (
-            each["owner"],
-            each["name"],
-            _correction(each["value"], signed=True),
-            _correction(each["sigma"]),
-            _correction(each["prior_sigma"]),
-            "freed" if each["is_freed"] else each["reason"],
-        )
-        for each in document["choices"]
-    ]
-    columns = ("of", "correction", "by the drives", "sigma", "sigma in robot.yaml", "freed, or why not")
-    note = "What stretches of the drives, each on its own, tell of each number, and what self-calibration made of that."
-    return table_of("choices", "Self-calibration", note, columns, rows)
-
-
-def _correction(value: float | None, *, signed: bool = False) -> str:
-    return UNKNOWN if value is None else f"{value:{'+' if signed else ''}.5f}"
+    columns = ("of", "number", "robot.yaml", "found", "sigma", "verdict", "what to do")
+    note = "Each number of a robot's file, and as the map of these drives has it. Metres, seconds, radians."
+    return table_of("robots", "What these drives say of the robots", note, columns, rows)

@@ -5,7 +5,7 @@ from typing import Any
 
 from groundsbot.offline.report.cells import Table, number, table_of
 from groundsbot.offline.report.join_tables import alignments, holding, start_to_start
-from groundsbot.offline.report.parameter_tables import calibration, checks, choices, measurements, metres, noise
+from groundsbot.offline.report.parameter_tables import checks, measurements, metres, noise, robots
 from groundsbot.offline.report.sentences import advice_sentence, has_several_families, largest_sigma_m
 
 
@@ -17,14 +17,13 @@ def tables(document: dict[str, Any]) -> list[Table]:
         alignments(document),
         holding(document),
         start_to_start(document),
+        robots(document),
         checks(document),
         metres(document),
         measurements(document),
         _runs(document),
         _tags(document),
         noise(document),
-        calibration(document),
-        choices(document),
     ]
     return [table for table in made if table.rows]
 

@@ -30,6 +30,7 @@ from .parameters import (
     parameters_of_wheels,
 )
 from .solver import (
+    COST_TOLERANCE,
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
     MAX_RELATIVE_ERROR,
@@ -43,6 +44,7 @@ from .solver import (
 )
 
 __all__ = [
+    "COST_TOLERANCE",
     "DEFAULT_LOSSES",
     "HUBER_THRESHOLD",
     "LEVELS",

@@ -1,23 +1,27 @@
-from .left_open import with_start_values
-from .option import AUTO, OFF, Calibrate, parse_calibrate
+from .left_open import start_left_open
+from .option import AUTO, Calibrate, parse_calibrate
 from .robot import Learnt, Owned, corrected
+from .robot_table import verdict_lines, verdicts
 from .self_calibration import TIMES_MAPPED, about_the_files, free_what_is_told, refocused
-from .words import choice_words, freed_lines, learnt_lines
+from .time_offset_search import TimeOffsetSearch
+from .words import choice_words, learnt_lines, refused_lines
 
 __all__ = [
     "AUTO",
-    "OFF",
     "TIMES_MAPPED",
     "Calibrate",
     "Learnt",
     "Owned",
+    "TimeOffsetSearch",
     "about_the_files",
     "choice_words",
     "corrected",
     "free_what_is_told",
-    "freed_lines",
     "learnt_lines",
     "parse_calibrate",
     "refocused",
-    "with_start_values",
+    "refused_lines",
+    "start_left_open",
+    "verdict_lines",
+    "verdicts",
 ]

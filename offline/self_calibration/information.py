@@ -7,7 +7,7 @@ noise is the one that windows of the drive leave over (`local_map.goodness_of_fi
 told of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -20,7 +20,6 @@ from groundsbot.offline.local_map import WINDOW_M, LocalMap, fitted_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
 from groundsbot.offline.noise import in_cell, spread_of_corners
 from groundsbot.offline.sam import Effort, Parameter, Solution, build_graph, solve
-from groundsbot.offline.self_calibration.robot import all_open
 from groundsbot.offline.self_calibration.selection import Told
 
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
@@ -42,11 +41,19 @@ class _Stretch(NamedTuple):
     vector: FloatArray
 
 
-def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Sequence[Effort], *, corners: bool) -> Told:
+def told_by(
+    maps: Sequence[LocalMap],
+    robots: Mapping[str, Robot],
+    noise: NoiseParameters,
+    efforts: Sequence[Effort],
+    *,
+    corners: bool,
+) -> Told:
     """What all stretches of some runs tell.
 
     Args:
-        maps: of the runs, solved alone, with what robot.yaml says of the calibration.
+        maps: of the runs, solved alone, with all open that may ever be freed.
+        robots: by the runs' names, with the sigmas that robot.yaml gives.
         noise: under which.
         efforts: what is left of what each of them is worth.
         corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
@@ -54,15 +61,15 @@ def told_by(maps: Sequence[LocalMap], noise: NoiseParameters, efforts: Sequence[
     stretches: list[_Stretch] = []
     priors: dict[tuple[object, ...], Parameter] = {}
     for each, effort in zip(maps, efforts, strict=True):
-        priors |= {parameter[:3]: parameter for parameter in each.graph.parameters}
+        robot = robots[each.chain.run.name]
+        given = build_graph([replace(each.chain, run=replace(each.chain.run, robot=robot))])
+        priors |= {parameter[:3]: parameter for parameter in given.parameters}
         chain = _under_own_noise(each, noise, effort)
         for first, end in _cuts(chain):
             stretch = _told_by_stretch(chain, each, first, end, effort, corners=corners)
             if stretch is not None:
                 stretches.append(stretch)
-                priors = {
-                    parameter[:3]: _as_given(parameter, chain.run.robot) for parameter in stretch.parameters
-                } | priors
+                priors = {parameter[:3]: _as_given(parameter, robot) for parameter in stretch.parameters} | priors
     parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
     index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
     n = len(parameters)
@@ -110,7 +117,6 @@ def _told_by_stretch(
     part = chain.part(first, end)
     if not len(part.readings):
         return None
-    part = replace(part, run=replace(part.run, robot=all_open(part.run.robot)))
     graph = build_graph([part])
     calibration = {parameter[:3]: value for parameter, value in whole.calibration.items()}
     start = graph.start(

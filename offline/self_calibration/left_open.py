@@ -1,30 +1,22 @@
-"""Robots whose file leaves their numbers open, as those of imported recordings: estimated before anything else.
+"""Robots whose file leaves their clock or track open, as those of imported recordings: start values for both.
 
-A camera that is half a second late, or wheels that turn the robot by half as much again as they say, would lead every
-later stage astray. The time offset is searched for in passes of tags (`time_offset_search`); then each drive is solved
-alone at few keyframes, with all that its file leaves open, and what enters the motions to first order only, the track
-and the time offset, is put into the file, until it stays. Their wide sigmas stay as they are.
+Their wide sigmas stay as they are: the map estimates them with everything else.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
-from groundsbot.offline.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps import CalibrationChoice
-from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsened
+from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
-from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
-
-_MOST_ROUNDS: Final = 4
-# What is left to first order then errs by its square: a percent of the turn, a millimetre at a metre a second.
-_SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
+from groundsbot.offline.self_calibration.start_values import estimated_start_values, with_start_values
+from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 
-class StartValues(NamedTuple):
+class Started(NamedTuple):
     """Runs of robots with start values in their files, what was put in, and the searches for time offsets by robot."""
 
     runs: list[Run]
@@ -32,7 +24,15 @@ class StartValues(NamedTuple):
     searches: dict[str, TimeOffsetSearch]
 
 
-def with_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
+def by_robot(runs: Sequence[Run]) -> list[list[int]]:
+    """Indices of runs whose robots have one file."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, run in enumerate(runs):
+        groups.setdefault((run.robot_id, run.robot.model_dump_json()), []).append(i)
+    return list(groups.values())
+
+
+def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> Started:
     """Estimates what files leave open, robot by robot; robots whose files do not stay as they are.
 
     Args:
@@ -42,72 +42,17 @@ def with_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValue
     found = list(runs)
     choices: list[CalibrationChoice] = []
     searches: dict[str, TimeOffsetSearch] = {}
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i, run in enumerate(runs):
-        groups.setdefault((run.robot_id, run.robot.model_dump_json()), []).append(i)
-    for (robot_id, _), own in groups.items():
-        if not runs[own[0]].robot.is_left_open:
+    for own in by_robot(runs):
+        robot = runs[own[0]].robot
+        if not robot.is_left_open:
             continue
-        searched = search_time_offset([runs[i] for i in own])
-        total = dict.fromkeys(_SMALL, Learnt(0.0, 0.0))
-        if searched is not None:
-            searches[robot_id] = searched
-            total[TIME_OFFSET] = Learnt(searched.offset_s, searched.sigma_s)
-        given = [runs[i] for i in own]
-        for _ in range(_MOST_ROUNDS):
-            put_in = [_with(run, total) for run in given]
-            more = _estimated(put_in, noise)
-            if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
-                break
-            total = {name: _together(name, each, more.get(name)) for name, each in total.items()}
-        for i, run in zip(own, (_with(run, total) for run in given), strict=True):
-            found[i] = run
-        choices += [_choice(given[0].robot, name, each) for name, each in total.items() if each.value]
-    return StartValues(found, tuple(choices), searches)
-
-
-def _with(run: Run, total: dict[str, Learnt]) -> Run:
-    """The run with time offset and track put into its robot's file, whose sigmas stay."""
-    late_s, track = total[TIME_OFFSET].value, total[TRACK_SCALE].value
-    robot = run.robot
-    wheels = robot.wheels.model_copy(update={"track_m": robot.wheels.track_m * (1.0 + track)})
-    changed = robot.model_copy(update={"time_offset_s": robot.time_offset_s + late_s, "wheels": wheels})
-    return replace(run.retimed(late_s), robot=changed)
-
-
-def _estimated(runs: Sequence[Run], noise: NoiseParameters) -> dict[str, Learnt]:
-    """Time offset and track by each drive alone, the mean by their information."""
-    maps: list[LocalMap] = []
-    for run in runs:
-        for chain in chains_of(run, noise):
-            if chain.tags and len(chain.stamps_ns) > 1:
-                maps.append(solve_local_map(coarsened(chain, coarse_keyframes(chain)), other_starts=0))
-    found: dict[str, Learnt] = {}
-    for name in _SMALL:
-        values, informations = [], []
-        for each in maps:
-            for parameter, column, value in zip(
-                each.graph.parameters,
-                each.graph.problem.columns.calibration.tolist(),
-                each.solution.state.calibration.tolist(),
-                strict=True,
-            ):
-                if parameter.name == name and column >= 0:
-                    values.append(value)
-                    informations.append(1.0 / float(each.solution.covariance(np.array([column]))[0, 0]))
-        if values:
-            found[name] = Learnt(float(np.average(values, weights=informations)), float(np.sum(informations) ** -0.5))
-    return found
-
-
-def _together(name: str, before: Learnt, more: Learnt | None) -> Learnt:
-    """Two corrections, one after the other; a turn of c to first order is one of 1 / (1 - c) of the track."""
-    if more is None:
-        return before
-    if name == TRACK_SCALE:
-        turn = float(np.clip(1.0 - more.value, 0.3, 3.0))
-        return Learnt((1.0 + before.value) / turn - 1.0, more.sigma / turn**2)
-    return Learnt(before.value + more.value, more.sigma)
+        start = estimated_start_values([runs[i] for i in own], noise)
+        if start.searched is not None:
+            searches[robot.robot_id] = start.searched
+        for i in own:
+            found[i] = with_start_values(runs[i], start.learnt)
+        choices += [_choice(robot, name, each) for name, each in start.learnt.items() if each.value]
+    return Started(found, tuple(choices), searches)
 
 
 def _choice(robot: Robot, name: str, learnt: Learnt) -> CalibrationChoice:

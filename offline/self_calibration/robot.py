@@ -21,21 +21,26 @@ from groundsbot.calib.robot import (
 _WHEEL_SCALE, _WHEEL_RATIO, TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"
 
-# What may be freed, and how far off a robot can be at all: what lies beyond is no error of calibration but the file of
-# another robot, or a tag measured along another edge than its black border's. A freed number has this for its sigma,
-# beside which what drives tell is everything. Camera height is not among them: a floor shows only differences of it.
-LIMITS: Final[Mapping[str, float]] = MappingProxyType(
+# What may be freed, and the sigma that a freed number has: as robots are of which somebody believes to know it. Beside
+# it what drives tell is everything. Camera height is not among them: a floor shows only differences of it.
+OPEN_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     {
-        **dict.fromkeys(WHEEL_PARAMETERS, 0.1),
-        **dict.fromkeys((*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad"), 0.2),  # rad; 11 degrees
-        "mount_x_m": 0.2,
-        "mount_y_m": 0.2,
-        TIME_OFFSET: 0.2,
+        _WHEEL_SCALE: 0.05,
+        _WHEEL_RATIO: 0.05,
+        TRACK_SCALE: 0.25,  # tracked and skidding robots turn half as far again as wheels at their track would
+        **dict.fromkeys((*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad"), 0.15),  # rad; 9 degrees
+        "mount_x_m": 0.5,
+        "mount_y_m": 0.5,
+        TIME_OFFSET: 0.3,
         EDGE_SHIFT: 1.0,
-        TAG_SCALE: 0.3,
-        FOCAL_SCALE: 0.1,
+        TAG_SCALE: 0.15,  # measured over the white margin a tag of ten cells is 25 % too large
+        FOCAL_SCALE: 0.05,
     }
 )
+# Of these a robot may be off by so much that nothing can be said to first order about what its file says.
+OFF_BY_FAR: Final = (TIME_OFFSET, TRACK_SCALE, *MOUNT_PARAMETERS)
+# What is off by more is no error of calibration but the file of another robot.
+MOST_SIGMAS: Final = 3.0
 
 
 class Learnt(NamedTuple):
@@ -82,11 +87,11 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
     )
 
 
-def all_open(robot: Robot) -> Robot:
-    """The robot with everything open that may ever be freed, as far as it can be off."""
-    own = {Owned(robot.robot_id, name): limit for name, limit in LIMITS.items()}
+def as_if_unknown(robot: Robot) -> Robot:
+    """The robot as if nobody had measured what is off by far where it is off at all; the focal length is open too."""
+    own = {Owned(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, FOCAL_SCALE)}
     batches = [*(_of_batch(batch) for batch in robot.tags), Owned(IMPORTED_BATCH, TAG_SCALE)]
-    return opened(robot, own | dict.fromkeys(batches, LIMITS[TAG_SCALE]))
+    return opened(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
 
 
 def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
@@ -111,7 +116,7 @@ def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
 
 def _mount_fields() -> list[str]:
     """Those of a mount that can be freed, without their `mount_`."""
-    return [name.removeprefix(_MOUNT) for name in LIMITS if name.startswith(_MOUNT)]
+    return [name.removeprefix(_MOUNT) for name in OPEN_SIGMAS if name.startswith(_MOUNT)]
 
 
 def _of_batch(batch: TagBatch) -> Owned:

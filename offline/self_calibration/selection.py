@@ -5,21 +5,27 @@ and a vector h_k with log p(stretch | c) = h_k^T c - c^T L_k c / 2 + constant. S
 own, so they are independent given c, and all questions below are asked of sums of these forms.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.stats import norm
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
+from groundsbot.calib.robot import TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import LIMITS
+from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, Owned
 
 # Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.
 _FALSE_ALARM: Final = 0.01
-_NOTHING: Final = 1e-9  # information, as a share of what the limits hold: rounding
+_NOTHING: Final = 1e-9  # information, as a share of what the sigmas of open numbers hold: rounding
+_ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
+# What is off by so many of the sigmas that open ones have is off by far.
+_BY_FAR: Final = 0.5
+DOUBTED: Final = "robot.yaml has another number wrong by far, so this one is not believed either"
 TELLS_LESS: Final = "the drives tell less of it than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
 _NOT_ASKED: Final = "it was not asked for"
@@ -38,6 +44,11 @@ class Told:
     information: FloatArray
     vector: FloatArray
 
+    def about(self, values: Mapping[Owned, float]) -> "Told":
+        """The same of numbers that are so much larger, by owner and name: about the files before these were put in."""
+        shift = np.array([values.get(Owned(each.owner, each.name), 0.0) for each in self.parameters])
+        return replace(self, vector=self.vector + self.information @ shift)
+
 
 class _Estimate(NamedTuple):
     """Of one number by data alone; of a variance beyond all measure where they say nothing."""
@@ -46,65 +57,125 @@ class _Estimate(NamedTuple):
     variance: float
 
 
-def choose(told: Told, asked: Collection[str] = ()) -> list[CalibrationChoice]:
+def choose(
+    told: Told, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
+) -> list[CalibrationChoice]:
     """What becomes of each number that could be freed.
 
-    The one that contradicts robot.yaml most is freed first, and the others are judged with it free.
+    First what robot.yaml has wrong by far. With it what the files of these robots say else is not believed either:
+    nobody measured the one number and not the other, and one hand writes the files of a fleet. Then what contradicts
+    robot.yaml, the worst first; the others are judged with it free.
 
     Args:
         told: by all drives.
         asked: names of those to be freed whether robot.yaml is contradicted or not; where empty those where it is.
+        late_s: by robot, the time offset that passes of tags tell alone: a robot that drives at one speed all the time
+            sees no difference between a camera that is late and one that sits elsewhere.
     """
-    sigmas = np.array([each.sigma for each in told.parameters])
-    candidates = [i for i, each in enumerate(told.parameters) if each.name in LIMITS]
-    at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
-    chosen: dict[int, CalibrationChoice] = {}
+    candidates = [i for i, each in enumerate(told.parameters) if each.name in OPEN_SIGMAS]
+    judge = _Judge(told, candidates, asked, late_s)
+    by_far = [] if asked else judge.off_by_far()
     while True:
-        looked = {
-            i: _look(told, sigmas, i, is_asked=told.parameters[i].name in asked) for i in candidates if i not in chosen
-        }
-        able = {
-            i: each
-            for i, each in looked.items()
-            if not each.reason and (each.name in asked if asked else each.off_sigmas > at_least)
-        }
+        able = {i: each for i in candidates if i not in judge.open and not (each := judge.look(i)).reason}
         if not able:
             break
-        first = max(able, key=lambda i: able[i].off_sigmas)
-        chosen[first] = replace(able[first], is_freed=True)
-        sigmas[first] = LIMITS[told.parameters[first].name]
-    for i, each in looked.items():
-        chosen[i] = each if each.reason else replace(each, reason=_NOT_ASKED if asked else _AGREES)
-    return [chosen[i] for i in candidates]
+        judge.open.append(max(able, key=lambda i: _plausible(able[i])))
+    found = {i: judge.look(i) for i in candidates}
+    doubted = [i for i in judge.open if i in by_far and found[i].off_sigmas <= judge.at_least]
+    return [_freed(each, DOUBTED if i in doubted else "") if i in judge.open else each for i, each in found.items()]
 
 
-def _look(told: Told, sigmas: FloatArray, index: int, *, is_asked: bool) -> CalibrationChoice:
-    """One number, judged with the others at these sigmas; with the reason why it may not be freed, if there is one."""
-    parameter = told.parameters[index]
-    limit, prior = LIMITS[parameter.name], parameter.sigma
-    whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
-    gain = _held_out_gain(told, sigmas, index)
-    reason = ""
-    if whole.variance >= prior**2:
-        reason = TELLS_LESS
-    elif gain is None:
-        reason = "a single stretch tells of it, and nothing bears that out"
-    elif gain <= 0.0:
-        reason = "what some stretches tell of it does not foretell the others better than robot.yaml does"
-    elif abs(whole.value) > limit:
-        reason = f"it would be off by more than {limit:g}, which is no error of calibration; is the file this robot's?"
-    return CalibrationChoice(
-        owner=parameter.owner,
-        name=parameter.name,
-        is_freed=False,
-        value=whole.value,
-        sigma=whole.variance**0.5,
-        prior_sigma=prior,
-        off_sigmas=abs(whole.value) / (prior**2 + whole.variance) ** 0.5,
-        held_out_gain=gain,
-        reason=reason,
-        is_asked=is_asked,
-    )
+class _Judge:
+    """Which numbers are open, and what is to be said of each as that is.
+
+    Attributes:
+        open: indices.
+        at_least: by so many sigmas a number contradicts robot.yaml.
+    """
+
+    def __init__(
+        self, told: Told, candidates: Sequence[int], asked: Collection[str], late_s: Mapping[str, float]
+    ) -> None:
+        self._told, self._candidates, self._asked, self._late_s = told, candidates, asked, late_s
+        self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
+        self.open: list[int] = []
+
+    def off_by_far(self) -> list[int]:
+        """Opens what is off by so much that robot.yaml cannot be meant, and what then is not believed either.
+
+        All that may be is open at first. What is off least is held by robot.yaml, and the others are judged anew, until
+        all that are left are off by far. So where several explain the same, one is left.
+        """
+        names, parameters = {*OFF_BY_FAR, TAG_SCALE}, self._told.parameters
+        self.open = [i for i in self._candidates if parameters[i].name in names]
+        while self.open:
+            looked = {i: self.look(i) for i in self.open}
+            held = {i: each for i, each in looked.items() if not self._is_by_far(each)}
+            if not held:
+                break
+            self.open.remove(min(held, key=lambda i: held[i].off_sigmas))
+        if any(parameters[i].name in OFF_BY_FAR for i in self.open):
+            self.open = [i for i in self._candidates if parameters[i].name in names]
+        return self.open.copy()
+
+    def _is_by_far(self, choice: CalibrationChoice) -> bool:
+        values = [choice.value]
+        if choice.name == TIME_OFFSET:
+            values.append(self._late_s.get(choice.owner, 0.0))
+        is_far = all(_BY_FAR < abs(value) / OPEN_SIGMAS[choice.name] < MOST_SIGMAS for value in values)
+        return is_far and choice.off_sigmas > self.at_least and (choice.held_out_gain or 0.0) > 0.0
+
+    def look(self, index: int) -> CalibrationChoice:
+        """One number, judged with the others open or not; with the reason why it may not be freed, if there is one."""
+        told, parameter = self._told, self._told.parameters[index]
+        sigmas = np.array([each.sigma for each in told.parameters])
+        sigmas[self.open] = [OPEN_SIGMAS[told.parameters[i].name] for i in self.open]
+        prior, is_asked = parameter.sigma, parameter.name in self._asked
+        whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
+        gain = _held_out_gain(told, sigmas, index)
+        off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
+        most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
+        reason = ""
+        if whole.variance >= prior**2:
+            reason = TELLS_LESS
+        elif gain is None:
+            reason = "a single stretch tells of it, and nothing bears that out"
+        elif gain <= 0.0:
+            reason = "what some stretches tell of it does not foretell the others better than robot.yaml does"
+        elif abs(whole.value) > most:
+            reason = f"it would be off by more than {most:g}, no error of calibration; is the file this robot's?"
+        elif self._asked and not is_asked:
+            reason = _NOT_ASKED
+        elif not is_asked and off_sigmas <= self.at_least:
+            reason = _AGREES
+        return CalibrationChoice(
+            owner=parameter.owner,
+            name=parameter.name,
+            is_freed=False,
+            value=whole.value,
+            sigma=whole.variance**0.5,
+            prior_sigma=prior,
+            off_sigmas=off_sigmas,
+            held_out_gain=gain,
+            reason=reason,
+            is_asked=is_asked,
+        )
+
+
+def _freed(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
+    """The choice to free a number; with what it is under the sigma that it has from then on."""
+    limit = OPEN_SIGMAS[choice.name]
+    share = limit**2 / (limit**2 + choice.sigma**2)
+    return replace(choice, is_freed=True, value=share * choice.value, sigma=share**0.5 * choice.sigma, reason=reason)
+
+
+def _plausible(choice: CalibrationChoice) -> float:
+    """By how much a number contradicts robot.yaml, in squared sigmas, less what speaks against its being wrong.
+
+    Wheels and tags that contradict each other about the metre contradict robot.yaml by the same sigmas. A radius is
+    measured over many turns; tags are printed at another scale, or measured along another edge, ten times as often.
+    """
+    return choice.off_sigmas**2 - (_ODDS_OF_WHEELS if choice.name == WHEEL_PARAMETERS[0] else 0.0)
 
 
 def _held_out_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
@@ -112,7 +183,7 @@ def _held_out_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
 
     None where no two stretches tell anything of it.
     """
-    prior, limit, gains = told.parameters[index].sigma, LIMITS[told.parameters[index].name], []
+    prior, limit, gains = told.parameters[index].sigma, OPEN_SIGMAS[told.parameters[index].name], []
     for k in range(len(told.vector)):
         own = np.arange(len(told.vector)) == k
         out, others = (_estimate(told, which, sigmas, index) for which in (own, ~own))
@@ -126,7 +197,7 @@ def _held_out_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
 
 def _estimate(told: Told, which: BoolArray, sigmas: FloatArray, index: int) -> _Estimate:
     """By some stretches (S,), the others at their sigmas about zero and this one without what holds it."""
-    limit = LIMITS[told.parameters[index].name]
+    limit = OPEN_SIGMAS[told.parameters[index].name]
     unit = sigmas.copy()
     unit[index] = limit
     information = unit[:, None] * told.information[which].sum(axis=0) * unit

@@ -8,11 +8,14 @@ from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.robot import FOCAL_SCALE, IMPORTED_BATCH, TAG_SCALE, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
-from groundsbot.offline.measurements import Chain, Run
+from groundsbot.offline.measurements import Run, chains_of
 from groundsbot.offline.sam import efforts_of
 from groundsbot.offline.self_calibration.information import told_by
-from groundsbot.offline.self_calibration.robot import LIMITS, Learnt, Owned, corrected, opened
+from groundsbot.offline.self_calibration.left_open import by_robot
+from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, as_if_unknown, corrected, opened
 from groundsbot.offline.self_calibration.selection import choose
+from groundsbot.offline.self_calibration.start_values import estimated_start_values, with_start_values
+from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 # Put right before the map is made, which takes them to first order, or on the floor not at all. Wheel readings are in
 # metres by then, and stamps on one clock; both are as good to first order.
@@ -25,32 +28,47 @@ _NOTHING: Final = Learnt(0.0, 0.0)
 
 
 class Freed(NamedTuple):
-    """Runs with what was freed left open in their robots' files, and why the rest was not."""
+    """Runs with what was freed left open in their robots' files, why the rest was not, and searches by robot."""
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
+    searches: dict[str, TimeOffsetSearch]
 
 
-def free_what_is_told(
-    runs: Sequence[Run], chains: Sequence[Chain], noise: NoiseParameters, names: Collection[str], *, corners: bool
-) -> Freed:
+def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool) -> Freed:
     """Frees what the drives can tell and robot.yaml has wrong.
+
+    Each robot is first estimated as if nobody had measured it; what stretches of its drives tell is then a quadratic
+    form about these values, and of that the numbers of robot.yaml are asked one by one (`selection`). Robots whose file
+    leaves them open have their say in the map as they are.
 
     Args:
         runs: with what robot.yaml says.
-        chains: of the runs.
-        noise: that the chains are under.
+        noise: of wheels and readings, or where it begins.
         names: what to free whether robot.yaml is contradicted or not; where empty what drives contradict.
         corners: the map will be refined on corners, which tell of the focal length too.
     """
+    started, searches = _as_if_unknown(runs, noise)
+    if not started:
+        return Freed(list(runs), (), {})
+    opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
+    chains = [chain for run in opened_runs for chain in chains_of(run, noise)]
     efforts = efforts_of(chains, TIMES_MAPPED)
-    maps = [solve_local_map(chain, effort).without_factors() for chain, effort in zip(chains, efforts, strict=True)]
-    choices = choose(told_by(maps, noise, efforts, corners=corners), names)
-    freed = {Owned(each.owner, each.name): LIMITS[each.name] for each in choices if each.is_freed}
+    maps = [
+        solve_local_map(chain, effort, noise_is_open=True).without_factors()
+        for chain, effort in zip(chains, efforts, strict=True)
+    ]
+    told = told_by(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
+    put_in = {owned: each.value for _, learnt in started for owned, each in learnt.items()}
+    late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
+    choices = choose(told.about(put_in), names, late_s)
+    freed = {Owned(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
     right = _put_right(choices)
     return Freed(
         [
-            replace(
+            run
+            if run.robot.is_left_open
+            else replace(
                 run.retimed(right.get(Owned(run.robot_id, TIME_OFFSET), _NOTHING).value),
                 robot=opened(corrected(run.robot, right), freed),
                 camera=refocused(run.camera, right.get(Owned(run.robot_id, FOCAL_SCALE))),
@@ -58,7 +76,29 @@ def free_what_is_told(
             for run in runs
         ],
         tuple(choices),
+        searches,
     )
+
+
+def _as_if_unknown(
+    runs: Sequence[Run], noise: NoiseParameters
+) -> tuple[list[tuple[Run, dict[Owned, Learnt]]], dict[str, TimeOffsetSearch]]:
+    """Runs of robots that somebody measured, with time offset and track put in as their drives have them.
+
+    With each run what was put in, and besides the searches for time offsets by robot. The sigmas are robot.yaml's.
+    """
+    found: list[tuple[Run, dict[Owned, Learnt]]] = []
+    searches: dict[str, TimeOffsetSearch] = {}
+    for own in by_robot(runs):
+        robot = runs[own[0]].robot
+        if robot.is_left_open:
+            continue
+        start = estimated_start_values([replace(runs[i], robot=as_if_unknown(robot)) for i in own], noise)
+        if start.searched is not None:
+            searches[robot.robot_id] = start.searched
+        learnt = {Owned(robot.robot_id, name): each for name, each in start.learnt.items()}
+        found += [(with_start_values(runs[i], start.learnt), learnt) for i in own]
+    return found, searches
 
 
 def refocused(camera: CameraModel | None, focal: Learnt | None) -> CameraModel | None:

@@ -26,22 +26,13 @@ DRIVES: Final[Mapping[str, str]] = MappingProxyType(
 )
 
 
-def freed_lines(result: MapResult) -> list[str]:
-    """What was freed, for a terminal, or that nothing was; and why not what was asked for by name."""
-    if not result.choices:
-        return []
-    refused = [
+def refused_lines(result: MapResult) -> list[str]:
+    """Why what was asked for by name was not freed, for a terminal."""
+    return [
         f"not freed: {each.name} of {each.owner}: {choice_words(each)}"
         for each in result.choices
         if each.is_asked and not each.is_freed
     ]
-    freed = [
-        f"freed: {correction_words(entry)}"
-        for entry in result.calibration
-        if any(each.is_freed and (each.owner, each.name) == (entry.owner, entry.name) for each in result.choices)
-    ]
-    nothing = "self-calibration: nothing was freed; robot.yaml's sigmas hold all numbers (map.json says why)"
-    return [*(freed or ([] if refused else [nothing])), *refused]
 
 
 def correction_words(entry: CalibrationResult) -> str:

@@ -52,6 +52,16 @@ class Readings:
         """(M,) which of them came from corners that the log still has."""
         return np.asarray(np.isfinite(self.corners_px).all((-1, -2)))
 
+    @property
+    def corner_sigma_px(self) -> float:
+        """The sigma of corners that the covariances of readings by corners alone were made with; 0 for none."""
+        of_corners = self.from_corners
+        if not of_corners.any():
+            return 0.0
+        made = np.trace(self.covariance - self.parts.rest, axis1=-2, axis2=-1)[of_corners].sum()
+        unit = np.trace(self.parts.of(("sigma_corner_px",))[0], axis1=-2, axis2=-1)[of_corners].sum()
+        return float(np.sqrt(max(made / unit, 0.0))) if unit > 0.0 else 0.0
+
     def where(self, mask: BoolArray | IntArray) -> "Readings":
         """Those of a mask, or of indices."""
         return Readings(

@@ -30,6 +30,7 @@ from groundsbot.offline.measurements.tags import Detections, Positions
 # What the covariance of an imported position without one is made of.
 STAMP_NOISE: Final = "sigma_stamp_s"  # an error of it is common to all that a picture shows
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad", STAMP_NOISE)
+_BY_TIME: Final = CAMERA_PARAMETERS.index(TIME_OFFSET)
 
 # A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
@@ -192,8 +193,7 @@ def read_positions(
     polar = positions.polar | unknown
     usable = np.where(good[:, None], value, 1.0)  # others may be no numbers, and are left out below
     by_camera = _by_sensor(robot, usable, polar, positions.in_camera, twist[keyframe])
-    by_stamp = by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
-    parts = _position_parts(range_m, modelled, covariance, by_stamp)
+    parts = _position_parts(range_m, modelled, covariance, by_camera[..., _BY_TIME])
     covariance[modelled] = parts.under(noise)[modelled]
     good &= _are_covariances(covariance)
     readings = Readings(
@@ -216,6 +216,22 @@ def read_positions(
         f"{MAX_RANGE_M:.0f} m, or with a covariance that is none"
     )
     return readings.where(good), [left_out]
+
+
+def with_position_noise(readings: Readings) -> Readings:
+    """Readings of corners that besides err as positions do of which no covariance is given, by the default noise.
+
+    Where a drive shows that corners err by far more than pixels explain, as when stamps jitter or a tag's range is read
+    wrong by a share of it, nothing is known of how they err but what is known of any sensor.
+    """
+    which = readings.from_corners & readings.polar
+    if not which.any():
+        return readings
+    unknown = np.full_like(readings.covariance, 0.0)
+    more = _position_parts(readings.value[:, 0], which, unknown, readings.by_camera[..., _BY_TIME])
+    names = tuple(dict.fromkeys(readings.parts.names + more.names))
+    parts = CovarianceParts(names, readings.parts.of(names) + more.of(names), readings.parts.rest)
+    return replace(readings, covariance=readings.covariance + more.under(NoiseParameters()), parts=parts)
 
 
 def _are_covariances(matrices: FloatArray) -> BoolArray:
@@ -260,7 +276,7 @@ def _by_sensor(
     to_sensor = np.column_stack([np.zeros((len(value), 2)), -mount[:, 2]])
     rates = se2.apply(to_sensor, _rates(se2.apply(mount, in_sensor), twist))
     found = np.zeros((len(value), 2, len(CAMERA_PARAMETERS)))
-    found[..., CAMERA_PARAMETERS.index(TIME_OFFSET)] = _by_place(in_sensor, polar, rates)
+    found[..., _BY_TIME] = _by_place(in_sensor, polar, rates)
     range_m = np.maximum(np.hypot(in_sensor[:, 0], in_sensor[:, 1]), 1e-6)
     outwards = np.where(polar[:, None], [1.0, 0.0], in_sensor / range_m[:, None])
     found[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)] = -outwards

@@ -211,8 +211,22 @@
       yaxis3: axis({ title: { text: "m/s" }, domain: [0.7, 1] }) }), STILL);
   }
 
+  function drawSearch(element) {
+    const search = data.searches[element.dataset.index];
+    const trace = { type: "scatter", mode: "lines+markers", x: search.grid_s, y: search.cost,
+      line: { color: colour("--front"), width: 1.4 }, marker: { size: 4 },
+      hovertemplate: "%{y} at %{x} s<extra></extra>" };
+    const found = { type: "line", xref: "x", yref: "paper", x0: search.offset_s, x1: search.offset_s, y0: 0, y1: 1,
+      line: { color: colour("--alarm"), width: 1.4, dash: "dot" } };
+    return Plotly.react(element, [trace], layout(element, { height: 260, showlegend: false, shapes: [found],
+      hovermode: "closest", dragmode: "zoom",
+      xaxis: axis({ title: { text: "time offset (s), beyond robot.yaml's", standoff: 4 } }),
+      yaxis: axis({ title: { text: "cost" }, rangemode: "tozero" }) }), STILL);
+  }
+
   function draw(element) {
     if (element.classList.contains("map")) return drawMap(element);
+    if (element.classList.contains("search")) return drawSearch(element);
     return element.classList.contains("before") ? drawBefore(element) : drawTimeline(element);
   }
 

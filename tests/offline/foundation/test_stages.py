@@ -14,6 +14,7 @@ from tests.support.programs import Run, on_terminal
 ALL = [
     "reading logs",
     "start values of robots",
+    "self-calibration",
     "keyframes and readings",
     "local maps",
     "tags that do not belong",

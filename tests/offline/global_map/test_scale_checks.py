@@ -15,6 +15,7 @@ from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckRe
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
+from groundsbot.offline.self_calibration.option import Calibrate
 from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
 
 ROUND = [(0.5, 0.5, 4.0), (0.3, 0.5, 7.85), (0.5, 0.5, 4.0), (0.5, 0.3, 7.85), (0.2, -0.2, 7.85)]
@@ -42,7 +43,8 @@ def mapped(size: float = 1.0, track: float = 1.0, seed: int | None = None, dista
         tags=[TagKey(FAMILY, i) for i in range(len(PLACES))],
         positions=made_positions(drive.stamps_ns[at], tag, seen, SIGMA_M),
     )
-    return build_map([run], NoiseParameters(), Stages(), TapeOptions(distances=[distance] if distance else []))
+    tape = TapeOptions(distances=[distance] if distance else [])
+    return build_map([run], NoiseParameters(), Stages(), tape, calibrate=Calibrate())
 
 
 def check(result: MapResult, name: str) -> CheckResult:

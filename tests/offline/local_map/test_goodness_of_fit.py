@@ -139,7 +139,8 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     log = write_drive(tmp_path, made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
-    def contradictory(chain: Chain, _: Effort) -> LocalMap:
+    def contradictory(chain: Chain, _: Effort, *, noise_is_open: bool) -> LocalMap:
+        assert noise_is_open
         return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
 
     monkeypatch.setattr(local_maps_without_outliers, "solve_local_map", contradictory)

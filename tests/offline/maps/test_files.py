@@ -63,7 +63,7 @@ def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
     data = written(made_map(), tmp_path)
     assert list(data) == [
         *("format_version", "frame", "components", "runs", "tags", "alignments", "start_to_start"),
-        *("noise", "noise_fit", "calibration", "choices", "measurements", "checks", "metres"),
+        *("noise", "noise_fit", "calibration", "choices", "robot_numbers", "measurements", "checks", "metres"),
         *("suspect_tags", "advice", "warnings", "losses"),
     ]
     assert data["components"][0]["runs"] == ["red_one", "blue_two"]

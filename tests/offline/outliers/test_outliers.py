@@ -132,7 +132,9 @@ def local_maps() -> tuple[LocalMap, ...]:
 def searched() -> Searched:
     maps = local_maps()
     graph, solution = solve_global_map(maps, merge(maps).groups[0], Stages())
-    return split_together(graph, solution, maps)
+    found = split_together(graph, solution, maps)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("which", [0, 7, 30])

@@ -95,9 +95,9 @@ def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
         facts += [(row["differ by (%)"], 100.0 * each["value"]), (row["sigmas"], each["sigmas"])]
     for row, each in zip(read.rows("metres"), document["metres"], strict=True):
         facts += [(row["sigma (%)"], 100.0 * each["sigma"]), (row["wheels (%)"], 100.0 * each["shares"]["wheels"])]
-    for row, each in zip(read.rows("calibration"), document["calibration"], strict=True):
-        assert (row["of"], row["correction"]) == (each["owner"], each["name"])
-        facts += [(row["value"], each["value"]), (row["sigma"], each["sigma"])]
+    for row, each in zip(read.rows("robots"), document["robot_numbers"], strict=True):
+        assert (row["of"], row["number"], row["verdict"]) == (each["owner"], each["what"], each["verdict"])
+        facts += [(row["found"], each["found"]), (row["sigma"], each["sigma"])]
     assert [row["sigma"] for row in read.rows("noise")] == list(document["noise"])
     assert len(facts) >= 30
     assert [fact for fact in facts if not close(*fact)] == []
@@ -335,7 +335,7 @@ def test_it_prints(window: Page, made: Path) -> None:
     printed = pypdfium2.PdfDocument(window.pdf())
     text = "".join(printed[i].get_textpage().get_text_range() for i in range(len(printed)))
     assert 2 <= len(printed) <= 8
-    for part in ("became one map of 4 tags", "Before merging", "Calibration"):
+    for part in ("became one map of 4 tags", "Before merging", "What these drives say of the robots"):
         assert part in " ".join(text.split())
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import load_run
@@ -15,6 +17,7 @@ from groundsbot.offline.sam.budget import Effort, efforts_of, size_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
 from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
 from tests.support.data.long_drives import made_long_drive, made_town
@@ -68,10 +71,33 @@ def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
     assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
 
 
+def test_a_dense_import_is_used_whole(tmp_path: Path) -> None:
+    """Ten tags a look at fifty looks a second, to the millimetre: as much as a robot records, in as few bytes."""
+    rng = np.random.default_rng(3)
+    folder = tmp_path / "dense"
+    folder.mkdir()
+    times = np.arange(2000) / 50.0
+    rows = [
+        f"{t:.3f},{tag},{3.0 + 0.1 * tag + 0.01 * noise[0]:.3f},{0.1 * tag - 0.5 + 0.005 * noise[1]:.4f}"
+        for t in times
+        for tag, noise in enumerate(rng.standard_normal((10, 2)))
+    ]
+    speeds = [f"{t:.3f},0.500,{0.01 * each:.4f}" for t, each in zip(times, rng.standard_normal(2000), strict=True)]
+    (folder / "odometry.csv").write_text("\n".join(["t_s,v_m_s,omega_rad_s", *speeds]))
+    (folder / "observations.csv").write_text("\n".join(["t_s,tag_id,range_m,bearing_rad", *rows]))
+    import_folder(folder, tmp_path / "logs", ImportOptions())
+    (log,) = find_logs([tmp_path / "logs"])
+    assert sum(each.stat().st_size for each in log.rglob("*.mcap")) < 24 * len(rows)
+    run = load_run(log)
+    assert len(run.positions.tag) == len(rows)
+    assert not [each for each in run.warnings if "look" in each]
+
+
 def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._BYTES_TO_USE", 64)
     log = written(observed(2000, 10), tmp_path)
     size = log.stat().st_size
     every = -(-4000 // (size // 64))
@@ -90,6 +116,7 @@ def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._BYTES_TO_USE", 64)
     run = load_run(written(resets(1, 3, 500), tmp_path))
     assert 0 < len(run.picture_stamps_ns) < 500
     assert len(run.detections.tag) == 3 * len(run.picture_stamps_ns)
@@ -158,7 +185,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         return solution
 
     monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
-    told_by([found], NoiseParameters(), [effort], corners=False)
+    told_by([found], {chain.run.name: chain.run.robot}, NoiseParameters(), [effort], corners=False)
     assert 0.0 < sum(taken) < 0.5 * effort.allowed
 
 

@@ -1,6 +1,7 @@
 """Self-calibration frees what drives tell and robot.yaml has wrong, and nothing else; `calibrate` writes it down."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +28,10 @@ from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
 from groundsbot.offline.self_calibration.information import told_by
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
-from groundsbot.offline.self_calibration.robot import LIMITS, Learnt, Owned, all_open, corrected, opened
+from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, corrected, opened
+from groundsbot.offline.self_calibration.robot_table import AGREES, ASKED, WRONG, verdict_lines
 from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose
-from groundsbot.offline.self_calibration.words import DRIVES, freed_lines
+from groundsbot.offline.self_calibration.words import DRIVES, refused_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
 from tests.support.data.drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
@@ -74,7 +76,8 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
     readings = replace(chain.readings, corner_bias_px=np.tile(bias_px, (len(chain.readings), 1)))
     biased = replace(found, chain=replace(chain, readings=readings))
-    plain, less = (told_by([each], NOISE, [Effort(1e11, 1e11, 1e9)], corners=corners) for each in (found, biased))
+    robots, efforts = {chain.run.name: chain.run.robot}, [Effort(1e11, 1e11, 1e9)]
+    plain, less = (told_by([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
 
@@ -109,6 +112,8 @@ def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
     assert {each.name for each in result.choices} == set(NAMES) - {FOCAL_SCALE}
     assert freed(result) == set()
     assert all(each.reason for each in result.choices)
+    assert AGREES in {each.verdict for each in result.robot_numbers}
+    assert verdict_lines(result.robot_numbers) == ["what these drives say of the robots: all as robot.yaml has it"]
     off = mapped(log, made_robot("a"), Calibrate())
     assert off.choices == ()
     for a, b in zip(off.components[0].tags, result.components[0].tags, strict=True):
@@ -122,7 +127,7 @@ def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
     assert value_of(result, "track_scale") == pytest.approx(1.0 / 1.08 - 1.0, abs=2e-3)
     assert value_of(result, "mount_yaw_rad") == pytest.approx(-0.06, abs=3e-3)
     prior = {each.name: each.prior_sigma for each in result.calibration}
-    assert prior["track_scale"] == LIMITS["track_scale"]
+    assert prior["track_scale"] == OPEN_SIGMAS["track_scale"]
     assert prior["mount_x_m"] == wrong.mount.x_m_sigma
 
 
@@ -161,8 +166,8 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     assert freed(result) == {"wheel_ratio"}
     reasons = {each.name: each.reason for each in result.choices}
     assert reasons["wheel_scale"] == TELLS_LESS
-    freed_line, refused_line = freed_lines(result)
-    assert freed_line.startswith("freed: wheel_ratio of a")
+    assert {each.name for each in result.robot_numbers if each.verdict == ASKED} == {"wheel_ratio"}
+    (refused_line,) = refused_lines(result)
     assert refused_line.startswith("not freed: wheel_scale of a: held by robot.yaml's sigma")
     assert "--distance" in refused_line
     assert reasons["track_scale"] == "it was not asked for"
@@ -201,7 +206,7 @@ def choice(
         ([0.02, 0.021, 0.019], [0.001] * 3, "track_scale", "agrees"),
         ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "tell less"),
         ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "foretell the others"),
-        ([0.25, 0.251, 0.249], [0.001] * 3, "track_scale", "no error of calibration"),
+        ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "no error of calibration"),
         ([0.05, 0.0], [0.001, 9.0], "track_scale", "single stretch"),
         ([0.05, 0.051, 0.049], [0.001] * 3, "time_offset_s", ""),
     ],
@@ -214,9 +219,10 @@ def test_each_condition_holds_a_number_back(values: list[float], sigmas: list[fl
 
 def test_what_is_told_is_the_weighed_mean_and_how_far_it_is_from_the_file() -> None:
     found = choice([0.05, 0.06], [0.001, 0.002])
-    assert found.value == pytest.approx((0.05 + 0.06 / 4) / 1.25)
-    assert found.sigma == pytest.approx(0.001 / np.sqrt(1.25))
-    assert found.off_sigmas == pytest.approx(found.value / np.hypot(0.01, found.sigma))
+    # A number that is freed has a wide sigma of its own.
+    assert found.value == pytest.approx((0.05 + 0.06 / 4) / 1.25, rel=1e-4)
+    assert found.sigma == pytest.approx(0.001 / np.sqrt(1.25), rel=1e-4)
+    assert found.off_sigmas == pytest.approx(found.value / np.hypot(0.01, found.sigma), rel=1e-4)
     # By hand: each from N(the other; both variances), against N(0; its own and the prior's).
     apart, both = 0.01**2, 0.001**2 + 0.002**2
     gain = -(apart / both + np.log(both))
@@ -254,17 +260,18 @@ def test_what_was_learnt_of_edges_is_written() -> None:
     robot = made_robot("a", edge_shift_px=0.02)
     better = corrected(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
     assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
-    assert all_open(robot).edge_shift_px_sigma == LIMITS["edge_shift_px"]
+    assert opened(robot, {Owned("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
 
 
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
-    assert set(NAMES) == set(LIMITS) == set(DRIVES)
+    assert set(NAMES) == set(OPEN_SIGMAS) == set(DRIVES)
     robot = made_robot("a")
-    everything = all_open(robot)
+    batch = Owned(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
+    everything = opened(robot, {Owned("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15})
     sigmas = dict(zip(WHEEL_PARAMETERS, [each.sigma for each in parameters_of_wheels(everything)], strict=True))
-    assert sigmas == pytest.approx({name: LIMITS[name] for name in WHEEL_PARAMETERS})
-    assert everything.tags[0].relative_sigma == pytest.approx(LIMITS[TAG_SCALE])
-    assert everything.mount.roll_rad_sigma == LIMITS["mount_roll_rad"]
+    assert sigmas == pytest.approx({name: OPEN_SIGMAS[name] for name in WHEEL_PARAMETERS})
+    assert everything.tags[0].relative_sigma == pytest.approx(OPEN_SIGMAS[TAG_SCALE])
+    assert everything.mount.roll_rad_sigma == OPEN_SIGMAS["mount_roll_rad"]
     assert everything.mount.z_m_sigma == robot.mount.z_m_sigma
     assert opened(robot, {}) == robot
     assert opened(robot, {Owned("another", "track_scale"): 0.1}) == robot
@@ -284,7 +291,7 @@ def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(log: Pat
     again = read_map(tmp_path)
     assert again.choices == result.choices
     with pytest.raises(OfflineError, match="--calibrate: a kept map has its calibration"):
-        build_map(read_runs([other]), extending=again, calibrate=AUTO)
+        build_map(read_runs([other]), extending=again, calibrate=Calibrate(is_on=True, names=("track_scale",)))
 
 
 def test_the_command_writes_files_that_the_next_drive_is_mapped_with(log: Path, tmp_path: Path, run: Program) -> None:
@@ -330,9 +337,15 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
     wrong = tmp_path / "wrong.yaml"
     write_robot_yaml(mistaken(track_m=0.08).model_copy(update={"camera": None}), wrong)
     found = run("map", log, "--robot", wrong, "--calibrate", "auto", "-o", tmp_path / "map")
-    assert "freed: track_scale of a: -0.07" in found.out
+    assert re.search(r"a  track_m +0\.5400 ->   0\.(49|50)\d\d  0\.00\d\d  robot\.yaml is wrong", found.out)
     document = json.loads((tmp_path / "map" / "map.json").read_text())
     assert [each["name"] for each in document["choices"] if each["is_freed"]] == ["track_scale"]
-    assert "Self-calibration" in (tmp_path / "map" / "report.html").read_text()
+    (row,) = [each for each in document["robot_numbers"] if each["name"] == "track_scale"]
+    assert (row["verdict"], row["in_file"]) == (WRONG, pytest.approx(0.54))
+    assert row["found"] == pytest.approx(0.5, abs=0.002)
+    assert "groundsbot-offline calibrate" in row["to_do"]
+    report = (tmp_path / "map" / "report.html").read_text()
+    assert "What these drives say of the robots" in report
+    assert "Search for time offsets" in report
     off = run("map", log, "--calibrate", "none", "-o", tmp_path / "off")
     assert (off.code, off.err.startswith("error: --calibrate: 'none'")) == (1, True)

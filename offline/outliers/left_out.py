@@ -1,0 +1,83 @@
+"""Readings that no tag explains, left out of a component: false detections, and single passes that went astray.
+
+A tag that was moved stays where it was moved to. A place that one pass in fifty, or one alone, gives a tag, whose other
+passes all have it elsewhere, is that pass's error: somebody stood before the tag, a wheel slipped, a reflection was
+read. And one or two readings are a misread code.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from groundsbot.offline.maps import SuspectTag
+from groundsbot.offline.measurements import FEW_READINGS, TagKey
+from groundsbot.offline.outliers.evidence import to_other_tags
+from groundsbot.offline.outliers.false_detections import MOST_READINGS
+from groundsbot.offline.outliers.kinds import DUPLICATED, PHANTOM, Case, Stand, cases, shift
+from groundsbot.offline.outliers.outliers import Searched
+from groundsbot.offline.sam import Graph, Solution, build_graph, solve
+
+# The other place must have so many passes; of hundreds a few more go astray.
+_MANY: Final = 3
+_SHARE_ASTRAY: Final = 0.02
+# Two tags with one id that hang nearer to each other than this would be seen together, and by all who pass.
+_WITHIN_SIGHT_M: Final = 2.0
+_FEW: Final = 0.25
+
+
+def phantoms(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
+    """Tags of the graph that are false detections and nothing else."""
+    named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
+    few = graph.n_readings() <= MOST_READINGS
+    return {tag for tag, is_few in zip(graph.tags, few, strict=True) if is_few and (tag.family, tag.tag_id) in named}
+
+
+def stray_passes(searched: Searched) -> set[TagKey]:
+    """Places of ids that next to nothing speaks for, beside one that more does."""
+    found: set[TagKey] = set()
+    which, tags = searched.evidence.which, searched.tags
+    for case in cases(searched.sightings, searched.evidence, searched.places):
+        others = _astray(searched, case)
+        labels = [each.label for each in others]
+        found |= {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
+    return found
+
+
+def _astray(searched: Searched, case: Case) -> list[Stand]:
+    """The places of a tag that are no places; all of them but one, or none."""
+    most = max(case.stands, key=lambda each: (each.n_sightings, each.n_readings))
+    others = [each for each in case.stands if each is not most]
+    if all(each.n_readings <= FEW_READINGS < most.n_readings for each in others):
+        return others
+    k = case.stands.index(most)
+    is_near = case.kind() == DUPLICATED and all(
+        shift(case, searched.evidence, searched.places, k, case.stands.index(each))[0] < _WITHIN_SIGHT_M
+        for each in others
+    )
+    share = _FEW if is_near else _SHARE_ASTRAY
+    n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
+    few = most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in others)
+    return others if few else []
+
+
+def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> tuple[Graph, Solution]:
+    """The same solved without some tags and their readings; an id that has one place left goes by its own name."""
+    if not gone:
+        return graph, solution
+    left = Counter(tag.whole for tag in graph.tags if tag not in gone)
+    alone = {tag.whole for tag in gone if left[tag.whole] == 1}
+    name = {tag: tag.whole if tag.whole in alone else tag for tag in graph.tags if tag not in gone}
+    chains = []
+    for chain in graph.chains:
+        kept = chain.with_readings(np.array([chain.tags[t] not in gone for t in chain.readings.tag], dtype=np.bool_))
+        chains.append(replace(kept, tags=tuple(name[tag] for tag in kept.tags)))
+    again = build_graph(chains)
+    index = {tag: i for i, tag in enumerate(again.tags)}
+    numbers = np.array([index.get(name.get(tag, tag.whole), 0) for tag in graph.tags], dtype=np.int64)
+    again = replace(again, problem=replace(again.problem, measured=to_other_tags(graph.problem.measured, numbers)))
+    places = {name[tag]: place_m for tag, place_m in graph.tags_of(solution.state).items() if tag in name}
+    start = again.start(solution.state.poses, places, graph.calibration_of(solution.state))
+    return again, solve(again.problem, start)

@@ -1,0 +1,159 @@
+"""What drives say of robots' files: each number as its file has it, as the map found it, and what to make of that."""
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from groundsbot.calib.robot import (
+    EDGE_SHIFT,
+    FOCAL_SCALE,
+    IMPORTED_BATCH,
+    RANGE_OFFSET,
+    TAG_SCALE,
+    TIME_OFFSET,
+    WHEEL_PARAMETERS,
+    Robot,
+)
+from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotNumber
+from groundsbot.offline.measurements import Run
+from groundsbot.offline.self_calibration.robot import Owned
+from groundsbot.offline.self_calibration.selection import DOUBTED, TELLS_LESS
+from groundsbot.offline.self_calibration.words import DRIVES
+
+FOUND: Final = "found; nobody had measured it"
+WRONG: Final = "robot.yaml is wrong"
+ASKED: Final = "freed, as was asked"
+AGREES: Final = "agrees"
+NOT_TOLD: Final = "not told by these drives"
+NOT_BELIEVED: Final = "not believed, since another number is wrong by far"
+CONTRADICTED: Final = "contradicts robot.yaml, which was held"
+
+_WRITE: Final = "write what was found into robot.yaml, as groundsbot-offline calibrate does"
+_MOST_SIGMAS: Final = 3.0
+_TOLD_SHARE: Final = 0.7  # of the sigma before, that a number that is told has at most
+_SCALES: Final = frozenset({*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE})
+# What a file says of each number of a robot.
+_OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
+    {
+        WHEEL_PARAMETERS[0]: lambda r: 0.5 * (r.wheels.radius_left_m + r.wheels.radius_right_m),
+        WHEEL_PARAMETERS[1]: lambda r: r.wheels.radius_right_m / r.wheels.radius_left_m,
+        WHEEL_PARAMETERS[2]: lambda r: r.wheels.track_m,
+        TIME_OFFSET: lambda r: r.time_offset_s,
+        EDGE_SHIFT: lambda r: r.edge_shift_px,
+        RANGE_OFFSET: lambda r: r.imported_range_offset_m,
+        FOCAL_SCALE: lambda _: 1.0,
+        **{
+            f"mount_{name}": lambda r, name=name: float(getattr(r.mount, name))  # type: ignore[misc]
+            for name in ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+        },
+    }
+)
+WHAT: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        WHEEL_PARAMETERS[0]: "mean wheel radius (m)",
+        WHEEL_PARAMETERS[1]: "wheel radius, right / left",
+        WHEEL_PARAMETERS[2]: "track_m",
+        TAG_SCALE: "tag size (m)",
+        TIME_OFFSET: "time_offset_s",
+        EDGE_SHIFT: "edge_shift_px",
+        RANGE_OFFSET: "imported_range_offset_m",
+        FOCAL_SCALE: "focal length, as a share",
+    }
+)
+
+
+def verdicts(
+    runs: Sequence[Run], calibration: Sequence[CalibrationResult], choices: Sequence[CalibrationChoice]
+) -> tuple[RobotNumber, ...]:
+    """A row for each number that the map estimated.
+
+    Args:
+        runs: with the robots' files as they were given.
+        calibration: corrections to these files.
+        choices: of self-calibration, and start values of what files leave open.
+    """
+    robots = {run.robot_id: run.robot for run in runs}
+    chosen = {Owned(each.owner, each.name): each for each in choices}
+    rows = []
+    for each in calibration:
+        in_file = _in_file(robots, each)
+        if in_file is None:
+            continue
+        scale = in_file if each.name in _SCALES else 1.0
+        is_open = each.owner.startswith(IMPORTED_BATCH) or (each.owner in robots and robots[each.owner].is_left_open)
+        verdict = _verdict(each, chosen.get(Owned(each.owner, each.name)), is_open=is_open)
+        rows.append(
+            RobotNumber(
+                owner=each.owner,
+                name=each.name,
+                component=each.component,
+                what=_what(each),
+                in_file=in_file,
+                found=in_file + scale * each.value,
+                sigma=abs(scale) * each.sigma,
+                verdict=verdict,
+                to_do=_to_do(each.name, verdict),
+            )
+        )
+    return tuple(rows)
+
+
+def is_news(number: RobotNumber) -> bool:
+    """Whether the file did not have it so."""
+    return number.verdict in (FOUND, WRONG, ASKED, NOT_BELIEVED, CONTRADICTED)
+
+
+def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
+    """For a terminal: a table of what files did not have so; none where they had all."""
+    rows = [each for each in numbers if is_news(each)]
+    if not rows:
+        return ["what these drives say of the robots: all as robot.yaml has it"] if numbers else []
+    owner = max(len(each.owner) for each in rows)
+    what = max(len(each.what) for each in rows)
+    lines = ["what these drives say of the robots (robot.yaml -> found, sigma; all numbers are in the report):"]
+    lines += [
+        f"  {each.owner:<{owner}}  {each.what:<{what}}  {each.in_file:8.4f} -> {each.found:8.4f}  {each.sigma:.4f}  "
+        f"{each.verdict}"
+        for each in rows[:most]
+    ]
+    return [*lines, f"  and {len(rows) - most} more"] if len(rows) > most else lines
+
+
+def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | None:
+    """What a file says of it; None of tags of several sizes."""
+    if entry.name != TAG_SCALE:
+        value = _OF_ROBOT.get(entry.name)
+        return None if value is None or entry.owner not in robots else float(value(robots[entry.owner]))
+    for robot in robots.values():
+        for batch in robot.tags:
+            if f"{batch.batch} {batch.family}" == entry.owner:
+                sizes = {*batch.sizes_m.values(), *([batch.default_size_m] if batch.default_size_m else [])}
+                return sizes.pop() if len(sizes) == 1 else 1.0
+    return 1.0
+
+
+def _what(entry: CalibrationResult) -> str:
+    if entry.owner.startswith(IMPORTED_BATCH):
+        return "ranges, as a share"
+    return WHAT.get(entry.name, f"mount.{entry.name.removeprefix('mount_')}")
+
+
+def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_open: bool) -> str:
+    if is_open:
+        return FOUND if entry.sigma < _TOLD_SHARE * entry.prior_sigma else NOT_TOLD
+    if choice is not None and choice.is_freed:
+        is_off = abs(entry.value) > _MOST_SIGMAS * float(np.hypot(entry.sigma, choice.prior_sigma))
+        if choice.is_asked:
+            return ASKED
+        return NOT_BELIEVED if choice.reason == DOUBTED and not is_off else WRONG
+    if abs(entry.value) > _MOST_SIGMAS * entry.prior_sigma:
+        return CONTRADICTED
+    return NOT_TOLD if choice is not None and choice.reason == TELLS_LESS else AGREES
+
+
+def _to_do(name: str, verdict: str) -> str:
+    if verdict == NOT_TOLD:
+        return DRIVES.get(name, "")
+    return "" if verdict == AGREES else _WRITE

@@ -1,0 +1,99 @@
+"""Time offset and track of a robot of which both are unknown: before anything else, since the rest is to first order.
+
+A camera that is half a second late, or wheels that turn the robot by half as much again as they say, would lead every
+later stage astray. The time offset is searched for in passes of tags (`time_offset_search`); then each drive is solved
+alone at few keyframes, with all that its file leaves open, and what enters the motions to first order only, the track
+and the time offset, is put into the file, until it stays. The sigmas of the file stay as they are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
+from groundsbot.offline.local_map import LocalMap, solve_local_map
+from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsened
+from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
+from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
+
+_MOST_ROUNDS: Final = 4
+# What is left to first order then errs by its square: a percent of the turn, a millimetre at a metre a second.
+_SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
+
+
+class StartValues(NamedTuple):
+    """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the search that they began with."""
+
+    learnt: dict[str, Learnt]
+    searched: TimeOffsetSearch | None
+
+
+def estimated_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
+    """Estimates both from the drives of one robot, whose file leaves them open.
+
+    Args:
+        runs: all with the same robot.yaml.
+        noise: where the noise of wheels and readings begins.
+    """
+    searched = search_time_offset(runs)
+    found = dict.fromkeys(_SMALL, Learnt(0.0, 0.0))
+    if searched is not None:
+        found[TIME_OFFSET] = Learnt(searched.offset_s, searched.sigma_s)
+    for _ in range(_MOST_ROUNDS):
+        more = _estimated([with_start_values(run, found) for run in runs], noise)
+        if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
+            break
+        found = {name: _together(name, each, more.get(name)) for name, each in found.items()}
+    return StartValues(found, searched)
+
+
+def with_start_values(run: Run, learnt: dict[str, Learnt]) -> Run:
+    """The run with time offset and track put into its robot's file, whose sigmas stay."""
+    late_s, track = learnt[TIME_OFFSET].value, learnt[TRACK_SCALE].value
+    robot = run.robot
+    wheels = robot.wheels.model_copy(
+        update={
+            "track_m": robot.wheels.track_m * (1.0 + track),
+            "track_m_sigma": robot.wheels.track_m_sigma * (1.0 + track),
+        }
+    )
+    changed = robot.model_copy(update={"time_offset_s": robot.time_offset_s + late_s, "wheels": wheels})
+    return replace(run.retimed(late_s), robot=changed)
+
+
+def _estimated(runs: Sequence[Run], noise: NoiseParameters) -> dict[str, Learnt]:
+    """Time offset and track by each drive alone, the mean by their information."""
+    maps: list[LocalMap] = []
+    for run in runs:
+        for chain in chains_of(run, noise):
+            if chain.tags and len(chain.stamps_ns) > 1:
+                coarse = coarsened(chain, coarse_keyframes(chain))
+                maps.append(solve_local_map(coarse, other_starts=0, noise_is_open=True))
+    found: dict[str, Learnt] = {}
+    for name in _SMALL:
+        values, informations = [], []
+        for each in maps:
+            for parameter, column, value in zip(
+                each.graph.parameters,
+                each.graph.problem.columns.calibration.tolist(),
+                each.solution.state.calibration.tolist(),
+                strict=True,
+            ):
+                if parameter.name == name and column >= 0:
+                    values.append(value)
+                    informations.append(1.0 / float(each.solution.covariance(np.array([column]))[0, 0]))
+        if values:
+            found[name] = Learnt(float(np.average(values, weights=informations)), float(np.sum(informations) ** -0.5))
+    return found
+
+
+def _together(name: str, before: Learnt, more: Learnt | None) -> Learnt:
+    """Two corrections, one after the other; a turn of c to first order is one of 1 / (1 - c) of the track."""
+    if more is None:
+        return before
+    if name == TRACK_SCALE:
+        turn = float(np.clip(1.0 - more.value, 0.3, 3.0))
+        return Learnt((1.0 + before.value) / turn - 1.0, more.sigma / turn**2)
+    return Learnt(before.value + more.value, more.sigma)
