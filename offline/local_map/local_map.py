@@ -136,7 +136,8 @@ def solve_local_map(
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
-    for _ in range(1 + (_OTHER_STARTS if other_starts is None else other_starts)):
+    most = _OTHER_STARTS if other_starts is None else other_starts
+    for n_others in range(1 + most):
         poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
@@ -147,7 +148,8 @@ def solve_local_map(
             n_in_vain = 0
             if best.goodness.fits:
                 break
-        if effort.left < _BUILDING_SHARE * effort.allowed or (far_larger and n_in_vain >= _MOST_IN_VAIN):
+        is_spent = effort.left < _BUILDING_SHARE * effort.allowed
+        if n_others == most or is_spent or (far_larger and n_in_vain >= _MOST_IN_VAIN):
             break
         known = _built_up(_redrawn(_as_shown(coarse, check.noise_factors), rng), effort)
     if best is None:

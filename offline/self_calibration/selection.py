@@ -25,6 +25,10 @@ _NOTHING: Final = 1e-9  # information, as a share of what the sigmas of open num
 _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
 # What is off by so many of the sigmas that open ones have is off by far.
 _BY_FAR: Final = 0.5
+# A number that drives know worse than robot.yaml claims to is freed only where it is off by so many times what is more
+# than chance: then the claim is wrong. Not those of which readings on the floor tell with a bias, as roll and pitch.
+_OFF_BY_ALL: Final = frozenset({*OFF_BY_FAR, TAG_SCALE})
+_CERTAINLY: Final = 1.5
 DOUBTED: Final = "robot.yaml has another number wrong by far, so this one is not believed either"
 TELLS_LESS: Final = "the drives tell less of it than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
@@ -106,7 +110,7 @@ class _Judge:
         All that may be is open at first. What is off least is held by robot.yaml, and the others are judged anew, until
         all that are left are off by far. So where several explain the same, one is left.
         """
-        names, parameters = {*OFF_BY_FAR, TAG_SCALE}, self._told.parameters
+        names, parameters = _OFF_BY_ALL, self._told.parameters
         self.open = [i for i in self._candidates if parameters[i].name in names]
         while self.open:
             looked = {i: self.look(i) for i in self.open}
@@ -136,7 +140,8 @@ class _Judge:
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
         most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
         reason = ""
-        if whole.variance >= prior**2:
+        is_wrong = parameter.name in _OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
+        if whole.variance >= prior**2 and not is_wrong:
             reason = TELLS_LESS
         elif gain is None:
             reason = "a single stretch tells of it, and nothing bears that out"

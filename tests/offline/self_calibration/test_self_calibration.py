@@ -204,7 +204,8 @@ def choice(
     [
         ([0.05, 0.051, 0.049], [0.001] * 3, "track_scale", ""),
         ([0.02, 0.021, 0.019], [0.001] * 3, "track_scale", "agrees"),
-        ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "tell less"),
+        ([0.03, 0.01, -0.02], [0.05] * 3, "track_scale", "tell less"),
+        ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "foretell the others"),
         ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "foretell the others"),
         ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "no error of calibration"),
         ([0.05, 0.0], [0.001, 9.0], "track_scale", "single stretch"),
