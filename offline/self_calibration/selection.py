@@ -141,6 +141,8 @@ class _Judge:
         most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
         reason = ""
         is_wrong = parameter.name in _OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
+        if parameter.name == TIME_OFFSET:  # passes of tags must say so too
+            is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
         if whole.variance >= prior**2 and not is_wrong:
             reason = TELLS_LESS
         elif gain is None:
