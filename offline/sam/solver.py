@@ -15,6 +15,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweighed
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from groundsbot.offline.sam.curvature import Curvature
 from groundsbot.offline.sam.damping import Damping
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
@@ -235,6 +236,7 @@ def solve(
         most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
     """
     arrowhead = problem.arrowhead
+    curvature = Curvature(losses)
     system, spare, rows = arrowhead.scratch
     state, n_linearised = _relaxed(problem, start, relaxed_steps)
     _, cost = arrowhead.linearise(state, *losses, out=system)
@@ -246,7 +248,7 @@ def solve(
 
     if not np.isfinite(cost):
         return ended("the cost is no number at the start", converged=False)
-    while n_steps < most_steps and n_linearised < last:
+    while n_steps < most_steps and n_linearised < last and not damping.exhausted:
         n_steps += 1
         try:
             step, expected = _step(arrowhead, system, damping, rows, threads)
@@ -254,22 +256,29 @@ def solve(
             return ended("a variable is in no factor", converged=False)
         if expected <= cost_tolerance + relative_tolerance * cost:
             return ended("converged", converged=True)
-        taken = take_step(arrowhead, losses, problem.anchor, Before(state, cost, rolled), step, expected, spare)
+        before = Before(state, cost, rolled)
+        taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spare)
         n_linearised += taken.n_linearised
+        if curvature.misleads(cost - taken.cost, expected):
+            arrowhead.linearise(state, *curvature.losses, out=system)
+            n_linearised += 1
+            continue
         if not taken.cost < cost:
             damping.step_rejected()
-            if damping.exhausted:
-                return ended("no step lowers the cost", converged=False)
             continue
         expected *= taken.share * (2.0 - taken.share)
         gain = (cost - taken.cost) / expected
         state, cost, rolled = taken.state, taken.cost, taken.rolled
         system, spare = spare, system
         costs.append(cost)
+        if curvature.is_due(costs[-2] - cost):
+            arrowhead.linearise(state, *curvature.losses, out=system)
+            n_linearised += 1
         if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
             return ended("converged", converged=True)
         damping.step_taken(gain)
-    return ended(f"stopped after {n_steps} steps", converged=False)
+    reason = "no step lowers the cost" if damping.exhausted else f"stopped after {n_steps} steps"
+    return ended(reason, converged=False)
 
 
 def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows, threads: int) -> tuple[FloatArray, float]:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inlined, inner, jitted
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
@@ -21,13 +21,23 @@ _TRUNCATED: Final = 4
 # What is cut off keeps this share of its force: a tag of which no reading fits is still somewhere, a thousand times
 # less certain than they say.
 _TRUNCATED_WEIGHT: Final = 1e-6
+# None at all would leave a tag that is only read beyond the threshold without a place to go to.
+_LEAST_CURVATURE: Final = 0.01
 
 
 class Loss(NamedTuple):
-    """Which loss, and from what length of the whitened residual on it differs from the square."""
+    """Which loss, and from what length of the whitened residual on it differs from the square.
+
+    Attributes:
+        least_curvature: for the matrix of a step only: a loss that bends away from the square curves less along the
+            residual than across, Huber's not at all beyond its threshold (Triggs, McLauchlan, Hartley and Fitzgibbon,
+            "Bundle adjustment: a modern synthesis", 2000, section 4.3). So many times the weight is left there. At 1
+            the matrix is that of weighted squares.
+    """
 
     form: int
     threshold: float
+    least_curvature: float = 1.0
 
 
 SQUARES: Final = Loss(_SQUARES, 1.0)
@@ -36,6 +46,15 @@ SQUARES: Final = Loss(_SQUARES, 1.0)
 def huber(threshold: float) -> Loss:
     """Squares up to the threshold, then linear: constant force."""
     return Loss(_HUBER, threshold)
+
+
+def curved(loss: Loss) -> Loss:
+    """The same loss with the matrix of its steps as near to its second derivative as leaves it a square root.
+
+    By weights alone each step leaves over a share of the way, nearly all of it where many readings lie beyond the
+    threshold. Of losses that forget the second derivative is negative far out; they keep their weights.
+    """
+    return loss._replace(least_curvature=_LEAST_CURVATURE) if loss.form == _HUBER else loss
 
 
 def cauchy(threshold: float) -> Loss:
@@ -81,6 +100,21 @@ def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
     if loss.form == _TRUNCATED and square > c2:
         return c2 + _TRUNCATED_WEIGHT * (square - c2), _TRUNCATED_WEIGHT
     return square, 1.0
+
+
+@inlined
+def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
+    """Scales (2,) r up and (2, n) J down along r where the loss curves less there, so that J' r stays the same."""
+    if loss.least_curvature == 1.0 or square <= loss.threshold * loss.threshold:
+        return
+    share = np.sqrt(loss.least_curvature)
+    taken = (1.0 - share) / square
+    for k in range(J.shape[1]):
+        along = taken * (r[0] * J[0, k] + r[1] * J[1, k])
+        J[0, k] -= along * r[0]
+        J[1, k] -= along * r[1]
+    r[0] /= share
+    r[1] /= share
 
 
 @jitted

@@ -7,7 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import borrowed, inlined, inner, jitted
-from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
+from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import System
 from groundsbot.offline.sam.linearisation.kernels import Free, Readings, Values
 
@@ -29,8 +29,10 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
     for m in range(len(readings.pose)):
         pose, tag = readings.pose[m], readings.tag[m]
         reading_factor(readings, m, values, by_calibration, r, J)
-        rho, w = loss_and_weight(loss, r[0] * r[0] + r[1] * r[1])
+        square = r[0] * r[0] + r[1] * r[1]
+        rho, w = loss_and_weight(loss, square)
         total += rho
+        bend(loss, square, r, J)
         a0, a1, a2, b0, b1, b2 = J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2]
         c0, c1, d0, d1 = J[0, 3], J[0, 4], J[1, 3], J[1, 4]
         r0, r1 = w * r[0], w * r[1]

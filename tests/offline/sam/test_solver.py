@@ -95,6 +95,18 @@ def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
     np.testing.assert_array_equal(found, found.T)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_steps_do_not_creep_where_many_readings_lie_beyond_the_threshold(seed: int) -> None:
+    made = made_problem(seed)
+    whitening = 5.0 * made.problem.readings.whitening  # sigmas told too small: most readings lie beyond 3 of them
+    problem = made.problem.reweighed(made.problem.odometry.whitening, whitening)
+    solution = solve(problem, made.truth)
+    weights = losses_and_weights(solution.losses.readings, problem.readings.residual(solution.state))[1]
+    assert (weights < 1.0).mean() > 0.3
+    assert solution.converged
+    assert len(solution.costs) < 20
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_start_nearby_leads_to_the_same_optimum(seed: int) -> None:
     made = made_problem(seed, n_outliers=2)
