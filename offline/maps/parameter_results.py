@@ -127,8 +127,8 @@ class FittedNoise:
     """Where the noise comes from when nobody gave it."""
 
     parameters: tuple[FittedParameter, ...]
-    # Variances of errors that readings of a tag share, as multiples of what the default noise gives: within 2.5 m of
-    # the way, and within a pass.
+    # Variances of errors that readings of a tag share, as multiples of what the default noise gives: forgotten along
+    # the way, over 0.25 m or 1 rad, and lasting for a pass.
     shared_range: float
     shared_bearing: float
     pass_range: float

@@ -12,7 +12,7 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParamete
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import STAMP_NOISE, Chain, CovarianceParts, coarse_keyframes, coarsened
 from groundsbot.offline.noise.likelihood import Components, Part
-from groundsbot.offline.noise.shared_errors import shared_levels, shared_root
+from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
 from groundsbot.offline.sam import build_graph
 
@@ -64,7 +64,7 @@ class NoiseFit:
     n_groups: FloatArray
 
 
-def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
+def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoiseParameters | None = None) -> NoiseFit:
     """Fits the noise of all runs at once, whatever it comes out at.
 
     What the drives tell too little of stays where it began, or where they are more content with if that is more; what
@@ -72,13 +72,14 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters) -> NoiseFit:
 
     Args:
         maps: solved under any noise.
-        noise: where to begin, and what stays where the drives say nothing.
+        noise: what stays where the drives say nothing.
+        start: where to begin; there where None.
     """
     maps = sorted(maps, key=lambda each: each.chain.name)  # sums are rounded alike whatever the order of the logs
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
-        fitted = _fitted(maps, noise, free)
+        fitted = _fitted(maps, noise, start or noise, free)
         found = _sigmas(free, fitted)
         small = {each.name: _left(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept}
         if not small:
@@ -113,12 +114,15 @@ def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
     return tuple(sigmas[name] for name in NoiseParameters.model_fields if name in sigmas)
 
 
-def _fitted(maps: Sequence[LocalMap], noise: NoiseParameters, names: tuple[str, ...]) -> FittedVariances:
+def _fitted(
+    maps: Sequence[LocalMap], noise: NoiseParameters, start: NoiseParameters, names: tuple[str, ...]
+) -> FittedVariances:
     default = NoiseParameters()
     return fit_variances(
         [_part(each, chain, noise, names) for each, chain in zip(maps, _thinned(maps), strict=True)],
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
+        start=np.array([getattr(start, name) for name in names]),
     )
 
 
@@ -150,8 +154,8 @@ def _part(local_map: LocalMap, chain: Chain, noise: NoiseParameters, names: tupl
         _rest(odometry, noise, names),
         readings.of(names),
         _rest(readings, noise, names),
-        shared_levels(chain),
-        shared_root(chain),
+        lasting_errors(chain),
+        lasting_root(chain),
         *_of_stamps(chain, names),
     )
     return Part(graph.problem, start, components)

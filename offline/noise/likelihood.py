@@ -16,9 +16,13 @@ from scipy import sparse
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.noise.lasting_errors import LastingErrors
 from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stacked, whitening
 
 _N_SIGNS: Final = 8
+# A trace over k directions is known to sqrt(2 / (32 k)): where errors that last, of which few directions tell, are set
+# against noise of a hundred times their size, with 8 what was left was chance.
+_N_SIGNS_LASTING: Final = 32
 _ROUNDING: Final = 1e-9
 _SEED: Final = 11
 # A residual beyond this is rather a fault than noise, and counts as if it lay there; of good ones 0.1 % do.
@@ -39,9 +43,8 @@ class Components:
         odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
         odometry_rest: (M, 3, 3) what is added whatever the variances.
         readings: (K, N, 2, 2) and readings_rest: (N, 2, 2) likewise.
-        cells: L levels at which readings share errors: (N,) each, the cell of each reading, from 0 without gaps.
-        shared_root: (N, 2, 2) its columns are the errors of each reading for a shared component of one; with a level's
-            two variances the readings of a cell all err by the same multiples of their columns.
+        lasting: L kinds of errors that readings of a tag have in common, in part or all.
+        lasting_root: (N, 2, 2) its columns are the errors of each reading for a lasting component of one.
         common: which of the K variances is of an error that all readings of a picture have in common, as that of its
             stamp; None: none. It is weighed as if each reading had its own.
         common_root: (N, 2) what such an error of one adds to each reading.
@@ -52,34 +55,34 @@ class Components:
     odometry_rest: FloatArray
     readings: FloatArray
     readings_rest: FloatArray
-    cells: tuple[IntArray, ...] = ()
-    shared_root: FloatArray | None = None
+    lasting: tuple[LastingErrors, ...] = ()
+    lasting_root: FloatArray | None = None
     common: int | None = None
     common_root: FloatArray | None = None
     picture: IntArray | None = None
 
     @property
-    def n_shared(self) -> int:
-        """Variances of shared errors: two a level."""
-        return 2 * len(self.cells)
+    def n_lasting(self) -> int:
+        """Variances of lasting errors: two a kind."""
+        return 2 * len(self.lasting)
 
     def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; readings count as independent with what that takes.
 
         The mean of n readings that share an error of variance s errs by it as n independent ones would of n s.
         """
-        own, shared = variances[: len(self.odometry)], variances[len(self.odometry) :].reshape(-1, 2)
+        own, lasting = variances[: len(self.odometry)], variances[len(self.odometry) :].reshape(-1, 2)
         odometry: FloatArray = np.tensordot(own, self.odometry, 1) + self.odometry_rest
         readings: FloatArray = np.tensordot(own, self.readings, 1) + self.readings_rest
-        return _regular(odometry), _regular(readings + self.covariance_shared(shared))
+        return _regular(odometry), _regular(readings + self._covariance_lasting(lasting))
 
-    def covariance_shared(self, shared: FloatArray) -> FloatArray:
-        """(N, 2, 2) what (L, 2) variances of shared errors add to each reading's covariance."""
+    def _covariance_lasting(self, lasting: FloatArray) -> FloatArray:
+        """(N, 2, 2) what (L, 2) variances of lasting errors add to each reading's covariance."""
         added = np.zeros_like(self.readings_rest)
-        for cell, both in zip(self.cells, shared, strict=True):
-            assert self.shared_root is not None
-            column = self.shared_root * np.sqrt(both)
-            added += np.bincount(cell)[cell][:, None, None] * (column @ column.swapaxes(-1, -2))
+        for errors, both in zip(self.lasting, lasting, strict=True):
+            assert self.lasting_root is not None
+            column = self.lasting_root * np.sqrt(both)
+            added += errors.alike()[:, None, None] * (column @ column.swapaxes(-1, -2))
         return added
 
 
@@ -98,8 +101,8 @@ class Seen(NamedTuple):
     Attributes:
         squares: (C,) q_i, less what the parts of the covariances bring that no variance scales.
         traces: (C, C) what a variance of one of component j brings to q_i.
-        at_most: (C,) what a variance of one of component i would bring to q_i if the estimate took nothing.
-        n_groups: (2 L,) how many independent cells, or passes, tell what they share, once the estimate has taken its
+        at_most: (C,) q_i as all variances would bring it if the estimate took nothing and no row was cut off.
+        n_groups: (2 L,) how many independent series tell how their errors last, once the estimate has taken its
             part: the squared trace of P V_i over the trace of its square.
     """
 
@@ -136,16 +139,20 @@ class Looker:
         self._steps_left -= self.solution.n_linearised
         rows = _Rows(self.solution, self._components)
         n, rng = rows.n_components, np.random.default_rng(_SEED)
-        traces, lengths = np.empty((n, n)), np.empty(n)
+        traces, lengths, n_signs, at_most = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
         for j in range(n):
             drawn = rows.drawn(j, rng)
+            at_most += variances[j] * rows.squares(drawn[:, :_N_SIGNS]).mean(axis=1)
+            drawn = rows.weighed(drawn)
             left = rows.left_over(drawn)
             traces[:, j] = rows.squares(left).mean(axis=1)
-            lengths[j] = (drawn * left).sum(axis=0).mean()
-        shared = slice(n - self._components.n_shared, n)
-        n_groups = lengths[shared] ** 2 / np.maximum(np.diag(traces)[shared], 1e-300)
-        unscaled = rows.squares(rows.left_over(rows.drawn_unscaled(rng))).mean(axis=1)
-        return Seen(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, rows.at_most, n_groups)
+            lengths[j], n_signs[j] = (drawn * left).sum(axis=0).mean(), drawn.shape[1]
+        # Both of a pair of components tell of the same trace.
+        traces = (n_signs * traces + (n_signs * traces).T) / (n_signs + n_signs[:, None])
+        lasting = slice(n - self._components.n_lasting, n)
+        n_groups = lengths[lasting] ** 2 / np.maximum(np.diag(traces)[lasting], 1e-300)
+        unscaled = rows.squares(rows.left_over(rows.weighed(rows.drawn_unscaled(rng)))).mean(axis=1)
+        return Seen(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, at_most, n_groups)
 
 
 class _Rows:
@@ -171,17 +178,19 @@ class _Rows:
             _roots(problem.odometry.whitening, components.odometry_rest[None])[0],
             _roots(problem.readings.whitening, components.readings_rest[None])[0],
         )
-        self._cells = [
-            sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell))))) for cell in components.cells
-        ]
-        if components.shared_root is not None:
-            self._shared = problem.readings.whitening @ components.shared_root
+        self._lasting = components.lasting
+        if components.lasting_root is not None:
+            self._by_lasting = problem.readings.whitening @ components.lasting_root
         self._common = components.common
         if components.common_root is not None and components.picture is not None:
             self._by_stamp = np.einsum("mij,mj->mi", problem.readings.whitening, components.common_root)
             picture = components.picture
             self._pictures = sparse.csr_array((np.ones(len(picture)), (picture, np.arange(len(picture)))))
-        self.n_components = len(components.odometry) + components.n_shared
+        self.n_components = len(components.odometry) + components.n_lasting
+
+    def weighed(self, errors: FloatArray) -> FloatArray:
+        """(R, n) errors as the losses weigh them."""
+        return np.asarray(self._root[:, None] * errors)
 
     def left_over(self, errors: FloatArray) -> FloatArray:
         """P e of (R, n) errors."""
@@ -200,12 +209,12 @@ class _Rows:
         if self._common is not None:
             along = np.einsum("mi,min->mn", self._by_stamp, readings)
             own[self._common] = (np.asarray(self._pictures @ along) ** 2).sum(axis=0)
-        shared = [
-            (np.asarray(cells @ np.einsum("mi,min->mn", self._shared[..., axis], readings)) ** 2).sum(axis=0)
-            for cells in self._cells
+        lasting = [
+            (errors.projected(np.einsum("mi,min->mn", self._by_lasting[..., axis], readings)) ** 2).sum(axis=0)
+            for errors in self._lasting
             for axis in (0, 1)
         ]
-        return np.array(own + shared).reshape(self.n_components, rows.shape[1])
+        return np.array(own + lasting).reshape(self.n_components, rows.shape[1])
 
     def drawn(self, component: int, rng: np.random.Generator) -> FloatArray:
         """(R, n) errors as component j brings with a variance of one, by random signs."""
@@ -216,17 +225,16 @@ class _Rows:
         elif component < len(self._of_motions):
             rows = self._drawn_by(self._of_motions[component], self._of_readings[component], rng)
         else:
-            level, axis = divmod(component - len(self._of_motions), 2)
-            signs = self._cells[level].T @ rng.choice([-1.0, 1.0], (self._cells[level].shape[0], _N_SIGNS))
-            readings = self._shared[..., axis, None] * signs[:, None, :]
-            rows[self._n_odometry :] = readings.reshape(-1, _N_SIGNS)
-        drawn: FloatArray = rows * self._root[:, None]
-        return drawn
+            kind, axis = divmod(component - len(self._of_motions), 2)
+            errors = self._lasting[kind].drawn(rng.choice([-1.0, 1.0], (len(self._by_lasting), _N_SIGNS_LASTING)))
+            readings = self._by_lasting[..., axis, None] * errors[:, None, :]
+            rows = np.zeros((len(self.residual), _N_SIGNS_LASTING))
+            rows[self._n_odometry :] = readings.reshape(-1, _N_SIGNS_LASTING)
+        return rows
 
     def drawn_unscaled(self, rng: np.random.Generator) -> FloatArray:
         """(R, n) errors as the parts of the covariances bring that no variance scales."""
-        drawn: FloatArray = self._drawn_by(*self._unscaled, rng) * self._root[:, None]
-        return drawn
+        return self._drawn_by(*self._unscaled, rng)
 
     def _drawn_by(
         self, of_motions: FloatArray | None, of_readings: FloatArray | None, rng: np.random.Generator
@@ -237,21 +245,6 @@ class _Rows:
                 signs = rng.choice([-1.0, 1.0], (len(root), root.shape[2], _N_SIGNS))
                 own[:] = (root @ signs).reshape(own.shape)
         return rows
-
-    @property
-    def at_most(self) -> FloatArray:
-        """(C,) traces of S^-1 V_i, all rows counted in full."""
-        own = [
-            sum(0.0 if root is None else float((root**2).sum()) for root in both)
-            for both in zip(self._of_motions, self._of_readings, strict=True)
-        ]
-        return np.array(own + [float(each.sum()) for each in self._of_groups()])
-
-    def _of_groups(self) -> list[FloatArray]:
-        """For each level and component (n groups,) the squared length of what a shared error of one brings."""
-        return [
-            np.asarray(cells @ (self._shared[..., axis] ** 2).sum(axis=1)) for cells in self._cells for axis in (0, 1)
-        ]
 
 
 def _regular(covariances: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         prior: what stays where the runs tell nothing.
     """
     sound = [each for each in maps if _is_sound(each)]
-    fit = fit_noise(sound, _as_shown(sound, prior))
+    fit = fit_noise(sound, prior, _as_shown(sound, prior))
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
     is_told = bool(fit.n_groups[0, 0] >= _LEAST_CELLS)
     shared = fit.shared if noise != prior else np.zeros((2, 2))

@@ -1,26 +1,47 @@
-"""Errors that readings of a tag share: within some metres of the way, and within the whole of a pass.
+"""Errors that readings of a tag share: those close to each other, and all of a pass.
 
 A detector's bias depends on how a tag looks, a sensor's on the range, a clock's on the speed: so an error repeats from
-picture to picture, and the mean of m readings is less certain than one reading over sqrt(m). At two levels readings are
-taken to err by a part that the level shares: a cell, 2.5 m of the way, and a pass. Their variances are fitted with all
-others (`variance_components`); a reading then counts as one of m independent ones that tell as much together.
+picture to picture, and the mean of m readings is less certain than one reading over sqrt(m). Readings are taken to err
+by two such parts: one that is forgotten along the way, as a Gauss-Markov process, and one that stays for a whole pass.
+Their variances are fitted with all others (`variance_components`); a reading then counts as one of m independent ones
+that tell as much together.
 """
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.measurements import Chain, cells_of, least_shared, least_shared_by_corners, passes_of
+from groundsbot.offline.noise.lasting_errors import LastingErrors
+
+# What readings of a tag err by is forgotten, but for a share of 1/e, after so much of the way, or so much turned. On
+# the five robots of MRCLAM ranges do so after 0.14 m; what lasts longer falls to the errors of whole passes.
+_LASTING_M: Final = 0.25
+_LASTING_RAD: Final = 1.0
 
 
-def shared_levels(chain: Chain) -> tuple[IntArray, ...]:
-    """For each level (M,) the group of each reading, from 0 without gaps: cells, then passes."""
-    return cells_of(chain), passes_of(chain)
+def lasting_errors(chain: Chain) -> tuple[LastingErrors, LastingErrors]:
+    """Errors of readings of a tag in one pass that last some way, and that last for all of it."""
+    pass_of = passes_of(chain)
+    order = np.lexsort((chain.readings.keyframe, pass_of))
+    goes_on = np.zeros(len(order))
+    goes_on[1:] = np.diff(pass_of[order]) == 0
+    at = chain.readings.keyframe[order]
+    apart = np.zeros(len(order))
+    apart[1:] = np.abs(np.diff(_changed(chain)[at]))
+    return LastingErrors(order, goes_on * np.exp(-apart)), LastingErrors(order, goes_on)
 
 
-def shared_root(chain: Chain) -> FloatArray:
+def _changed(chain: Chain) -> FloatArray:
+    """(K,) how often the view has changed by so much that errors are others, at the keyframes."""
+    turned_rad = np.append(0.0, np.cumsum(np.abs(chain.odometry.motion[:, 2])))
+    return np.asarray(chain.along_m / _LASTING_M + turned_rad / _LASTING_RAD)
+
+
+def lasting_root(chain: Chain) -> FloatArray:
     """(M, 2, 2) whose columns a shared error of one adds to a reading: in range and bearing, as the default noise is.
 
     Of readings whose log gives their covariance that is a multiple of their own.
@@ -49,16 +70,16 @@ def counted_for_less(chain: Chain, shared: FloatArray, sigma_corner_px: float) -
 
     Args:
         chain: under its noise, with its readings as independent.
-        shared: (2, 2) variances by level and component, as multiples of the squares of `shared_root`.
+        shared: (2, 2) variances by kind and component, as multiples of the squares of `lasting_root`.
         sigma_corner_px: of the corners' noise.
     """
     readings = chain.readings
     if not len(readings) or not (shared.any() or readings.corner_bias_px.any()):
         return chain
-    back = np.linalg.inv(np.linalg.cholesky(readings.covariance)) @ shared_root(chain)
+    back = np.linalg.inv(np.linalg.cholesky(readings.covariance)) @ lasting_root(chain)
     times = np.zeros((len(readings), 2))
-    for group, both in zip(shared_levels(chain), shared, strict=True):
-        times += _n_in_group(group)[:, None] * np.einsum("mij,j->mi", back**2, both)
+    for errors, both in zip(lasting_errors(chain), shared, strict=True):
+        times += errors.alike()[:, None] * np.einsum("mij,j->mi", back**2, both)
     n_in_cell = in_cell(chain)
     sigmas = np.sqrt(1.0 + np.maximum(times, n_in_cell[:, None] * least_shared(readings)))
     of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), spread_of_corners(chain, n_in_cell, sigma_corner_px))

@@ -29,7 +29,9 @@ PRIOR_SIGMA: Final = float(np.log(10.0))
 _MOST_LOOKS: Final = 15
 # As many squares as that leave a sigma uncertain by a third.
 LEAST_REDUNDANCY: Final = 5.0
-_CONTRADICTED: Final = 3.0  # sigmas of the squares
+# In sigmas of the squares: by so much must there be less left over than what nobody could tell would bring, for it not
+# to be put back. Several that are told together only would bring too much by their sum, each by little.
+_CONTRADICTED: Final = 1.0
 _LARGEST_STEP: Final = 10.0  # factor on a variance, from one look to the next
 _GROWING: Final = 0.5  # of the logarithm of a sigma in one step
 _SMALL_STEP: Final = 0.1  # of its own standard deviation
@@ -52,7 +54,7 @@ class FittedVariances:
             with if that is more, unless they speak against that.
         solutions: of the parts under these sigmas.
         converged: whether the last repetition changed nothing that matters.
-        shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.shared_root`.
+        shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.lasting_root`.
         n_groups: (L, 2) of how many cells, or passes, each tells.
     """
 
@@ -76,28 +78,33 @@ class FittedVariances:
         return self.sigma * np.sqrt(np.maximum(1.0 - 2.0 * spread, 0.0)), self.sigma * np.exp(spread)
 
 
-def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | None = None) -> FittedVariances:
-    """Fits K sigmas to all parts at once, from `sigma` (K,), which is also the middle of the prior.
+def fit_variances(
+    parts: Sequence[Part], sigma: FloatArray, least: FloatArray | None = None, start: FloatArray | None = None
+) -> FittedVariances:
+    """Fits K sigmas to all parts at once.
 
-    Sigmas of which the data say next to nothing are put back up to where they began, unless the data speak against it.
+    Sigmas of which the data say next to nothing are put back up to the prior's, unless the data speak against it.
 
     Args:
         parts: what the residuals are of.
-        sigma: (K,) where to begin.
+        sigma: (K,) the middle of the prior.
         least: (K,) below which no sigma is looked for.
+        start: (K,) where to begin; at the prior's where None.
 
     Raises:
         UnderDeterminedError: a part has something that nothing ties down.
     """
-    n_shared = parts[0].components.n_shared if parts else 0
-    search = _Search(parts, sigma, np.zeros(len(sigma)) if least is None else least, n_shared)
+    least = np.zeros(len(sigma)) if least is None else least
+    search = _Search(parts, sigma, least, sigma if start is None else start)
     n = len(sigma)
-    converged = search.run(np.ones(n + n_shared, dtype=np.bool_))
+    search.grow()
+    converged = search.run(np.ones(len(search.variances), dtype=np.bool_))
     told = search.redundancy() >= LEAST_REDUNDANCY
     if not told[:n].all():
         converged &= search.hold_untold(told)
     log_covariance = search.log_covariance()
     redundancy = search.redundancy()
+    is_shared = (search.variances[n:] > 2.0 * _NONE_SHARED) & (search.seen.n_groups > 0.0)
     return FittedVariances(
         np.sqrt(search.variances[:n]),
         log_covariance[:n, :n],
@@ -105,7 +112,7 @@ def fit_variances(parts: Sequence[Part], sigma: FloatArray, least: FloatArray | 
         told[:n],
         tuple(each.solution for each in search.lookers),
         converged,
-        np.where(search.variances[n:] > 2.0 * _NONE_SHARED, search.variances[n:], 0.0).reshape(-1, 2),
+        np.where(is_shared, search.variances[n:], 0.0).reshape(-1, 2),
         search.seen.n_groups.reshape(-1, 2),
     )
 
@@ -118,10 +125,10 @@ def _own_by_shared(parts: Sequence[Part], sigma: FloatArray) -> float:
     own, shared = 0.0, 0.0
     for each in parts:
         found = each.components
-        if found.shared_root is not None and len(found.readings_rest):
+        if found.lasting_root is not None and len(found.readings_rest):
             readings = np.tensordot(sigma**2, found.readings, 1) + found.readings_rest
             own += float(np.trace(readings, axis1=-2, axis2=-1).sum())
-            shared += float((found.shared_root**2).sum())
+            shared += float((found.lasting_root**2).sum())
     return min(1.0, own / shared) if shared > 0.0 else 1.0
 
 
@@ -133,12 +140,13 @@ class _Search:
         seen: at these variances.
     """
 
-    def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, n_shared: int) -> None:
+    def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, start: FloatArray) -> None:
         self.lookers = [Looker(part) for part in parts]
         self._n = len(sigma)
+        n_shared = parts[0].components.n_lasting if parts else 0
         self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
-        self.variances = np.maximum(self._middle, self._least)
+        self.variances = np.maximum(np.append(start**2, self._middle[self._n :]), self._least)
         self.seen: Seen = all_looks(self.lookers, self.variances)
 
     def run(self, free: BoolArray) -> bool:
@@ -156,8 +164,18 @@ class _Search:
                 return True
         return False
 
+    def grow(self) -> None:
+        """Raises sigmas that are far too small, without lasting errors: else these would take what wheels err by."""
+        own = np.arange(len(self.variances)) < self._n
+        for _ in range(_MOST_LOOKS):
+            moved = 0.5 * np.log(np.clip(np.where(own, self._estimate(own), 1.0), 1.0, _LARGEST_STEP))
+            if not (moved > _GROWING).any():
+                return
+            self.variances = np.minimum(self.variances * np.exp(2.0 * moved), _MOST_TIMES * self._middle)
+            self.seen = all_looks(self.lookers, self.variances)
+
     def hold_untold(self, told: BoolArray) -> bool:
-        """Puts sigmas of which little is told up to where they began, where the data do not speak against it."""
+        """Puts sigmas of which little is told up to the prior's, where the data do not speak against it."""
         n = self._n
         fitted = self.variances.copy()
         untold = ~told & (np.arange(len(fitted)) < n)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, TIME_OFFSET
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
@@ -16,7 +17,10 @@ from groundsbot.offline.maps.parameter_results import NOT_NEEDED
 from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.sensor_model.sensor_model import STAMP_NOISE
 from groundsbot.offline.noise import fit as noise_fit
+from groundsbot.offline.noise.fit import fit_noise
+from groundsbot.offline.noise.likelihood import Looker
 from groundsbot.offline.noise.reweighing import fit_and_weigh, weighed_as
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
@@ -102,7 +106,7 @@ def test_of_long_runs_beginnings_may_be_without_tags(
     found = fit_and_weigh(both, PRIOR)
     by_name = {each.name: each for each in found.fitted.parameters}
     assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
-    assert (found.fitted.shared_range, found.fitted.shared_bearing) == (0.0, 0.0) or n_late == 1
+    assert max(found.fitted.shared_range, found.fitted.shared_bearing) < 1e-3 or n_late == 1
 
 
 def _read_late(chain: Chain) -> Chain:
@@ -119,16 +123,19 @@ def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     result = build_map(read_runs([log]))
     assert result.noise_fit is not None
     assert all(each.kept for each in result.noise_fit.parameters)
-    assert result.noise == PRIOR
+    for name, value in PRIOR.model_dump().items():
+        assert getattr(result.noise, name) == pytest.approx(value, rel=0.02), name
 
 
 def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[LocalMap]) -> None:
     """Wheels that err fifty times as much as they are taken to."""
-    odometry = maps[0].chain.odometry
-    parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
-    odd = replace(maps[0].chain, odometry=replace(odometry, parts=parts))
-    found = fit_and_weigh([replace(maps[0], chain=odd)], PRIOR)
-    as_told = fit_and_weigh([maps[0]], PRIOR)
+    odd = []
+    for each in maps:
+        odometry = each.chain.odometry
+        parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
+        odd.append(replace(each, chain=replace(each.chain, odometry=replace(odometry, parts=parts))))
+    found = fit_and_weigh(odd, PRIOR)
+    as_told = fit_and_weigh(maps, PRIOR)
     ratio = found.noise.sigma_distance_m_per_sqrt_m / as_told.noise.sigma_distance_m_per_sqrt_m
     assert ratio == pytest.approx(50.0, rel=0.15)
     (sigma,) = [each for each in found.fitted.parameters if each.name == "sigma_distance_m_per_sqrt_m"]
@@ -136,6 +143,34 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
     assert sigma.low is not None
     assert sigma.high is not None
     assert sigma.low < sigma.value < sigma.high
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 0.02])
+def test_stamps_that_jitter_are_told_from_what_all_tags_of_a_picture_show(
+    maps: list[LocalMap], jitter_s: float
+) -> None:
+    """Tags of one picture err alike, so that more is left over than of as many errors of each reading's own."""
+    rng = np.random.default_rng(2)
+    late = []
+    for each in maps:
+        readings = each.chain.readings
+        error_s = jitter_s * rng.standard_normal(len(each.chain.stamps_ns))[readings.keyframe, None]
+        value = readings.value + error_s * readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+        chain = replace(each.chain, readings=replace(readings, value=value)).with_position_noise((STAMP_NOISE,))
+        late.append(replace(solve_local_map(chain), is_noisy=True))
+    (sigma,) = [each for each in fit_noise(late, PRIOR).sigmas if each.name == STAMP_NOISE]
+    assert sigma.value == pytest.approx(jitter_s, abs=0.003)
+
+
+def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -> None:
+    """Else what a good estimate leaves would look like sigmas that are far too small."""
+    chain = maps[0].chain.with_position_noise((STAMP_NOISE,))
+    names = ("sigma_corner_px", STAMP_NOISE)
+    sigma = np.array([0.2, 0.5])
+    looker = Looker(noise_fit._part(solve_local_map(chain), chain, PRIOR, names))
+    variances = np.append(sigma**2, np.full(4, 0.05))
+    seen = looker.look(variances)
+    assert (seen.traces @ variances < 1.02 * seen.at_most).all()
 
 
 def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
@@ -153,8 +188,8 @@ def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) 
         value = readings.value + (root @ shared[..., None])[..., 0]
         biased.append(solve_local_map(replace(each.chain, readings=replace(readings, value=value))))
     good, bad = fit_and_weigh(maps, PRIOR), fit_and_weigh(biased, PRIOR)
-    assert good.fitted.shared_range < 0.03
-    assert bad.fitted.shared_range > 0.1
+    assert good.fitted.shared_range + good.fitted.pass_range < 0.03
+    assert bad.fitted.shared_range + bad.fitted.pass_range > 0.1
     for before, after in zip(biased, bad.maps, strict=True):
         spread = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
         assert np.median(spread) > 2.0

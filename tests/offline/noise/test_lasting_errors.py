@@ -1,0 +1,55 @@
+"""Errors that last, against the dense covariance of their process."""
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.noise.lasting_errors import LastingErrors
+
+
+@pytest.fixture
+def place() -> FloatArray:
+    """(N,) where readings were made along the way, series 0 and 1 in turns."""
+    return np.array([0.0, 0.1, 0.3, 0.35, 0.9, 1.0, 1.0, 2.5])
+
+
+@pytest.fixture
+def series() -> FloatArray:
+    return np.array([0, 1, 0, 0, 1, 1, 0, 1])
+
+
+@pytest.fixture
+def errors(place: FloatArray, series: FloatArray) -> LastingErrors:
+    order = np.lexsort((place, series))
+    kept = np.zeros(len(order))
+    goes_on = np.diff(series[order]) == 0
+    kept[1:][goes_on] = np.exp(-np.diff(place[order])[goes_on] / 0.4)
+    return LastingErrors(order, kept)
+
+
+@pytest.fixture
+def covariance(place: FloatArray, series: FloatArray) -> FloatArray:
+    """(N, N) by the kernel exp(-d / 0.4 m) within each series."""
+    apart = np.abs(place[:, None] - place)
+    return np.asarray(np.exp(-apart / 0.4) * (series[:, None] == series))
+
+
+def test_drawn_errors_have_the_covariance_of_the_process(errors: LastingErrors, covariance: FloatArray) -> None:
+    root = errors.drawn(np.eye(len(covariance)))
+    np.testing.assert_allclose(root @ root.T, covariance, atol=1e-12)
+
+
+def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
+    rows = np.random.default_rng(0).standard_normal((len(covariance), 3))
+    squares = (errors.projected(rows) ** 2).sum(axis=0)
+    np.testing.assert_allclose(squares, np.einsum("in,ij,jn->n", rows, covariance, rows))
+
+
+def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: FloatArray) -> None:
+    np.testing.assert_allclose(errors.alike(), covariance.sum(axis=1))
+
+
+def test_without_readings_there_is_nothing() -> None:
+    none = LastingErrors(np.zeros(0, dtype=np.int64), np.zeros(0))
+    assert none.drawn(np.zeros((0, 8))).shape == (0, 8)
+    assert none.alike().shape == (0,)
