@@ -46,6 +46,7 @@ from groundsbot.offline.measurements.run import Run
 JITTER_S: Final = 0.01
 _GAP_S: Final = 10.0  # what is farther apart shares nothing
 _STEP_S: Final = 0.05  # over which speeds are taken
+_ROUNDING_NS: Final = 2000
 # A robot's numbers: scale and ratio of its wheels, turns, mount x, y and yaw, time offset, range offset.
 _N_ROBOT: Final = 8
 
@@ -79,7 +80,13 @@ def shape_bound_m(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) ->
     """
     told: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
     places = {(tag["family"], tag["tag_id"]): np.array(tag["position_m"][:2]) for tag in told["tags"]}
-    seen = sorted({(run.tags[t].family, run.tags[t].tag_id) for run in runs for t in _tags_of(run)[1].tolist()})
+    seen = sorted(
+        {
+            (run.tags[t].family, run.tags[t].tag_id)
+            for run in runs
+            for t in _true_readings(run, told["runs"][run.name])[1].tolist()
+        }
+    )
     index = {key: i for i, key in enumerate(seen)}
     tags_m = np.array([places[key] for key in seen])
     drives = [_drive(run, told["runs"][run.name], index) for run in runs]
@@ -152,10 +159,21 @@ def _tags_of(run: Run) -> tuple[IntArray, IntArray]:
     return readings.stamps_ns[order], readings.tag[order]
 
 
+def _true_readings(run: Run, true: dict[str, Any]) -> tuple[IntArray, IntArray]:
+    """The same without those that are of another tag or another place than they say."""
+    stamps_ns, tag = _tags_of(run)
+    right = np.ones(len(tag), dtype=np.bool_)
+    late_ns = round(1e9 * run.robot.time_offset_s)
+    for each in true.get("outliers", ()):
+        same_id = np.array([run.tags[t].tag_id == each["tag_id"] for t in tag.tolist()])
+        right &= ~(same_id & (np.abs(stamps_ns + late_ns - int(each["stamp_ns"])) <= _ROUNDING_NS))
+    return stamps_ns[right], tag[right]
+
+
 def _drive(run: Run, true: dict[str, Any], index: dict[tuple[str, int], int]) -> _Drive:
     stamped = np.array(true["poses"])
     true_ns, true_poses = np.array([int(each[0]) for each in true["poses"]]), stamped[:, 1:]
-    stamps_ns, tag = _tags_of(run)
+    stamps_ns, tag = _true_readings(run, true)
     looks_ns, look = np.unique(stamps_ns, return_inverse=True)
     start_ns = int(true_ns[0])
     driven_s = 1e-9 * (true_ns - start_ns)
