@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from groundsbot.calib.errors import CalibError
@@ -174,10 +174,13 @@ class Robot(_Section):
     time_offset_s_sigma: Positive = 0.002
     edge_shift_px: Finite = 0.0
     edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
+    # Logs hold copies of robot.yaml, older ones by names from when only imported readings had such an offset.
+    range_offset_m: Finite = Field(0.0, validation_alias=AliasChoices("range_offset_m", "imported_range_offset_m"))
+    range_offset_m_sigma: NotNegative = Field(
+        0.0, validation_alias=AliasChoices("range_offset_m_sigma", "imported_range_offset_m_sigma")
+    )
     tags: list[TagBatch] = []
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
-    imported_range_offset_m: Finite = 0.0
-    imported_range_offset_m_sigma: NotNegative = 0.0
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
 

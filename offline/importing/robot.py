@@ -196,7 +196,7 @@ def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> d
         },
         "mount": known.mount.model_dump() if known.mount is not None else {},
         "time_offset_s_sigma": UNKNOWN_TIME_OFFSET_SIGMA_S,
-        "imported_range_offset_m_sigma": UNKNOWN_RANGE_OFFSET_SIGMA_M,
+        "range_offset_m_sigma": UNKNOWN_RANGE_OFFSET_SIGMA_M,
         "imported_tag_scale_sigma": known.range_scale_sigma,
     }
     bare["wheels"]["track_m_sigma"] = UNKNOWN_TRACK_SIGMA * bare["wheels"]["track_m"]

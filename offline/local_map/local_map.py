@@ -18,6 +18,8 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chained, se2
 from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fitted_windows
 from groundsbot.offline.measurements import (
+    POSITION_NOISE,
+    STAMP_NOISE,
     Chain,
     TagKey,
     coarse_keyframes,
@@ -68,6 +70,7 @@ class LocalMap:
     goodness: Goodness
     is_noisy: bool = False  # its windows show far more noise than was told: that comes first, what does not fit after
     whole: Chain | None = None  # with readings that nothing confirms, where these were left out of a noisy one
+    n_misread: int = 0  # readings that were left out of it since they are of another tag, or of none
     is_doubtful: bool = False  # it does not fit even under the noise that was fitted to it: no tag of it is named
 
     @property
@@ -99,9 +102,7 @@ class _BuiltUp(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(
-    chain: Chain, effort: Effort | None = None, other_starts: int | None = None, *, noise_is_open: bool = False
-) -> LocalMap:
+def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open: bool = False) -> LocalMap:
     """Solves the whole chain from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
@@ -110,7 +111,6 @@ def solve_local_map(
     Args:
         chain: what was measured.
         effort: what the stretch is worth; the whole log's where None.
-        other_starts: how many may be tried; eight where None.
         noise_is_open: the noise that the chain is under is a first guess, to be fitted later. Where its windows show
             far more, it is taken for unknown, as it always is for robots that nobody measured.
 
@@ -118,26 +118,18 @@ def solve_local_map(
         OfflineError: there are more readings than a log of this size can be worth.
     """
     effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    effort.check(build_graph([chain]).problem, chain.run.log, chain.name)
+    shown, check = _shown_noise(chain, effort, noise_is_open=noise_is_open)
+    chain, whole = shown.applied_to(chain)
+    far_larger = shown.is_far_larger
     graph = build_graph([chain])
-    effort.check(graph.problem, chain.run.log, chain.name)
     keyframes = coarse_keyframes(chain)
-    check = _Check(graph, effort)
-    noise_is_open = noise_is_open or chain.run.robot.is_left_open
-    factors = check.noise_factors if chain.run.robot.is_left_open else check.usual_noise_factors
-    far_larger = noise_is_open and max(factors) > _FAR_LARGER
-    whole = None
-    if far_larger:
-        whole = chain.with_unknown_noise() if factors[1] * chain.readings.corner_sigma_px > _MOST_CORNER_PX else chain
-        chain = confirmed(whole)
-        graph = build_graph([chain])
-        check = _Check(graph, effort)
     coarse = coarsened(chain, keyframes)
     known = _built_up(_as_shown(coarse, check.noise_factors) if far_larger else coarse, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
-    most = _OTHER_STARTS if other_starts is None else other_starts
-    for n_others in range(1 + most):
+    for n_others in range(1 + _OTHER_STARTS):
         poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
@@ -149,13 +141,71 @@ def solve_local_map(
             if best.goodness.fits:
                 break
         is_spent = effort.left < _BUILDING_SHARE * effort.allowed
-        if n_others == most or is_spent or (far_larger and n_in_vain >= _MOST_IN_VAIN):
+        if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MOST_IN_VAIN):
             break
         known = _built_up(_redrawn(_as_shown(coarse, check.noise_factors), rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
-    return best
+    return _with_edges_at_solved_ranges(best, effort) if far_larger else best
+
+
+def _with_edges_at_solved_ranges(local_map: LocalMap, effort: Effort) -> LocalMap:
+    """The map of noisy ranges solved again, with what depends on ranges taken at those of the map."""
+
+    def changed(chain: Chain) -> Chain:
+        graph = build_graph([chain])
+        state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
+        return replace(chain, readings=chain.readings.with_edges_at(graph.problem.readings.ranges_m(state)))
+
+    chain = changed(local_map.chain)
+    if not chain.readings.from_corners.any():
+        return local_map
+    graph = build_graph([chain])
+    start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
+    solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    graph.problem.arrowhead.without_scratch()
+    whole = local_map.whole
+    return replace(local_map, chain=chain, graph=graph, solution=solution, whole=whole and changed(whole))
+
+
+class ShownNoise(NamedTuple):
+    """What the windows of a chain show of its noise.
+
+    Attributes:
+        is_far_larger: far larger than was told, so that it is taken for unknown.
+        factors: of wheels and readings, as multiples of what was told.
+        added: names of the noise of positions that corners err by besides.
+    """
+
+    is_far_larger: bool
+    factors: tuple[float, float]
+    added: tuple[str, ...]
+
+    def applied_to(self, chain: Chain) -> tuple[Chain, Chain | None]:
+        """The chain to solve and, where its noise is unknown, the one with readings that nothing confirms."""
+        if not self.is_far_larger:
+            return chain, None
+        whole = chain.with_position_noise(self.added)
+        return confirmed(whole), whole
+
+
+def shown_noise(chain: Chain) -> ShownNoise:
+    """What the windows show, where the noise that the chain is under is a first guess."""
+    effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    return _shown_noise(chain, effort, noise_is_open=True)[0]
+
+
+def first_solution(chain: Chain, shown: ShownNoise) -> tuple[Graph, Solution]:
+    """The chain solved once from where building up leads, whether it fits together or not."""
+    effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    chain, _ = shown.applied_to(chain)
+    graph, keyframes = build_graph([chain]), coarse_keyframes(chain)
+    coarse = coarsened(chain, keyframes)
+    known = _built_up(_as_shown(coarse, shown.factors) if shown.is_far_larger else coarse, effort)
+    poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
+    start = graph.start(poses, known.tags, known.calibration)
+    return graph, solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
 
 
 def judged(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
@@ -166,6 +216,23 @@ def judged(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
     found = replace(local_map, goodness=check.judge(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
+
+
+def _shown_noise(chain: Chain, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
+    """What the windows show, and the check of solutions of the chain that `ShownNoise.applied_to` returns."""
+    is_left_open = chain.run.robot.is_left_open
+    noise_is_open = noise_is_open or is_left_open
+    likely = confirmed(chain) if is_left_open else chain
+    check = _Check(build_graph([likely]), effort)
+    factors = check.noise_factors if is_left_open else check.usual_noise_factors
+    is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
+    is_beyond_pixels = factors[1] * chain.readings.corner_sigma_px > _MOST_CORNER_PX
+    shown = ShownNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
+    applied, whole = shown.applied_to(chain)
+    if likely is not chain if whole is None else whole.readings is not chain.readings:
+        check = _Check(build_graph([applied]), effort)
+        shown = shown._replace(factors=check.noise_factors)
+    return shown, check
 
 
 class _Check:

@@ -4,11 +4,18 @@ from .covariance_components import CovarianceParts
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, ChainOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.stretches import wheel_distances
-from .passes import FEW_READINGS, GAP_M, cells_of, confirmed, passes_of
+from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, confirmed, passes_of
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
 from .sensor_model.readings import Readings
-from .sensor_model.sensor_model import MAX_RANGE_M, SAME_SIZE_M, STAMP_NOISE, read_detections, read_positions
+from .sensor_model.sensor_model import (
+    MAX_RANGE_M,
+    POSITION_NOISE,
+    SAME_SIZE_M,
+    STAMP_NOISE,
+    read_detections,
+    read_positions,
+)
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
@@ -19,7 +26,9 @@ __all__ = [
     "GAP_M",
     "GAP_NS",
     "MAX_RANGE_M",
+    "MOST_MISREAD",
     "ODOMETRY_NOISE",
+    "POSITION_NOISE",
     "REACH_M",
     "SAME_SIZE_M",
     "STAMP_NOISE",

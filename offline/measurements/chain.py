@@ -85,9 +85,9 @@ class Chain:
         """The same measurements under other noise."""
         return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
 
-    def with_unknown_noise(self) -> "Chain":
-        """The same measurements with readings of which no more is known than of any sensor's."""
-        return replace(self, readings=with_position_noise(self.readings))
+    def with_position_noise(self, names: tuple[str, ...]) -> "Chain":
+        """The same measurements with readings of corners that err besides by some of `POSITION_NOISE`."""
+        return replace(self, readings=with_position_noise(self.readings, names))
 
 
 def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:

@@ -71,7 +71,7 @@ def parameters_of_camera(robot: Robot) -> list[Parameter]:
     return [
         *(Parameter(robot.robot_id, *each) for each in zip(of_mount_and_time, [nominal] * 3, sigmas, strict=True)),
         Parameter(robot.robot_id, of_edges, (robot.edge_shift_px,), robot.edge_shift_px_sigma),
-        Parameter(robot.robot_id, of_range, (robot.imported_range_offset_m,), robot.imported_range_offset_m_sigma),
+        Parameter(robot.robot_id, of_range, (robot.range_offset_m,), robot.range_offset_m_sigma),
     ]
 
 

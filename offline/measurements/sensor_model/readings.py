@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.robot import CAMERA_PARAMETERS, NoiseParameters
+from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
 from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenated
 
 
@@ -77,6 +77,18 @@ class Readings:
             self.corner_bias_px[mask],
             self.corner_sigmas[mask],
         )
+
+    def with_edges_at(self, range_m: FloatArray) -> "Readings":
+        """The same with what a shift of the tags' edges does taken at other ranges (M,) than those that were read.
+
+        It grows with the square of the range. Taken at a range that errs by much, it goes along with the error, and a
+        shift would be found that is none.
+        """
+        of_corners = self.from_corners & self.polar
+        share = np.where(of_corners, range_m / np.where(of_corners, self.value[:, 0], 1.0), 1.0)
+        by_camera = self.by_camera.copy()
+        by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= share**2
+        return replace(self, by_camera=by_camera)
 
     def weighed(self, noise: NoiseParameters) -> "Readings":
         """The same readings under other noise."""

@@ -88,7 +88,7 @@ def read_detections(
     readings = Readings(
         keyframe=keyframe[good],
         tag=tag[good],
-        value=np.stack([kept.range_bearing[:, 0], bearing_rad], axis=-1),
+        value=np.stack([kept.range_bearing[:, 0] - run.robot.range_offset_m, bearing_rad], axis=-1),
         covariance=kept.covariance + by_floor,
         parts=_corner_parts(kept, noise.sigma_corner_px, sigmas_px[good], by_floor),
         by_camera=_by_camera(run.robot, kept, twist[keyframe[good]]),
@@ -218,7 +218,7 @@ def read_positions(
     return readings.where(good), [left_out]
 
 
-def with_position_noise(readings: Readings) -> Readings:
+def with_position_noise(readings: Readings, names: tuple[str, ...] = POSITION_NOISE) -> Readings:
     """Readings of corners that besides err as positions do of which no covariance is given, by the default noise.
 
     Where a drive shows that corners err by far more than pixels explain, as when stamps jitter or a tag's range is read
@@ -229,8 +229,9 @@ def with_position_noise(readings: Readings) -> Readings:
         return readings
     unknown = np.full_like(readings.covariance, 0.0)
     more = _position_parts(readings.value[:, 0], which, unknown, readings.by_camera[..., _BY_TIME])
-    names = tuple(dict.fromkeys(readings.parts.names + more.names))
-    parts = CovarianceParts(names, readings.parts.of(names) + more.of(names), readings.parts.rest)
+    more = CovarianceParts(names, more.of(names), more.rest)
+    both = tuple(dict.fromkeys(readings.parts.names + names))
+    parts = CovarianceParts(both, readings.parts.of(both) + more.of(both), readings.parts.rest)
     return replace(readings, covariance=readings.covariance + more.under(NoiseParameters()), parts=parts)
 
 
@@ -254,8 +255,8 @@ def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArra
     rates = _rates(np.array([robot.mount.x_m, robot.mount.y_m]) + apart_m, twist)
     by_time = _by_place(apart_m, np.ones(len(range_m), dtype=np.bool_), rates)
     by_turn = found.by_turn @ _mount_axes(robot).T
-    none = np.zeros_like(by_time)  # an offset of ranges belongs to imported positions
-    return np.concatenate([by_turn, np.stack([by_time, found.by_edge, none], axis=-1)], axis=-1)
+    by_offset = np.column_stack([np.full(len(range_m), -1.0), np.zeros(len(range_m))])
+    return np.concatenate([by_turn, np.stack([by_time, found.by_edge, by_offset], axis=-1)], axis=-1)
 
 
 def _by_sensor(
@@ -299,10 +300,10 @@ def _by_place(in_sensor_m: FloatArray, polar: BoolArray, moved: FloatArray) -> F
 
 def _with_right_ranges(robot: Robot, positions: Positions) -> Positions:
     """Positions with ranges as they are, where robot.yaml says how the sensor reads them."""
-    if not robot.imported_range_offset_m:
+    if not robot.range_offset_m:
         return positions
     range_m = np.where(positions.polar, positions.value[:, 0], np.hypot(*positions.value.T))
-    shorter = 1.0 - robot.imported_range_offset_m / np.maximum(range_m, 1e-6)
+    shorter = 1.0 - robot.range_offset_m / np.maximum(range_m, 1e-6)
     times = np.where(positions.polar[:, None], np.stack([shorter, np.ones_like(shorter)], axis=-1), shorter[:, None])
     return replace(positions, value=positions.value * times)
 

@@ -4,7 +4,7 @@ Each class gives whitened residuals (M, n) and Jacobian blocks: pairs of columns
 derivatives (M, n, k). A column of -1 marks something that is held and has no column.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -175,6 +175,16 @@ class ReadingFactors:
                 (columns.calibration[self.camera_parameters], -self.whitening @ self.by_camera),
             ),
         )
+
+    def taken_for(self, reading: int, tags: IntArray) -> "ReadingFactors":
+        """One of the readings, once for each of some tags (K,), as if it were of that tag."""
+        columns = {each.name: getattr(self, each.name)[np.full(len(tags), reading)] for each in fields(self)}
+        return ReadingFactors(**{**columns, "tag": tags})
+
+    def ranges_m(self, state: State) -> FloatArray:
+        """(M,) from the sensor to the tag by a state, where tags are as large as is told."""
+        _, in_sensor, _ = self._places(state)
+        return np.asarray(np.hypot(in_sensor[:, 0], in_sensor[:, 1]))
 
     def places_in_map(self, state: State) -> FloatArray:
         """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""

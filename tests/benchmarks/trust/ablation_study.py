@@ -66,7 +66,7 @@ def _as_measured(run: Run) -> Run:
         return run
     wheels = robot.wheels.model_copy(update={"track_m_sigma": 0.01 * robot.wheels.track_m})
     mount = robot.mount.model_copy(update={"x_m_sigma": 0.005, "y_m_sigma": 0.005, "yaw_rad_sigma": 0.0087})
-    numbers = {"time_offset_s_sigma": 0.001, "imported_range_offset_m_sigma": 0.0, "imported_tag_scale_sigma": 0.02}
+    numbers = {"time_offset_s_sigma": 0.001, "range_offset_m_sigma": 0.0, "imported_tag_scale_sigma": 0.02}
     return replace(run, robot=robot.model_copy(update={"wheels": wheels, "mount": mount, **numbers}))
 
 

@@ -185,7 +185,7 @@ def test_a_bag_leaves_open_what_it_does_not_tell(tmp_path: Path, position_log: P
     """tf tells of the mount; neither clocks nor wheels nor who measured ranges are in a bag."""
     bag = BagOfLog.of(position_log).mount().odometry().isaac_poses().write(tmp_path / "drive")
     robot = load_run(imported(bag, tmp_path, replace(OPTIONS, track_width_m=None), BagOptions()).run_folder).robot
-    assert (robot.time_offset_s_sigma, robot.imported_range_offset_m_sigma) == (0.3, 0.1)
+    assert (robot.time_offset_s_sigma, robot.range_offset_m_sigma) == (0.3, 0.1)
     assert robot.wheels.track_m_sigma == pytest.approx(0.3 * robot.wheels.track_m)
     assert (robot.wheels.radii_scale_sigma, robot.wheels.radii_ratio_sigma) == (0.01, 0.02)
     assert robot.mount.x_m_sigma < 0.01

@@ -230,7 +230,7 @@ def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
     """A mount, a clock, a track and offsets of ranges: unlike the defaults, which a person's own robot.yaml has."""
     robot = parse_robot_yaml(run_of(imported(tmp_path).run_folder).robot_yaml, "log")
     assert (robot.time_offset_s, robot.time_offset_s_sigma) == (0.0, 0.3)
-    assert (robot.imported_range_offset_m, robot.imported_range_offset_m_sigma) == (0.0, 0.1)
+    assert (robot.range_offset_m, robot.range_offset_m_sigma) == (0.0, 0.1)
     assert (robot.mount.x_m_sigma, robot.mount.y_m_sigma) == (0.5, 0.5)
     assert robot.mount.yaw_rad_sigma == pytest.approx(radians(8))
     assert robot.wheels.track_m == 0.5
@@ -259,7 +259,7 @@ def test_who_vouches_for_the_metre_depends_on_the_form(
 def test_a_robot_yaml_that_is_given_keeps_its_sigmas(tmp_path: Path) -> None:
     options = ImportOptions(robot=robot_yaml_in(tmp_path))
     robot = parse_robot_yaml(run_of(imported(tmp_path, options=options).run_folder).robot_yaml, "log")
-    assert (robot.time_offset_s_sigma, robot.imported_range_offset_m_sigma) == (0.001, 0.0)
+    assert (robot.time_offset_s_sigma, robot.range_offset_m_sigma) == (0.001, 0.0)
     assert robot.wheels.track_m_sigma == pytest.approx(0.004)
     assert (robot.wheels.radii_scale_sigma, robot.imported_tag_scale_sigma) == (None, 0.005)
 

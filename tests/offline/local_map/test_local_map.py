@@ -2,19 +2,23 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
 from groundsbot.offline.local_map import local_map
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.coarse_chain import coarse_keyframes, coarsened, refined
+from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.convergence_study import is_right, missed_bounds, study_seed
 from tests.support.data.long_drives import made_long_drive
 
@@ -123,3 +127,24 @@ def test_number_of_pieces_grows_with_the_logarithm_of_a_long_way() -> None:
     short, long = (len(local_map._pieces(made_long_drive(2, length_m).chain)) for length_m in (1000.0, 4000.0))
     assert 80 <= short <= 101
     assert long - short < 150
+
+
+def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> None:
+    """What a shift of edges does grows with the square of the range: at one that was read it errs with the reading."""
+    rng = np.random.default_rng(0)
+    found = []
+    for log in find_logs([room]):
+        run = load_run(log)
+        wheels = run.robot.wheels.model_copy(update={"track_m_sigma": 0.2})
+        robot = run.robot.model_copy(update={"wheels": wheels, "edge_shift_px_sigma": 1.0})
+        (chain,) = chains_of(replace(run, robot=robot), NoiseParameters())
+        readings = chain.readings
+        times = 1.0 + 0.1 * rng.standard_normal(len(readings))
+        value, by_camera = readings.value.copy(), readings.by_camera.copy()
+        value[:, 0] *= times
+        by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= times**2
+        chain = replace(chain, readings=replace(readings, value=value, by_camera=by_camera))
+        solved = solve_local_map(chain, noise_is_open=True)
+        assert solved.is_noisy
+        found += [value for parameter, value in solved.calibration.items() if parameter.name == EDGE_SHIFT]
+    assert np.abs(found).max() < 0.6

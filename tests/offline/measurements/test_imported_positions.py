@@ -116,7 +116,7 @@ def test_a_late_stamp_shows_what_is_seen_farther_along_the_drive(
 @frames
 def test_a_range_offset_is_taken_off_and_its_derivative_is_that(polar: bool, in_camera: bool) -> None:
     value = seen_from(np.zeros(3), polar=polar, in_camera=in_camera)
-    shorter = ROBOT.model_copy(update={"imported_range_offset_m": 0.125})
+    shorter = ROBOT.model_copy(update={"range_offset_m": 0.125})
     plain = read_one(value, polar=polar, in_camera=in_camera)
     less = read_one(value, polar=polar, in_camera=in_camera, robot=shorter)
     change = (less.value - plain.value)[0]

@@ -45,20 +45,22 @@ def corners_of(tag: MadeTag) -> FloatArray:
     return corners
 
 
-def run_of(tags: list[MadeTag]) -> Run:
-    return made_run([STILL.track], robot=ROBOT, tags=[TagKey(FAMILY, tag.tag_id) for tag in tags])
+def run_of(tags: list[MadeTag], robot: Robot = ROBOT) -> Run:
+    return made_run([STILL.track], robot=robot, tags=[TagKey(FAMILY, tag.tag_id) for tag in tags])
 
 
 def detections_of(corners_px: FloatArray, tag: list[int]) -> Detections:
     return Detections(np.arange(len(tag), dtype=np.int64), np.array(tag, dtype=np.int64), corners_px)
 
 
-def read_many(tags: list[MadeTag], n: int = 40, sigma_px: float = 0.2, seed: int = 1) -> tuple[Readings, list[str]]:
+def read_many(
+    tags: list[MadeTag], n: int = 40, sigma_px: float = 0.2, seed: int = 1, robot: Robot = ROBOT
+) -> tuple[Readings, list[str]]:
     """Each tag from n keyframes."""
     noise = sigma_px * np.random.default_rng(seed).standard_normal((len(tags), n, 4, 2))
     corners_px = np.array([corners_of(tag) for tag in tags])[:, None] + noise
     detections = detections_of(corners_px.reshape(-1, 4, 2), np.repeat(np.arange(len(tags)), n).tolist())
-    return read_detections(run_of(tags), detections, np.tile(np.arange(n), len(tags)), NO_TWIST, NOISE)
+    return read_detections(run_of(tags, robot), detections, np.tile(np.arange(n), len(tags)), NO_TWIST, NOISE)
 
 
 def in_camera(tag: MadeTag) -> FloatArray:
@@ -328,7 +330,9 @@ def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) 
     np.testing.assert_allclose(by_edge[1], by_hand[1], atol=1e-6 if tag is UPRIGHT[0] else 1e-3)
 
 
-def test_an_offset_of_imported_ranges_is_nothing_to_corners() -> None:
+def test_an_offset_of_ranges_is_taken_off_and_its_derivative_is_that() -> None:
     readings, _ = read_many(UPRIGHT, n=1)
     assert readings.by_camera.shape == (5, 2, len(CAMERA_PARAMETERS))
-    assert not readings.by_camera[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)].any()
+    np.testing.assert_array_equal(readings.by_camera[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)], [[-1.0, 0.0]] * 5)
+    shorter, _ = read_many(UPRIGHT, n=1, robot=ROBOT.model_copy(update={"range_offset_m": 0.125}))
+    np.testing.assert_allclose(shorter.value - readings.value, [[-0.125, 0.0]] * 5, atol=1e-12)

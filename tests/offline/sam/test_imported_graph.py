@@ -29,7 +29,7 @@ DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.5, 4.0)])
 TAGS_M = np.array([[4.0, 2.0], [3.5, 5.0], [1.5, 4.0]])
 SIGMAS: Final[dict[str, object]] = {
     "time_offset_s_sigma": 0.3,
-    "imported_range_offset_m_sigma": 0.07,
+    "range_offset_m_sigma": 0.07,
     "imported_tag_scale_sigma": 0.02,
 }
 ROBOT = made_robot("carl", camera=None, tags=[], **SIGMAS)
