@@ -23,7 +23,7 @@ from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_t
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
 from groundsbot.offline.mapping.workings import Workings
-from groundsbot.offline.maps import CalibrationChoice, MapResult
+from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import (
     Chain,
     Measurements,
@@ -37,9 +37,10 @@ from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, t
 from groundsbot.offline.self_calibration import (
     TIMES_MAPPED,
     Calibrate,
-    TimeOffsetSearch,
+    Freed,
     about_the_files,
     free_what_is_told,
+    put_right,
     start_left_open,
     verdicts,
 )
@@ -89,7 +90,9 @@ def build_map(
     workings = workings or Workings()
     workings.runs += runs
     given = runs
-    runs, chains, choices, searches = _calibrated(runs, noise or prior_noise, stages, calibrate, corners=corners)
+    (runs, choices, put_in, searches), chains = _calibrated(
+        runs, noise or prior_noise, stages, calibrate, corners=corners
+    )
     workings.searches |= searches
     measurements = _measurements(tape, runs, chains, extending)
     known = _known_maps(extending, stages)
@@ -113,7 +116,7 @@ def build_map(
     found.measured += unused(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
-    calibration = about_the_files(found.calibration, choices)
+    calibration = about_the_files(found.calibration, put_in)
     return MapResult(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged) + joined,
@@ -137,16 +140,18 @@ def build_map(
 
 def _calibrated(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
-) -> tuple[Sequence[Run], list[Chain], tuple[CalibrationChoice, ...], dict[str, TimeOffsetSearch]]:
-    """The runs as their robots are to be taken, their stretches, what was freed, and searches for time offsets."""
+) -> tuple[Freed, list[Chain]]:
+    """The runs as their robots are to be taken, and their stretches."""
     with stages.stage("start values of robots"):
         runs, started, searches = start_left_open(runs, noise)
-    choices: tuple[CalibrationChoice, ...] = ()
+    found = Freed(runs, started, put_right(started), searches)
     if calibrate.is_on:
         with stages.stage("self-calibration"):
-            runs, choices, more = free_what_is_told(runs, noise, calibrate.names, corners=corners)
-        searches |= more
-    return runs, _chains(runs, noise, stages), (*started, *choices), searches
+            freed = free_what_is_told(runs, noise, calibrate.names, corners=corners)
+        found = Freed(
+            freed.runs, (*started, *freed.choices), found.put_in | freed.put_in, found.searches | freed.searches
+        )
+    return found, _chains(found.runs, noise, stages)
 
 
 def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:

@@ -9,12 +9,13 @@ told of it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.robot import FOCAL_SCALE, NoiseParameters, Robot
+from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fitted_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
@@ -29,8 +30,9 @@ _FEWEST: Final = 2  # of a short one
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.2
 
-# What a calibration of the camera with a board is good for, where robot.yaml does not say how good its focal length is.
-_FOCAL_SIGMA: Final = 1e-3
+# Where robot.yaml does not say how good a number is: what a calibration of the camera with a board is good for, and
+# what tags' prints lie before or behind the places they stand for.
+_SIGMAS_NOT_GIVEN: Final[Mapping[str, float]] = MappingProxyType({FOCAL_SCALE: 1e-3, RANGE_OFFSET: 0.002})
 
 
 class _Stretch(NamedTuple):
@@ -63,7 +65,7 @@ def told_by(
     for each, effort in zip(maps, efforts, strict=True):
         robot = robots[each.chain.run.name]
         given = build_graph([replace(each.chain, run=replace(each.chain.run, robot=robot))])
-        priors |= {parameter[:3]: parameter for parameter in given.parameters}
+        priors |= {parameter[:3]: _as_given(parameter, robot) for parameter in given.parameters}
         chain = _under_own_noise(each, noise, effort)
         for first, end in _cuts(chain):
             stretch = _told_by_stretch(chain, each, first, end, effort, corners=corners)
@@ -81,10 +83,11 @@ def told_by(
 
 
 def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
-    """One that only corners depend on, with the sigma that the robot's file gives it: here a focal length is open."""
-    if parameter.name != FOCAL_SCALE:
+    """One that a map holds unless the file leaves it open, with the sigma that it has where it is asked for."""
+    given = {FOCAL_SCALE: robot.focal_scale_sigma, RANGE_OFFSET: robot.range_offset_m_sigma}
+    if parameter.name not in given:
         return parameter
-    return parameter._replace(sigma=robot.focal_scale_sigma or _FOCAL_SIGMA)
+    return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
 def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:

@@ -20,6 +20,7 @@ NAMES: Final = (
     "mount_yaw_rad",
     "time_offset_s",
     "edge_shift_px",
+    "range_offset_m",
     "focal_scale",
 )
 

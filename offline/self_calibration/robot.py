@@ -9,6 +9,7 @@ from groundsbot.calib.robot import (
     FOCAL_SCALE,
     IMPORTED_BATCH,
     MOUNT_PARAMETERS,
+    RANGE_OFFSET,
     TAG_SCALE,
     TIME_OFFSET,
     WHEEL_PARAMETERS,
@@ -33,6 +34,7 @@ OPEN_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
         "mount_y_m": 0.5,
         TIME_OFFSET: 0.3,
         EDGE_SHIFT: 1.0,
+        RANGE_OFFSET: 0.1,
         TAG_SCALE: 0.15,  # measured over the white margin a tag of ten cells is 25 % too large
         FOCAL_SCALE: 0.05,
     }
@@ -77,6 +79,7 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
             "mount": mount.model_copy(update=of_mount),
             "time_offset_s_sigma": sigma(TIME_OFFSET) or robot.time_offset_s_sigma,
             "edge_shift_px_sigma": sigma(EDGE_SHIFT) or robot.edge_shift_px_sigma,
+            "range_offset_m_sigma": sigma(RANGE_OFFSET) or robot.range_offset_m_sigma,
             "focal_scale_sigma": sigma(FOCAL_SCALE) or robot.focal_scale_sigma,
             "tags": [_opened_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
             "imported_tag_scale_sigma": next(
@@ -89,7 +92,7 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
 
 def as_if_unknown(robot: Robot) -> Robot:
     """The robot as if nobody had measured what is off by far where it is off at all; the focal length is open too."""
-    own = {Owned(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, FOCAL_SCALE)}
+    own = {Owned(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
     batches = [*(_of_batch(batch) for batch in robot.tags), Owned(IMPORTED_BATCH, TAG_SCALE)]
     return opened(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
 
@@ -109,6 +112,8 @@ def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
         changed |= {"time_offset_s": robot.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
     if shift := of(EDGE_SHIFT):
         changed |= {"edge_shift_px": robot.edge_shift_px + shift.value, "edge_shift_px_sigma": shift.sigma}
+    if offset := of(RANGE_OFFSET):
+        changed |= {"range_offset_m": robot.range_offset_m + offset.value, "range_offset_m_sigma": offset.sigma}
     if focal := of(FOCAL_SCALE):
         changed |= {"focal_scale_sigma": focal.sigma}
     return robot.model_copy(update=changed)

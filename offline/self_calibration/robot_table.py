@@ -42,7 +42,7 @@ _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
         WHEEL_PARAMETERS[2]: lambda r: r.wheels.track_m,
         TIME_OFFSET: lambda r: r.time_offset_s,
         EDGE_SHIFT: lambda r: r.edge_shift_px,
-        RANGE_OFFSET: lambda r: r.imported_range_offset_m,
+        RANGE_OFFSET: lambda r: r.range_offset_m,
         FOCAL_SCALE: lambda _: 1.0,
         **{
             f"mount_{name}": lambda r, name=name: float(getattr(r.mount, name))  # type: ignore[misc]
@@ -58,7 +58,7 @@ WHAT: Final[Mapping[str, str]] = MappingProxyType(
         TAG_SCALE: "tag size (m)",
         TIME_OFFSET: "time_offset_s",
         EDGE_SHIFT: "edge_shift_px",
-        RANGE_OFFSET: "imported_range_offset_m",
+        RANGE_OFFSET: "range_offset_m",
         FOCAL_SCALE: "focal length, as a share",
     }
 )

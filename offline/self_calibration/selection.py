@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.calib.robot import TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
+from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
 from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, Owned
@@ -27,7 +27,7 @@ _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
 _BY_FAR: Final = 0.5
 # A number that drives know worse than robot.yaml claims to is freed only where it is off by so many times what is more
 # than chance: then the claim is wrong. Not those of which readings on the floor tell with a bias, as roll and pitch.
-_OFF_BY_ALL: Final = frozenset({*OFF_BY_FAR, TAG_SCALE})
+OFF_BY_ALL: Final = frozenset({*OFF_BY_FAR, RANGE_OFFSET, TAG_SCALE})
 _CERTAINLY: Final = 1.5
 DOUBTED: Final = "robot.yaml has another number wrong by far, so this one is not believed either"
 TELLS_LESS: Final = "the drives tell less of it than robot.yaml does"
@@ -79,14 +79,18 @@ def choose(
     candidates = [i for i, each in enumerate(told.parameters) if each.name in OPEN_SIGMAS]
     judge = _Judge(told, candidates, asked, late_s)
     by_far = [] if asked else judge.off_by_far()
-    while True:
-        able = {i: each for i in candidates if i not in judge.open and not (each := judge.look(i)).reason}
-        if not able:
-            break
-        judge.open.append(max(able, key=lambda i: _plausible(able[i])))
+    judge.open_what_contradicts()
+    if not asked and not by_far and judge.is_any_by_far():
+        by_far = judge.open_all()
+        judge.open_what_contradicts()
     found = {i: judge.look(i) for i in candidates}
     doubted = [i for i in judge.open if i in by_far and found[i].off_sigmas <= judge.at_least]
     return [_freed(each, DOUBTED if i in doubted else "") if i in judge.open else each for i, each in found.items()]
+
+
+def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
+    """Whether robots' files are not believed at all."""
+    return all(each.is_freed for each in choices if each.name in OFF_BY_FAR)
 
 
 class _Judge:
@@ -110,7 +114,7 @@ class _Judge:
         All that may be is open at first. What is off least is held by robot.yaml, and the others are judged anew, until
         all that are left are off by far. So where several explain the same, one is left.
         """
-        names, parameters = _OFF_BY_ALL, self._told.parameters
+        names, parameters = OFF_BY_ALL, self._told.parameters
         self.open = [i for i in self._candidates if parameters[i].name in names]
         while self.open:
             looked = {i: self.look(i) for i in self.open}
@@ -118,9 +122,26 @@ class _Judge:
             if not held:
                 break
             self.open.remove(min(held, key=lambda i: held[i].off_sigmas))
-        if any(parameters[i].name in OFF_BY_FAR for i in self.open):
-            self.open = [i for i in self._candidates if parameters[i].name in names]
-        return self.open.copy()
+        return self.open_all() if any(parameters[i].name in OFF_BY_FAR for i in self.open) else self.open.copy()
+
+    def open_all(self) -> list[int]:
+        """Opens what is not believed where anything is off by far, besides what is open."""
+        doubted = [i for i in self._candidates if self._told.parameters[i].name in OFF_BY_ALL]
+        self.open = [*doubted, *(i for i in self.open if i not in doubted)]
+        return doubted
+
+    def open_what_contradicts(self) -> None:
+        """Opens what contradicts robot.yaml, the worst first."""
+        while True:
+            able = {i: each for i in self._candidates if i not in self.open and not (each := self.look(i)).reason}
+            if not able:
+                return
+            self.open.append(max(able, key=lambda i: _plausible(able[i])))
+
+    def is_any_by_far(self) -> bool:
+        """Whether what is open is off by so much that robot.yaml cannot be meant."""
+        is_one = (self._told.parameters[i].name in OFF_BY_FAR for i in self.open)
+        return any(own and self._is_by_far(self.look(i)) for i, own in zip(self.open, is_one, strict=True))
 
     def _is_by_far(self, choice: CalibrationChoice) -> bool:
         values = [choice.value]
@@ -140,7 +161,7 @@ class _Judge:
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
         most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
         reason = ""
-        is_wrong = parameter.name in _OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
+        is_wrong = parameter.name in OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
         if parameter.name == TIME_OFFSET:  # passes of tags must say so too
             is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
         if whole.variance >= prior**2 and not is_wrong:

@@ -1,19 +1,27 @@
 """Robots and tags calibrated by their own drives, as far as these know better than robot.yaml."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 from groundsbot.calib.camera import CameraModel
-from groundsbot.calib.robot import FOCAL_SCALE, IMPORTED_BATCH, TAG_SCALE, TIME_OFFSET, NoiseParameters
+from groundsbot.calib.robot import (
+    FOCAL_SCALE,
+    IMPORTED_BATCH,
+    MOUNT_PARAMETERS,
+    RANGE_OFFSET,
+    TAG_SCALE,
+    TIME_OFFSET,
+    NoiseParameters,
+)
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
-from groundsbot.offline.measurements import Run, chains_of
+from groundsbot.offline.measurements import Run, chains_of, confirmed
 from groundsbot.offline.sam import efforts_of
 from groundsbot.offline.self_calibration.information import told_by
 from groundsbot.offline.self_calibration.left_open import by_robot
 from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, as_if_unknown, corrected, opened
-from groundsbot.offline.self_calibration.selection import choose
+from groundsbot.offline.self_calibration.selection import OFF_BY_ALL, choose, is_overruled
 from groundsbot.offline.self_calibration.start_values import estimated_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
@@ -21,17 +29,25 @@ from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSea
 # metres by then, and stamps on one clock; both are as good to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
 TIMES_MAPPED: Final = 2  # the runs are, where this comes before their map
-_ADDED: Final = frozenset({"mount_x_m", "mount_y_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad", TIME_OFFSET})
+_ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, RANGE_OFFSET})
 
 
 _NOTHING: Final = Learnt(0.0, 0.0)
 
 
 class Freed(NamedTuple):
-    """Runs with what was freed left open in their robots' files, why the rest was not, and searches by robot."""
+    """What became of robots' files.
+
+    Attributes:
+        runs: with what was freed left open in their files.
+        choices: what was freed, and why the rest was not.
+        put_in: corrections to the files that the runs have already.
+        searches: for time offsets, by robot.
+    """
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
+    put_in: dict[Owned, Learnt]
     searches: dict[str, TimeOffsetSearch]
 
 
@@ -50,20 +66,23 @@ def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collec
     """
     started, searches = _as_if_unknown(runs, noise)
     if not started:
-        return Freed(list(runs), (), {})
+        return Freed(list(runs), (), {}, {})
     opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
-    chains = [chain for run in opened_runs for chain in chains_of(run, noise)]
+    chains = [confirmed(chain) for run in opened_runs for chain in chains_of(run, noise)]
     efforts = efforts_of(chains, TIMES_MAPPED)
     maps = [
         solve_local_map(chain, effort, noise_is_open=True).without_factors()
         for chain, effort in zip(chains, efforts, strict=True)
     ]
     told = told_by(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
-    put_in = {owned: each.value for _, learnt in started for owned, each in learnt.items()}
+    starts = {owned: each for _, learnt in started for owned, each in learnt.items()}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
-    choices = choose(told.about(put_in), names, late_s)
+    choices = choose(told.about({owned: each.value for owned, each in starts.items()}), names, late_s)
     freed = {Owned(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
-    right = _put_right(choices)
+    right = put_right(choices)
+    if is_overruled(choices):
+        # What pieces of drives tell of a robot that is off by metres is of different minima; all of them have a say.
+        right = {owned: each for owned, each in right.items() if owned.name not in OFF_BY_ALL} | starts
     return Freed(
         [
             run
@@ -76,6 +95,7 @@ def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collec
             for run in runs
         ],
         tuple(choices),
+        right,
         searches,
     )
 
@@ -109,17 +129,17 @@ def refocused(camera: CameraModel | None, focal: Learnt | None) -> CameraModel |
 
 
 def about_the_files(
-    calibration: Sequence[CalibrationResult], choices: Sequence[CalibrationChoice]
+    calibration: Sequence[CalibrationResult], put_in: Mapping[Owned, Learnt]
 ) -> list[CalibrationResult]:
-    """Corrections to the files as they were given: what was put right before is part of them."""
-    right, found = _put_right(choices), []
+    """Corrections to the files as they were given: what was put in before is part of them."""
+    found = []
     for each in calibration:
-        before = right.get(Owned(each.owner, each.name), _NOTHING).value
+        before = put_in.get(Owned(each.owner, each.name), _NOTHING).value
         found.append(replace(each, value=_one_after_the_other(each.name, before, each.value)))
     return found
 
 
-def _put_right(choices: Sequence[CalibrationChoice]) -> dict[Owned, Learnt]:
+def put_right(choices: Sequence[CalibrationChoice]) -> dict[Owned, Learnt]:
     """What was put into robots' files before the map was made; of a number that was twice, both together."""
     right: dict[Owned, Learnt] = {}
     for each in choices:

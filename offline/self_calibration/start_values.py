@@ -13,8 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
-from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsened
+from groundsbot.offline.local_map import ShownNoise, first_solution, shown_noise
+from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsened, confirmed
+from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 
@@ -41,8 +42,9 @@ def estimated_start_values(runs: Sequence[Run], noise: NoiseParameters) -> Start
     found = dict.fromkeys(_SMALL, Learnt(0.0, 0.0))
     if searched is not None:
         found[TIME_OFFSET] = Learnt(searched.offset_s, searched.sigma_s)
+    shown: dict[str, ShownNoise] = {}
     for _ in range(_MOST_ROUNDS):
-        more = _estimated([with_start_values(run, found) for run in runs], noise)
+        more = _estimated([with_start_values(run, found) for run in runs], noise, shown)
         if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
             break
         found = {name: _together(name, each, more.get(name)) for name, each in found.items()}
@@ -63,27 +65,36 @@ def with_start_values(run: Run, learnt: dict[str, Learnt]) -> Run:
     return replace(run.retimed(late_s), robot=changed)
 
 
-def _estimated(runs: Sequence[Run], noise: NoiseParameters) -> dict[str, Learnt]:
-    """Time offset and track by each drive alone, the mean by their information."""
-    maps: list[LocalMap] = []
+def _estimated(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, ShownNoise]) -> dict[str, Learnt]:
+    """Time offset and track by each drive alone, the mean by their information.
+
+    Args:
+        runs: of one robot.
+        noise: where the noise begins.
+        shown: by chain, what windows show of it; what is missing is added.
+    """
+    solved: list[tuple[Graph, Solution]] = []
     for run in runs:
         for chain in chains_of(run, noise):
             if chain.tags and len(chain.stamps_ns) > 1:
-                coarse = coarsened(chain, coarse_keyframes(chain))
-                maps.append(solve_local_map(coarse, other_starts=0, noise_is_open=True))
+                likely = confirmed(chain)
+                coarse = coarsened(likely, coarse_keyframes(likely))
+                if chain.name not in shown:
+                    shown[chain.name] = shown_noise(coarse)
+                solved.append(first_solution(coarse, shown[chain.name]))
     found: dict[str, Learnt] = {}
     for name in _SMALL:
         values, informations = [], []
-        for each in maps:
+        for graph, solution in solved:
             for parameter, column, value in zip(
-                each.graph.parameters,
-                each.graph.problem.columns.calibration.tolist(),
-                each.solution.state.calibration.tolist(),
+                graph.parameters,
+                graph.problem.columns.calibration.tolist(),
+                solution.state.calibration.tolist(),
                 strict=True,
             ):
                 if parameter.name == name and column >= 0:
                     values.append(value)
-                    informations.append(1.0 / float(each.solution.covariance(np.array([column]))[0, 0]))
+                    informations.append(1.0 / float(solution.covariance(np.array([column]))[0, 0]))
         if values:
             found[name] = Learnt(float(np.average(values, weights=informations)), float(np.sum(informations) ** -0.5))
     return found

@@ -20,6 +20,7 @@ DRIVES: Final[Mapping[str, str]] = MappingProxyType(
         "mount_roll_rad": "pass tags that hang at different heights, near, and far to either side; add --model corners",
         "mount_pitch_rad": "drive towards tags from afar until they are near; add --model corners",
         "time_offset_s": "turn on the spot to and fro, fast, in view of tags",
+        "range_offset_m": "see the same tags from near and from afar",
         "edge_shift_px": "see the same tags from near and from afar; add --model corners",
         "focal_scale": "drive straight towards tags from afar until they are near; only --model corners tells it",
     }

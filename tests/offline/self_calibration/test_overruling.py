@@ -59,7 +59,9 @@ def test_all_is_found_that_is_off_by_far(result: MapResult, drives: Path) -> Non
         }
         for name, value in truth.items():
             number = found[robot, name]
-            assert abs(number.found - value) < 4.0 * number.sigma + 0.01, (robot, name, number, value)
+            # Who steers answers what the floor does: that looks like a camera farther ahead (docs/estimate.md).
+            beyond = 0.1 if name == "mount_x_m" else 0.01
+            assert abs(number.found - value) < 4.0 * number.sigma + beyond, (robot, name, number, value)
             assert number.verdict in (WRONG, NOT_BELIEVED)
             assert is_news(number)
     (size,) = [each for each in result.robot_numbers if each.name == "tag_scale"]

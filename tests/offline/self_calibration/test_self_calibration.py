@@ -30,7 +30,7 @@ from groundsbot.offline.self_calibration.information import told_by
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
 from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, corrected, opened
 from groundsbot.offline.self_calibration.robot_table import AGREES, ASKED, WRONG, verdict_lines
-from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose
+from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose, is_overruled
 from groundsbot.offline.self_calibration.words import DRIVES, refused_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
@@ -350,3 +350,16 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
     assert "Search for time offsets" in report
     off = run("map", log, "--calibrate", "none", "-o", tmp_path / "off")
     assert (off.code, off.err.startswith("error: --calibrate: 'none'")) == (1, True)
+
+
+def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_too() -> None:
+    """Stretches tell the sum of track and mount, and next to nothing of the one without the other."""
+    together, mount = np.array([1.0, 0.5]), np.array([0.0, 1.0])
+    ahead = [1.2, -0.9, 1.1, -1.0]
+    information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))
+    vector = np.array([each @ np.array([-0.45 - 0.5 * m, m]) for each, m in zip(information, ahead, strict=True)])
+    parameters = (Parameter("r", "track_scale", (), 0.01), Parameter("r", "mount_x_m", (), 0.005))
+    choices = choose(Told(parameters, information, vector))
+    assert is_overruled(choices)
+    mild = choose(Told(parameters, information, 0.2 * vector))
+    assert [each.is_freed for each in mild] == [True, False]
