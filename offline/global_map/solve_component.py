@@ -18,6 +18,7 @@ from groundsbot.offline.outliers import (
     Searched,
     joined,
     phantoms,
+    read_as_another,
     split_together,
     stray_passes,
     suspect_tags,
@@ -67,6 +68,10 @@ def solved_component(
             graph, solution = without_tags(searched.graph, searched.solution, gone)
     if keep_suspects and suspects:
         graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
+    if misread := read_as_another(graph, solution, [maps[m] for m in members.members]):
+        graph, solution = without_tags(graph, solution, misread)
+        ids = _listed({(tag.family, tag.tag_id) for tag in misread})
+        told = [*told, f"tags {ids} were read once each, where another tag is: taken for misread codes, not placed"]
     solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told))
     if not corners or not graph.has_corners:
         return solved

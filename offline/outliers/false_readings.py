@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import FEW_READINGS, passes_of
+from groundsbot.offline.measurements import FEW_READINGS, MOST_MISREAD, passes_of
 from groundsbot.offline.outliers.search import FALSE_ALARM
 from groundsbot.offline.sam import build_graph, solve
 
@@ -61,7 +61,8 @@ def _far_passes(local_map: LocalMap) -> BoolArray:
     is_placed = np.zeros(len(local_map.chain.tags), dtype=np.bool_)
     is_placed[tag_of[~is_few]] = True
     is_false = is_few & is_placed[tag_of] & (least > chi2.isf(FALSE_ALARM / max(int(is_few.sum()), 1), 2))
-    return np.asarray(is_false[pass_of])
+    # So many are the noise's, not misread.
+    return np.asarray(is_false[pass_of] & (is_false[pass_of].mean() <= MOST_MISREAD))
 
 
 def _medians(values: FloatArray, group: IntArray) -> FloatArray:
@@ -86,7 +87,7 @@ def without_false_detections(local_map: LocalMap) -> LocalMap:
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start)
     graph.problem.arrowhead.without_scratch()
-    return replace(local_map, chain=chain, graph=graph, solution=solution)
+    return replace(local_map, chain=chain, graph=graph, solution=solution, n_misread=n)
 
 
 def _with_all_readings(local_map: LocalMap) -> LocalMap:

@@ -11,7 +11,9 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from scipy.stats import chi2
 
+from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import SuspectTag
 from groundsbot.offline.measurements import FEW_READINGS, TagKey
 from groundsbot.offline.outliers.evidence import to_other_tags
@@ -26,6 +28,8 @@ _SHARE_ASTRAY: Final = 0.02
 # Two tags with one id that hang nearer to each other than this would be seen together, and by all who pass.
 _WITHIN_SIGHT_M: Final = 2.0
 _FEW: Final = 0.25
+# Of a whitened residual: a reading of a tag itself is nearer but once in a thousand times.
+_SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
 def phantoms(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
@@ -61,6 +65,30 @@ def _astray(searched: Searched, case: Case) -> list[Stand]:
     n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
     few = most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in others)
     return others if few else []
+
+
+def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> set[TagKey]:
+    """Tags of a single reading that lie where another tag is, which the same picture does not show.
+
+    Where other readings of these drives were misread, such a one is the other tag, its code misread; none where none
+    were. One that a tape or a finished map knows of is there.
+    """
+    if not any(each.n_misread for each in maps):
+        return set()
+    measured, readings = graph.problem.measured, graph.problem.readings
+    n_readings = graph.n_readings()
+    is_once = n_readings == 1
+    for known in (measured.known.tags, measured.distances.tag_a, measured.distances.tag_b):
+        is_once[known[known >= 0]] = False
+    found = set()
+    for tag in np.flatnonzero(is_once).tolist():
+        (m,) = np.flatnonzero(readings.tag == tag).tolist()
+        in_picture = readings.tag[readings.pose == readings.pose[m]]
+        others = np.setdiff1d(np.flatnonzero(n_readings > 1), in_picture)
+        squares = (readings.taken_for(m, others).residual(solution.state) ** 2).sum(axis=1)
+        if len(others) and squares.min() < _SAME_PLACE:
+            found.add(graph.tags[tag])
+    return found
 
 
 def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> tuple[Graph, Solution]:
