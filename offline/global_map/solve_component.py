@@ -37,6 +37,7 @@ class SolvedComponent(NamedTuple):
         suspects: tags that do not belong.
         refined: on corners; None where it is not.
         told: what was left out; why it is not refined, where anybody asked; or which tags do not hang as was said.
+        left_out: family and id of tags some of whose readings, or all, are not in the graph.
     """
 
     members: Group
@@ -45,6 +46,7 @@ class SolvedComponent(NamedTuple):
     suspects: list[SuspectTag]
     refined: Refined | None = None
     told: tuple[str, ...] = ()
+    left_out: frozenset[tuple[str, int]] = frozenset()
 
 
 def solved_component(
@@ -61,6 +63,7 @@ def solved_component(
     graph, solution = solve_global_map(maps, members, stages, measurements)
     suspects: list[SuspectTag] = []
     told: list[str] = []
+    gone: set[TagKey] = set()
     with stages.stage("tags that do not belong"):
         searched = _searched(graph, solution, [maps[m] for m in members.members])
         if searched is not None:
@@ -70,9 +73,11 @@ def solved_component(
         graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
     if misread := read_as_another(graph, solution, [maps[m] for m in members.members]):
         graph, solution = without_tags(graph, solution, misread)
+        gone |= misread
         ids = _listed({(tag.family, tag.tag_id) for tag in misread})
         told = [*told, f"tags {ids} were read once each, where another tag is: taken for misread codes, not placed"]
-    solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told))
+    left_out = frozenset((tag.family, tag.tag_id) for tag in gone)
+    solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told), left_out=left_out)
     if not corners or not graph.has_corners:
         return solved
     with stages.stage("refining on tag corners"):

@@ -46,6 +46,7 @@ class Found:
     checks: list[CheckResult] = field(default_factory=list)
     metres: list[MetreResult] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    left_out: set[tuple[str, int]] = field(default_factory=set)
     advice: list[AdviceResult] = field(default_factory=list)
 
     def take(
@@ -53,8 +54,9 @@ class Found:
     ) -> Solved:
         """Takes what one more component says."""
         index = len(self.components)
-        members, graph, solution, suspects, refined, told = solved
+        members, graph, solution, suspects, refined, told, left_out = solved
         self.suspects += suspects
+        self.left_out |= left_out
         self.warnings += [f"component {index}: {sentence}" for sentence in told]
         own_maps = [maps[m] for m in members.members]
         with stages.stage("checking that it fits"):

@@ -25,7 +25,7 @@ def map_warnings(
     warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
     warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
     warnings += calibration_warnings(found.calibration, found.checks)
-    named = {(each.family, each.tag_id) for each in found.suspects}
+    named = {(each.family, each.tag_id) for each in found.suspects} | found.left_out
     return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
 
 
