@@ -29,13 +29,14 @@ from groundsbot.offline.measurements import (
     refined,
     telling_keyframes,
 )
-from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, build_graph, solve
+from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, build_graph, parameters_of_wheels, solve
 
-# A chain is built up in pieces over which dead reckoning stays in the right valley: what a wheel ratio 1 % off turns in
-# this distance (0.2 rad on a half-metre track) is far from losing a tag. Later, when the wheels are known, they grow
-# with the way, so that the time does not grow with its square.
+# A chain is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
+# farther than its heading is known to this sigma, under the noise and the wheels' calibration as the pieces before tell
+# it. They grow with the distance, so that the time does not grow with its square.
 _PIECE_M: Final = 10.0
 _PIECE_SHARE: Final = 0.01
+_PIECE_HEADING_RAD: Final = 0.3
 # In squared sigmas: a piece is only the next one's start.
 _PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
@@ -200,9 +201,13 @@ def first_solution(chain: Chain, shown: ShownNoise) -> tuple[Graph, Solution]:
     """The chain solved once from where building up leads, whether it fits together or not."""
     effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
     chain, _ = shown.applied_to(chain)
+    if shown.is_far_larger:  # under too small a noise a wrong minimum far off the priors costs less than the right one
+        wheels, readings = (
+            shown.factors
+        )  # within a window errors that last do not show: readings are no better than told
+        chain = _as_shown(chain, (max(1.0, wheels), max(1.0, readings)))
     graph, keyframes = build_graph([chain]), coarse_keyframes(chain)
-    coarse = coarsened(chain, keyframes)
-    known = _built_up(_as_shown(coarse, shown.factors) if shown.is_far_larger else coarse, effort)
+    known = _built_up(coarsened(chain, keyframes), effort)
     poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
     start = graph.start(poses, known.tags, known.calibration)
     return graph, solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
@@ -294,7 +299,9 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
     """Solves the chain piece by piece, each from the solution of the last; dead reckoning where effort ends."""
     known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
-    for n_keyframes in _pieces(chain):
+    pieces, n_keyframes = _Pieces(chain), 1
+    while True:
+        n_keyframes = pieces.next_end(n_keyframes)
         part = chain.prefix(n_keyframes)
         graph = build_graph([part])
         poses = _extended(part, known.poses, known.wheel_calibration)
@@ -305,19 +312,37 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
         state = solution.state
         wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
         known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state))
-        if effort.left < enough:
+        if n_keyframes == len(chain.stamps_ns) or effort.left < enough:
             break
+        pieces.wheel_covariance = solution.covariance(graph.problem.columns.calibration[graph.wheel_parameters(0)])
     return known._replace(poses=_extended(chain, known.poses, known.wheel_calibration))
 
 
-def _pieces(chain: Chain) -> list[int]:
-    """Numbers of keyframes at which to stop and solve; the last is all of them."""
-    ends, last_m = [], 0.0
-    for keyframe, along_m in enumerate(chain.along_m[1:].tolist(), start=1):
-        if along_m - last_m >= max(_PIECE_M, _PIECE_SHARE * along_m):
-            ends.append(keyframe)
-            last_m = along_m
-    return [*ends, len(chain.stamps_ns)]
+class _Pieces:
+    """Numbers of keyframes at which building up stops and solves; the last is all of them.
+
+    Attributes:
+        wheel_covariance: (3, 3) of WHEEL_PARAMETERS, as far as they are known; at first as robot.yaml says.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        self._along_m = chain.along_m
+        odometry = chain.odometry
+        # Of the heading at each keyframe: its derivative by the wheels' parameters, and the variance of its noise.
+        self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
+        self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
+        self.wheel_covariance = np.diag([each.sigma**2 for each in parameters_of_wheels(chain.run.robot)])
+
+    def next_end(self, n_keyframes: int) -> int:
+        """Where the piece after so many keyframes ends."""
+        last, rest = n_keyframes - 1, slice(n_keyframes, None)
+        way_m, grown_m = self._along_m[rest] - self._along_m[last], _PIECE_SHARE * self._along_m[rest]
+        by_wheels = self._by_wheels[rest] - self._by_wheels[last]
+        variance_rad2 = self._noise_rad2[rest] - self._noise_rad2[last]
+        variance_rad2 += np.einsum("ki,ij,kj->k", by_wheels, self.wheel_covariance, by_wheels)
+        ends = way_m >= np.maximum(_PIECE_M, grown_m)
+        ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
+        return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
 
 
 def _extended(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:

@@ -60,9 +60,15 @@ def localize(
         raise OfflineError(f"{run.log}: {run.name} saw no tag, so nothing tells where in {folder} it drove")
     maps, noisy, broken = local_maps_of(chains, stages)
     maps = weighed_as(maps, noise or known.noise, known.noise_fit if noise is None else None)
-    maps = judged_under_own_noise(maps, noisy, stages)
+    maps, slipped = judged_under_own_noise(maps, noisy, stages)
     found = localize_maps(maps, known, folder, component=component, stages=stages)
-    told = [*run.warnings, *broken, *(warning for each in maps for warning in each.chain.warnings), *found.warnings]
+    told = [
+        *run.warnings,
+        *broken,
+        *slipped,
+        *(warning for each in maps for warning in each.chain.warnings),
+        *found.warnings,
+    ]
     losses = (f"{run.name}: located without what is lost of {run.log}: {run.lost}",) if run.lost else ()
     return replace(found, warnings=tuple(dict.fromkeys(told)), losses=losses)
 

@@ -101,7 +101,8 @@ def build_map(
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
-        maps = judged_under_own_noise(maps, noisy, stages)
+        maps, slipped = judged_under_own_noise(maps, noisy, stages)
+        broken += slipped
     else:
         maps = known + weighed_as(maps, noise, noise_fit)
     kept = tuple(kept_of(each) for each in maps)

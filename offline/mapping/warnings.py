@@ -1,5 +1,6 @@
 """All that a person must be told of a map, in one list."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from groundsbot.calib.robot import TAG_SCALE
@@ -25,8 +26,15 @@ def map_warnings(
     warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
     warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
     warnings += calibration_warnings(found.calibration, found.checks)
-    named = {(each.family, each.tag_id) for each in found.suspects} | found.left_out
+    named = {(each.family, each.tag_id) for each in found.suspects} | found.left_out | _in_one_place(found)
     return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
+
+
+def _in_one_place(found: Found) -> set[tuple[str, int]]:
+    """Family and id of tags that all drives of a component together have in one place, whatever two of them had."""
+    n_places = [Counter((tag.family, tag.tag_id) for tag in component.tags) for component in found.components]
+    several = {each for counts in n_places for each, n in counts.items() if n > 1}
+    return {each for counts in n_places for each in counts} - several
 
 
 def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:

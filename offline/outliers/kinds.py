@@ -24,6 +24,12 @@ INCONSISTENT: Final = "inconsistent"
 # Somebody who hangs one tag where another one was does it this well.
 _REHUNG_SIGMA_M: Final = 0.05
 _NOT_THERE: Final = 1e-3
+# Two tags with one id that are nearer to each other than this are seen together.
+_WITHIN_SIGHT_M: Final = 2.0
+# Passes that go astray: of hundreds a few; of a place within sight of the tag's own, which is no other tag's, more.
+SHARE_ASTRAY: Final = 0.02
+SHARE_ASTRAY_WITHIN_SIGHT: Final = 0.25
+_MANY: Final = 3
 # A run of whose shared tags so many lie elsewhere than others have them is wrong itself.
 _LEAST_WRONG: Final = 3
 _SHARE_WRONG: Final = 0.5
@@ -63,6 +69,17 @@ class Case:
     is_ordered: bool
     at_once: bool
 
+    @property
+    def most(self) -> Stand:
+        """The place with most sightings."""
+        return max(self.stands, key=lambda each: (each.n_sightings, each.n_readings))
+
+    @property
+    def others(self) -> tuple[Stand, ...]:
+        """All places but that one."""
+        most = self.most
+        return tuple(each for each in self.stands if each is not most)
+
     def kind(self) -> str:
         """Moved, moving or duplicated, by who saw it where."""
         ways = list(self.seen.values())
@@ -95,6 +112,33 @@ def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case
         at_once = _in_two_places_at_once(sightings, own, label[own])
         found.append(Case(tag, stands, seen, sightings.one_after_the_other(own), at_once))
     return found
+
+
+def is_within_sight(case: Case, sightings: Sightings, evidence: Evidence, places: Places, picture: IntArray) -> bool:
+    """Whether these seem two tags with one id, so near that pictures would show both, and none does.
+
+    Args:
+        case: of the sightings.
+        sightings: of all M readings.
+        evidence: of the sightings.
+        places: of the evidence.
+        picture: (M,) the picture of each reading, -1 where it is of none.
+    """
+    pairs = list(combinations(range(len(case.stands)), 2))
+    if case.kind() != DUPLICATED or any(shift(case, evidence, places, *pair)[0] >= _WITHIN_SIGHT_M for pair in pairs):
+        return False
+    seen_in = [
+        picture[np.isin(sightings.of_reading, evidence.which[places.place == stand.label]) & (picture >= 0)]
+        for stand in case.stands
+    ]
+    return not any(len(np.intersect1d(seen_in[i], seen_in[j])) for i, j in pairs)
+
+
+def minority(case: Case, share: float) -> list[Stand]:
+    """All places but the one sighted most; none where that has few sightings, or another one more than its share."""
+    n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
+    is_minority = case.most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in case.others)
+    return list(case.others) if is_minority else []
 
 
 def swapped_pairs(found: Sequence[Case], evidence: Evidence, places: Places) -> list[tuple[int, int]]:

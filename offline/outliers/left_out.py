@@ -18,16 +18,19 @@ from groundsbot.offline.maps import SuspectTag
 from groundsbot.offline.measurements import FEW_READINGS, TagKey
 from groundsbot.offline.outliers.evidence import to_other_tags
 from groundsbot.offline.outliers.false_detections import MOST_READINGS
-from groundsbot.offline.outliers.kinds import DUPLICATED, PHANTOM, Case, Stand, cases, shift
+from groundsbot.offline.outliers.kinds import (
+    PHANTOM,
+    SHARE_ASTRAY,
+    SHARE_ASTRAY_WITHIN_SIGHT,
+    Case,
+    Stand,
+    cases,
+    is_within_sight,
+    minority,
+)
 from groundsbot.offline.outliers.outliers import Searched
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
-# The other place must have so many passes; of hundreds a few more go astray.
-_MANY: Final = 3
-_SHARE_ASTRAY: Final = 0.02
-# Two tags with one id that hang nearer to each other than this would be seen together, and by all who pass.
-_WITHIN_SIGHT_M: Final = 2.0
-_FEW: Final = 0.25
 # Of a whitened residual: a reading of a tag itself is nearer but once in a thousand times.
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
@@ -41,30 +44,18 @@ def phantoms(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
 
 def stray_passes(searched: Searched) -> set[TagKey]:
     """Places of ids that next to nothing speaks for, beside one that more does."""
-    found: set[TagKey] = set()
     which, tags = searched.evidence.which, searched.tags
-    for case in cases(searched.sightings, searched.evidence, searched.places):
-        others = _astray(searched, case)
-        labels = [each.label for each in others]
-        found |= {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
-    return found
+    found = cases(searched.sightings, searched.evidence, searched.places)
+    labels = [stand.label for case in found for stand in _astray(searched, case)]
+    return {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
 
 
 def _astray(searched: Searched, case: Case) -> list[Stand]:
     """The places of a tag that are no places; all of them but one, or none."""
-    most = max(case.stands, key=lambda each: (each.n_sightings, each.n_readings))
-    others = [each for each in case.stands if each is not most]
-    if all(each.n_readings <= FEW_READINGS < most.n_readings for each in others):
-        return others
-    k = case.stands.index(most)
-    is_near = case.kind() == DUPLICATED and all(
-        shift(case, searched.evidence, searched.places, k, case.stands.index(each))[0] < _WITHIN_SIGHT_M
-        for each in others
-    )
-    share = _FEW if is_near else _SHARE_ASTRAY
-    n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
-    few = most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in others)
-    return others if few else []
+    if all(each.n_readings <= FEW_READINGS < case.most.n_readings for each in case.others):
+        return list(case.others)
+    is_near = is_within_sight(case, searched.sightings, searched.evidence, searched.places, searched.picture)
+    return minority(case, SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY)
 
 
 def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> set[TagKey]:

@@ -10,6 +10,7 @@ from groundsbot.offline.measurements import Chain
 from groundsbot.offline.outliers.false_readings import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_where_broken
 from groundsbot.offline.outliers.outliers import RunsAlone
+from groundsbot.offline.outliers.slips import sentence, without_slips
 from groundsbot.offline.sam import efforts_of
 
 
@@ -58,10 +59,18 @@ def local_maps_of(
     return ExplainedMaps([each.without_factors() for each in maps], noisy, broken)
 
 
-def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages) -> list[LocalMap]:
-    """Noisy maps without false detections, judged again under the noise that was fitted.
+class JudgedMaps(NamedTuple):
+    """Local maps, and sentences about drives whose wheels do not explain how they moved."""
 
-    Where a drive does not fit even so, no tag of its component is taken for moved: something else is wrong. Where it
+    maps: list[LocalMap]
+    warnings: list[str]
+
+
+def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages) -> JudgedMaps:
+    """Noisy maps without false detections and slips, judged again under the noise that was fitted.
+
+    A drive that does not fit is parted where its wheels lost the way, if that explains it. Where a drive does not fit
+    even so, no tag of its component is taken for moved: something else is wrong. Where it
     fits, tags that moved stand out when all drives are solved together.
 
     Args:
@@ -69,10 +78,22 @@ def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], sta
         noisy: names of the chains in question.
         stages: told what is being done.
     """
-    found = list(maps)
-    for i, each in enumerate(maps):
-        if each.chain.name in noisy and each.chain.tags:
-            with stages.stage("checking that it fits"):
-                again = judged(without_false_detections(each))
-            found[i] = replace(again, is_doubtful=not again.goodness.fits).without_factors()
-    return found
+    found: list[LocalMap] = []
+    warnings: list[str] = []
+    for each in maps:
+        if each.chain.name not in noisy or not each.chain.tags:
+            found.append(each)
+            continue
+        with stages.stage("breaks of odometry"):
+            again, slips = without_slips(without_false_detections(each))
+        if slips:
+            warnings.append(sentence(again, slips))
+        with stages.stage("checking that it fits"):
+            again = judged(again)
+        parts = [again]
+        if not again.goodness.fits:
+            with stages.stage("breaks of odometry"):
+                parts, broken = split_where_broken([replace(again, is_noisy=False)])
+            warnings += broken
+        found += [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factors() for part in parts]
+    return JudgedMaps(found, warnings)

@@ -26,9 +26,17 @@ from groundsbot.offline.outliers.evidence import (
     to_other_tags,
 )
 from groundsbot.offline.outliers.grouping import few_of_each_tag
+from groundsbot.offline.outliers.kinds import SHARE_ASTRAY_WITHIN_SIGHT, cases, is_within_sight, minority
 from groundsbot.offline.outliers.places import Places, settled
 from groundsbot.offline.outliers.search import FALSE_ALARM, bound, excess, freedom_of_places, search
-from groundsbot.offline.outliers.sightings import Sightings, instances, places_told_apart, sightings_of, with_instances
+from groundsbot.offline.outliers.sightings import (
+    Sightings,
+    instances,
+    letters,
+    places_told_apart,
+    sightings_of,
+    with_instances,
+)
 from groundsbot.offline.sam import Graph, Measured, Solution, build_graph, solve
 
 # Each search is linearised where the last one led; two do where a move is far beyond its sigma.
@@ -64,6 +72,13 @@ class Searched:
         """The tag of each sighting (S,)."""
         of = zip(self.sightings.chain, self.sightings.tag, strict=True)
         return [self.graph.chains[c].tags[t] for c, t in of]
+
+    @property
+    def picture(self) -> IntArray:
+        """(M,) the picture of each reading, as the pose it was taken from; -1 for an imported one, which is of none."""
+        from_pictures = [not len(chain.run.positions.tag) for chain in self.graph.chains]
+        of_reading = np.repeat(from_pictures, [len(chain.readings) for chain in self.graph.chains])
+        return np.where(of_reading, self.graph.problem.readings.pose, -1)
 
 
 class RunsAlone:
@@ -179,6 +194,7 @@ def _relabelled(local_map: LocalMap, sightings: Sightings, place: IntArray) -> L
 def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
     """The maps with tags told apart that sure alignments found elsewhere in one map than in another."""
     names: dict[tuple[int, TagKey], TagKey] = {}
+    n_places: Counter[TagKey] = Counter()
     sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_sure]
     outliers = {tag for pair in sure for tag in (pair.alignment.outliers if pair.alignment else ())}
     for tag in sorted(outliers):
@@ -187,8 +203,11 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
             if pair.alignment is not None and tag in pair.alignment.inliers:
                 one, other = group[pair.a], group[pair.b]
                 group = {m: one if g == other else g for m, g in group.items()}
-        for m, g in group.items():
-            names[m, tag] = tag._replace(instance=f"like {maps[g].chain.name}")
+        if len(places := dict.fromkeys(group.values())) > 1:
+            first = n_places[tag.whole]
+            letter = {g: letters(first + i) for i, g in enumerate(places)}
+            n_places[tag.whole] += len(places)
+            names |= {(m, tag): tag._replace(instance=letter[g]) for m, g in group.items()}
     return [renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
 
 
@@ -224,7 +243,26 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Search
         if instances(seen.sightings, wanted) == seen.tags:
             break
         seen = _looked_at(*_solved_again(seen, wanted), scales)
+    if noise_is_fitted:
+        joined_place = _near_ones_joined(seen)
+        if not _same(joined_place, seen.place):
+            seen = _looked_at(*_solved_again(seen, joined_place), scales)
     return seen
+
+
+def _near_ones_joined(seen: Searched) -> IntArray:
+    """(S,) the places; one for an id of near places that were never seen at once, each sighted more than now and then.
+
+    Where noise was fitted, that is an error of the drives.
+    """
+    found = seen.place.copy()
+    for case in cases(seen.sightings, seen.evidence, seen.places):
+        if is_within_sight(case, seen.sightings, seen.evidence, seen.places, seen.picture) and not minority(
+            case, SHARE_ASTRAY_WITHIN_SIGHT
+        ):
+            which = seen.evidence.which[np.isin(seen.places.place, [each.label for each in case.stands])]
+            found[which] = found[which[0]]
+    return found
 
 
 def _sightings(graph: Graph, at: Heard) -> Sightings:

@@ -147,7 +147,7 @@ def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[
     for s in sightings.in_time.tolist():
         own, at = int(sightings.id[s]), int(place[s])
         if (own, at) not in names:
-            names[own, at] = only_in + _letters(int(n_places[own]))
+            names[own, at] = only_in + letters(int(n_places[own]))
             n_places[own] += 1
     return [
         sightings.ids[own]._replace(instance=names[own, at] if n_places[own] > 1 else "")
@@ -170,7 +170,7 @@ def with_instances(chains: Sequence[Chain], sightings: Sightings, tag_of: Sequen
     return relabelled
 
 
-def _letters(number: int) -> str:
-    """a, b, ... z, aa, ab, ..."""
+def letters(number: int) -> str:
+    """Name of an instance: a, b, ... z, aa, ab, ..."""
     tail = _INSTANCES[number % 26]
-    return tail if number < 26 else _letters(number // 26 - 1) + tail
+    return tail if number < 26 else letters(number // 26 - 1) + tail

@@ -123,10 +123,23 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
     )
 
 
+def _n_pieces(length_m: float, wheel_sigma: float) -> int:
+    chain = made_long_drive(2, length_m).chain
+    pieces, n_keyframes, found = local_map._Pieces(chain), 1, 0
+    pieces.wheel_covariance = wheel_sigma**2 * np.eye(3)
+    while n_keyframes < len(chain.stamps_ns):
+        n_keyframes, found = pieces.next_end(n_keyframes), found + 1
+    return found
+
+
 def test_number_of_pieces_grows_with_the_logarithm_of_a_long_way() -> None:
-    short, long = (len(local_map._pieces(made_long_drive(2, length_m).chain)) for length_m in (1000.0, 4000.0))
+    short, long = _n_pieces(1000.0, 1e-3), _n_pieces(4000.0, 1e-3)
     assert 80 <= short <= 101
     assert long - short < 150
+
+
+def test_pieces_are_short_while_the_track_is_unknown() -> None:
+    assert _n_pieces(100.0, 0.3) > 2 * _n_pieces(100.0, 1e-3)
 
 
 def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.alignment.merging import merge
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.alignment.merging import PairAlignment, merge
 from groundsbot.offline.commands.map_drives import exit_code, summary
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
@@ -19,12 +20,13 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
-from groundsbot.offline.outliers.outliers import Searched, split_together
+from groundsbot.offline.outliers.outliers import Searched, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import NOWHERE, settled
 from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
 from groundsbot.offline.sam.arrowhead import covariance
@@ -37,6 +39,7 @@ HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(8)}
 STARTS = {"a": [0.0, 0.0, 0.0], "b": [5.0, 1.0, 2.0], "c": [9.0, -1.0, -3.0], "d": [4.0, 0.0, 1.0]}
 NAMES = tuple(STARTS)
 SIGMA_M = 0.05
+NOISE = NoiseParameters()
 
 
 def stood(name: str, places: dict[int, FloatArray], seed: int = 0, hours: int = 0) -> Run:
@@ -215,3 +218,44 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
     assert (found[: 2 * n] == 1.0).all()
     assert found[-2] < 1e-6
     assert found[-1] > 0.05
+
+
+def _searched_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> Searched:
+    """One run after the other, whose noise was fitted or not, solved together and searched."""
+    runs = [stood(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
+    maps = [replace(solve_local_map(chain), is_noisy=is_noisy) for run in runs for chain in chains_of(run, NOISE)]
+    merged = merge(maps)
+    maps = with_outliers_apart(maps, merged)
+    found = split_together(*solve_global_map(maps, merged.groups[0], Stages()), maps)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("off_m", "is_noisy", "n_places"), [(1.2, True, 1), (1.2, False, 2), (4.0, True, 2)], ids=["near", "told", "far"]
+)
+def test_places_within_sight_of_each_other_are_one_where_noise_was_fitted(
+    off_m: float, is_noisy: bool, n_places: int
+) -> None:
+    there = {3: HALL[3] + [off_m, 0.0]}
+    found = _searched_as([{}, there, {}, there], is_noisy=is_noisy)
+    assert sum(tag.whole.tag_id == 3 for tag in found.graph.tags) == n_places
+
+
+def test_a_tag_that_two_alignments_doubt_and_others_join_keeps_its_name() -> None:
+    maps = [solve_local_map(chain) for hall in NAMES[:3] for chain in chains_of(stood(hall, HALL), NOISE)]
+    merged = merge(maps)
+    tag = TagKey(FAMILY, 3)
+
+    def doubted(pair: PairAlignment) -> PairAlignment:
+        assert pair.alignment is not None
+        inlier = np.array([each != tag for each in pair.alignment.shared])
+        return replace(pair, alignment=replace(pair.alignment, inlier=inlier))
+
+    pairs = [doubted(each) if (each.a, each.b) == (0, 1) else each for each in merged.pairs]
+    assert pairs[0].alignment is not None
+    assert pairs[0].alignment.outliers == (tag,)
+    one = with_outliers_apart(maps, replace(merged, pairs=tuple(pairs)))
+    assert [each.chain.tags for each in one] == [each.chain.tags for each in maps]
+    apart = with_outliers_apart(maps, replace(merged, pairs=tuple(doubted(each) for each in merged.pairs)))
+    assert [each.chain.tags[3].instance for each in apart] == ["a", "b", "c"]
