@@ -29,7 +29,7 @@ from groundsbot.offline.measurements import (
     refined,
     telling_keyframes,
 )
-from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, build_graph, parameters_of_wheels, solve
+from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, State, build_graph, parameters_of_wheels, solve
 
 # A chain is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
 # farther than its heading is known to this sigma, under the noise and the wheels' calibration as the pieces before tell
@@ -245,6 +245,7 @@ class _Check:
 
     def __init__(self, graph: Graph, effort: Effort, least_factor: float = 0.0) -> None:
         (chain,) = graph.chains
+        whole = graph
         self._keyframes = telling_keyframes(chain)
         share = _LEAST_SHARE
         while len(self._keyframes) > _MOST_CHECKED:
@@ -253,6 +254,9 @@ class _Check:
         if len(self._keyframes) < len(chain.stamps_ns):
             chain = coarsened(chain, self._keyframes)
             graph = build_graph([chain])
+        # Tags whose few readings all fall out are not in the windows, nor is what only these depend on.
+        self._tags = np.array([whole.tags.index(tag) for tag in graph.tags], dtype=np.int64)
+        self._calibration = np.array([whole.parameters.index(each) for each in graph.parameters], dtype=np.int64)
         self._windows: Windows = fitted_windows(
             graph.problem,
             effort=effort,
@@ -275,7 +279,9 @@ class _Check:
 
     def judge(self, solution: Solution) -> Goodness:
         state = solution.state
-        return self._windows.judge(replace(state, poses=state.poses[self._keyframes]))
+        return self._windows.judge(
+            State(state.poses[self._keyframes], state.tags[self._tags], state.calibration[self._calibration])
+        )
 
 
 def _as_shown(chain: Chain, factors: tuple[float, float]) -> Chain:

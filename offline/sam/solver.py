@@ -79,6 +79,13 @@ class Problem:
     anchor: IntArray
     measured: Measured = NOTHING_MEASURED
 
+    def check(self, state: State) -> None:
+        """Raises ValueError for a state of another problem, which compiled code would read beyond its end."""
+        columns = self.columns
+        wanted = len(columns.poses), len(columns.tags), len(columns.calibration)
+        if (len(state.poses), len(state.tags), len(state.calibration)) != wanted:
+            raise ValueError("the state has another number of poses, tags or calibration parameters than the problem")
+
     def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
         """Half the sum of all losses: rho(|r|^2) of odometry and readings, |r|^2 of priors and what was measured."""
         odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
@@ -235,6 +242,7 @@ def solve(
         most_steps: how many to try, relaxed ones aside.
         most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
     """
+    problem.check(start)
     arrowhead = problem.arrowhead
     curvature = Curvature(losses)
     system, spare, rows = arrowhead.scratch

@@ -20,7 +20,7 @@ from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.convergence_study import is_right, missed_bounds, study_seed
-from tests.support.data.long_drives import made_long_drive
+from tests.support.data.long_drives import made_long_drive, made_town
 
 
 def test_study_keeps_its_promises_on_a_few_seeds() -> None:
@@ -161,3 +161,22 @@ def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> 
         assert solved.is_noisy
         found += [value for parameter, value in solved.calibration.items() if parameter.name == EDGE_SHIFT]
     assert np.abs(found).max() < 0.6
+
+
+def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Places of the others were once taken for theirs, beyond the end of arrays."""
+    chain = made_long_drive(5, 300.0, town=made_town(5, (0.6, 1.2))).chain
+    whole = solve_local_map(chain)
+    monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
+    check = local_map._Check(build_graph([chain]), Effort.of_log(chain.run.log_bytes, chain.run.inputs))
+    assert 0 < len(check._tags) < len(chain.tags)
+    assert check.judge(whole.solution).fits
+
+
+def test_a_start_of_another_problem_is_refused() -> None:
+    short, long = (build_graph([made_long_drive(3, length_m).chain]) for length_m in (50.0, 100.0))
+    state = long.start(np.zeros((len(long.chains[0].stamps_ns), 3)), {}, {})
+    with pytest.raises(ValueError, match="another number of poses"):
+        solve(short.problem, state)
