@@ -22,18 +22,24 @@ from groundsbot.offline.maps.result import (
     TagPose,
     TagResult,
 )
+from groundsbot.offline.maps.shape import Shape, shape_of
 
 FORMAT_VERSION: Final = 1
 
 
 def map_as_json(result: MapResult) -> dict[str, Any]:
     """What map.json holds: plain data, null where a number is not known."""
+    shapes = [shape_of(component) for component in result.components]
     return {
         "format_version": FORMAT_VERSION,
         "frame": "map",
-        "components": [_component_json(component) for component in result.components],
+        "components": [_component_json(*each) for each in zip(result.components, shapes, strict=True)],
         "runs": [_run_json(run, i) for i, component in enumerate(result.components) for run in component.runs],
-        "tags": [_tag_json(tag, i) for i, component in enumerate(result.components) for tag in component.tags],
+        "tags": [
+            _tag_json(tag, i, None if shape is None else shape.tag_sigmas_m[k])
+            for i, (component, shape) in enumerate(zip(result.components, shapes, strict=True))
+            for k, tag in enumerate(component.tags)
+        ],
         "alignments": [_alignment_json(alignment) for alignment in result.alignments],
         "start_to_start": [
             {
@@ -62,7 +68,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
     }
 
 
-def _component_json(component: Component) -> dict[str, Any]:
+def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]:
     return {
         "frame_run": component.frame_run,
         "runs": [run.name for run in component.runs],
@@ -71,6 +77,7 @@ def _component_json(component: Component) -> dict[str, Any]:
         "cost": _plain(component.cost),
         "n_residuals": component.n_residuals,
         "floor": _floor_json(component.floor) or None,
+        "heading_sigma_rad": None if shape is None else _plain(shape.heading_sigma_rad),
         "sigma_factor": _plain(component.sigma_factor),
         "misfit": None if component.misfit is None else _plain(asdict(component.misfit)),
     }
@@ -112,7 +119,7 @@ def _run_json(run: RunResult, component: int) -> dict[str, Any]:
     }
 
 
-def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
+def _tag_json(tag: TagResult, component: int, shape_sigma_m: float | None) -> dict[str, Any]:
     return {
         "family": tag.family,
         "tag_id": tag.tag_id,
@@ -122,6 +129,7 @@ def _tag_json(tag: TagResult, component: int) -> dict[str, Any]:
         "quaternion_xyzw": None if tag.pose is None else _plain(tag.pose.quaternion_xyzw),
         "covariance": _plain(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
         "pose_covariance": None if tag.pose is None else _plain(tag.pose.covariance),
+        "shape_sigma_m": _plain(shape_sigma_m),
         "sigma_factor": _plain(tag.sigma_factor),
         "n_observations": tag.n_observations,
         "runs": list(tag.runs),

@@ -5,6 +5,7 @@ say different things.
 """
 
 from collections.abc import Sequence
+from math import degrees
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +23,7 @@ def sentences(document: dict[str, Any]) -> list[str]:
     told = [
         contradiction_sentence(document),
         _joined(document),
-        _how_good(document),
+        headline(document),
         _scale(document),
         *_mistrust(document),
         *_next(document),
@@ -108,19 +109,13 @@ def _n_drives(runs: Sequence[dict[str, Any]]) -> int:
     return len({run["stretch_of"] or run["run"] for run in runs})
 
 
-def _how_good(document: dict[str, Any]) -> str:
+def headline(document: dict[str, Any]) -> str:
+    """How well the map is known, its shape first."""
     tags = [tag for tag in document["tags"] if tag["component"] == 0]
     known = [(sigma, tag) for tag in tags if (sigma := largest_sigma_m(tag["covariance"])) is not None]
     if not known:
         return "It places no tag, so that nothing corrects what the wheels say."
-    worst_m, worst = max(known, key=lambda each: each[0])
-    worst_name = f"{worst['tag_id']}{worst['instance']}"
-    where = "In the largest component a" if len(document["components"]) > 1 else "A"
-    told = (
-        f"{where} typical tag is known to {_metres(float(np.median([sigma for sigma, _ in known])))} (one sigma, seen "
-        f"from the start of {document['components'][0]['frame_run']}), the worst, tag {worst_name}, to "
-        f"{_metres(worst_m)}"
-    )
+    told = _shape(document, tags, float(np.median([sigma for sigma, _ in known])))
     pairs = document["start_to_start"]
     if len(pairs) == 1:
         pair = pairs[0]
@@ -129,6 +124,23 @@ def _how_good(document: dict[str, Any]) -> str:
             f"{_metres(pair['sigma_m'])}"
         )
     return told + "."
+
+
+def _shape(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_start_m: float) -> str:
+    """How well tags are known relative to each other, and seen from the first start."""
+    component = document["components"][0]
+    where, the_tags = ("In the largest component ", "tags") if len(document["components"]) > 1 else ("", "Tags")
+    start = f"the start of {component['frame_run']}"
+    if component["heading_sigma_rad"] is None:
+        return f"{where}{the_tags} are known to {_metres(seen_from_start_m)} (median, one sigma), seen from {start}"
+    median_m = float(np.median([tag["shape_sigma_m"] for tag in tags]))
+    worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
+    return (
+        f"{where}{the_tags} are known to {_metres(median_m)} relative to each other (median, one sigma; the worst, tag "
+        f"{worst['tag_id']}{worst['instance']}, to {_metres(worst['shape_sigma_m'])}); seen from {start}, whose "
+        f"heading is uncertain by {degrees(component['heading_sigma_rad']):.1f} degrees, to "
+        f"{_metres(seen_from_start_m)}"
+    )
 
 
 def _scale(document: dict[str, Any]) -> str:
