@@ -66,7 +66,8 @@ def map_command(
     ] = AUTO,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Also print time and memory of each stage; `stages` in JSON.")
+        bool,
+        typer.Option("-v", "--verbose", help="Print all that was found, and what each stage took (`stages` in JSON)."),
     ] = False,
     json_output: JsonFlag = False,
 ) -> None:
@@ -96,7 +97,7 @@ def map_command(
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))
     else:
-        for line in [*summary(result, output), *(stage_lines(costs) if verbose else [])]:
+        for line in [*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])]:
             typer.echo(line)
     raise typer.Exit(exit_code(result))
 

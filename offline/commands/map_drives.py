@@ -31,7 +31,7 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import advice_sentence, contradiction_sentence, write_picture
+from groundsbot.offline.report import advice_sentence, contradiction_sentence, headline, write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refused_lines, verdict_lines
 from groundsbot.onboard.log import find_logs
 
@@ -39,6 +39,9 @@ REPORT_FILE: Final = "report.html"
 # Of --upright-deg: a tag that is told to hang better than that, or worse, is a slip of the unit.
 _FINEST_DEG: Final = 0.01
 _COARSEST_DEG: Final = 10.0
+# On one screen.
+_MOST_PAIRS: Final = 3
+_MOST_TO_ACT_ON: Final = 5
 
 
 @dataclass(frozen=True)
@@ -125,34 +128,47 @@ def exit_code(result: MapResult) -> int:
     return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or contradicts else EXIT_DONE
 
 
-def summary(result: MapResult, output: Path) -> list[str]:
-    """What a person wants to know first."""
-    lines = _contradiction_lines(result)
+def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
+    """What a terminal shows of a map: the result, what asks for action, and where the files are.
+
+    Args:
+        result: the map.
+        output: its folder.
+        verbose: also alignments, every distance between starts, noise and scale; and all of what asks for action, of
+            which else the first five lines are shown.
+    """
+    document = map_as_json(result)
+    several = len(result.components) > 1
+    lines = [each for each in (contradiction_sentence(document), headline(document)) if each]
     for component in result.components:
-        lines += _component_lines(component, several=len(result.components) > 1)
-    lines += [_alignment_line(alignment) for alignment in result.alignments]
+        lines += _component_lines(component, several=several)
+    pairs = [pair for component in result.components for pair in component.start_to_start]
+    if verbose:
+        lines += [_alignment_line(alignment) for alignment in result.alignments]
     lines += [
         f"start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m (sigma {pair.sigma_m:.3f} m)"
-        for component in result.components
-        for pair in component.start_to_start
+        for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
-    lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
-    lines += [*verdict_lines(result.robot_numbers), *refused_lines(result)]
-    lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
-    if result.noise_fit is not None:
-        lines += _noise_lines(result.noise_fit)
+    if verbose:
+        lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+        lines += [] if result.noise_fit is None else _noise_lines(result.noise_fit)
     lines += _floor_lines(result)
-    lines += _advice_lines(result)
-    lines += [f"warning: {warning}" for warning in result.warnings]
-    lines += [f"lost: {loss}" for loss in result.losses]
+    lines += [*verdict_lines(result.robot_numbers), *refused_lines(result)]
+    lines += _to_act_on(result, verbose=verbose)
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
 
 
-def _contradiction_lines(result: MapResult) -> list[str]:
-    if not any(component.misfit for component in result.components):
-        return []
-    return [contradiction_sentence(map_as_json(result))]
+def _to_act_on(result: MapResult, *, verbose: bool) -> list[str]:
+    """What is lost, suspect or doubtful, and what to drive next; the gravest first."""
+    lines = [f"lost: {loss}" for loss in result.losses]
+    lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    lines += _advice_lines(result)
+    if verbose or len(lines) <= _MOST_TO_ACT_ON:
+        return lines
+    rest = len(lines) - _MOST_TO_ACT_ON
+    return [*lines[:_MOST_TO_ACT_ON], f"{rest} more: in the report, or with -v"]
 
 
 def _report_line(output: Path) -> str:

@@ -1,10 +1,11 @@
 from .picture import write_picture
 from .report import write_report
-from .sentences import advice_sentence, contradiction_sentence
+from .sentences import advice_sentence, contradiction_sentence, headline
 
 __all__ = [
     "advice_sentence",
     "contradiction_sentence",
+    "headline",
     "write_picture",
     "write_report",
 ]

@@ -5,22 +5,52 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import pytest
+
+from groundsbot.offline.commands.map_drives import summary
 from groundsbot.offline.maps.files import read_map
+from groundsbot.offline.maps.result import MapResult
 from tests.support.data.drives import made_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
+from tests.support.data.maps import made_component, made_map
 from tests.support.programs import Run
 
 
 def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     outcome = map_to(logs["a"], logs["b"])
     assert (outcome.code, outcome.err) == (0, "")
-    for part in ("a_one: ", "4 of 4 shared tags fit", "start of a_one to start of b_one: 1.118 m", "4 tags in one map"):
+    for part in (
+        "a_one: ",
+        "Tags are known to ",
+        " relative to each other",
+        "start of a_one to start of b_one: 1.118 m",
+        "4 tags in one map",
+    ):
         assert part in outcome.out
     names = {path.name for path in (tmp_path / "out").iterdir()}
     report = {"report.html"} if find_spec("plotly") else set()
     files = {"map.json", "map.npz", "tags.csv", "map.png", "map.mcap", "a_one.tum", "b_one.tum"}
     assert names == files | report
     assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
+
+
+def test_more_is_said_with_v(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    outcome = map_to(logs["a"], logs["b"], "-v")
+    for part in ("4 of 4 shared tags fit", "scale: known to ", "noise ", "solving all runs together"):
+        assert part in outcome.out
+
+
+def test_a_terminal_shows_five_lines_that_ask_for_action(made_map_with_warnings: MapResult) -> None:
+    short = summary(made_map_with_warnings, Path("out"))
+    assert [line for line in short if line.startswith("warning: ")] == [f"warning: w{i}" for i in range(5)]
+    assert "4 more: in the report, or with -v" in short
+    long = summary(made_map_with_warnings, Path("out"), verbose=True)
+    assert len([line for line in long if line.startswith("warning: ")]) == 9
+
+
+@pytest.fixture
+def made_map_with_warnings() -> MapResult:
+    return replace(made_map(made_component()), warnings=tuple(f"w{i}" for i in range(9)), advice=())
 
 
 def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
