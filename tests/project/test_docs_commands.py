@@ -164,7 +164,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag.write(folder / "drive.bag")
     write_robot_yaml(made_robot("a"), folder / "robot.yaml")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
-    seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},1.0\n" for i in range(0, 60, 3))
+    seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
     for day in ("monday", "tuesday"):
         (folder / day).mkdir()
         (folder / day / "odometry.csv").write_text("t_s,v_m_s,omega_rad_s\n" + turning)
@@ -196,7 +196,7 @@ def test_commands_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         # The paper's recordings make a map of their own, in a folder of their own.
         folder = tmp_path / "paper" if re.search(r" (hallway|logs) -o", each.text) else tmp_path
         run(each.text, folder, monkeypatch)
-    for made in ("board.pdf", "map/report.html", "trajectories", "layout.json", "simulated/truth.json", "paper/map"):
+    for made in ("map/report.html", "trajectories", "layout.json", "simulated/truth.json", "paper/map"):
         assert (tmp_path / made).exists(), made
 
 
