@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Its theme warns of a later release on every build; the version is locked.
+export NO_MKDOCS_2_WARNING := 1
 # The newest picture of the demo and its logs end up here.
 DEMO := build/demo
 

@@ -8,15 +8,31 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+# What the theme's offline search would fetch, and what stands in for it.
+_FETCHED = "https://unpkg.com/iframe-worker/shim"
+_FROM_DISK = "worker_from_disk.js"
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """README and its like are pages too."""
     top = Path(config.config_file_path).parent
+    files.append(
+        File.generated(config, _FROM_DISK, content=(top / "docs/site" / _FROM_DISK).read_text(encoding="utf-8"))
+    )
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=(top / source).read_text(encoding="utf-8")))
     return files
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """The search works from disk without a network."""
+    return output.replace(_FETCHED, _FROM_DISK)
+
+
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """The page for what is not found, too."""
+    return output_content.replace(_FETCHED, f"/{_FROM_DISK}")
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.browser import browser, chromium
 from tests.support.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -31,6 +32,15 @@ def test_every_page_is_there_and_none_fetches_anything(site: Path) -> None:
         text = page.read_text(encoding="utf-8")
         assert re.findall(r"<(?:script|img)[^>]*src=\"(?:https?:)?//", text) == []
         assert re.findall(r"<link[^>]*rel=\"stylesheet\"[^>]*href=\"(?:https?:)?//", text) == []
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium to look with; apt-get install chromium")
+def test_the_search_finds_from_disk_and_fetches_nothing(site: Path, tmp_path: Path) -> None:
+    """Browsers start no worker for a page from disk, and the theme would fetch what stands in for one."""
+    with browser(tmp_path) as page:
+        page.call("Page.navigate", url=f"{(site / 'index.html').as_uri()}?q=slip")
+        page.wait_for("document.querySelectorAll('.md-search-result__item').length > 0")
+        assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []
 
 
 def test_links_between_the_readme_and_the_pages_are_right_in_both(site: Path) -> None:
