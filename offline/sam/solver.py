@@ -214,7 +214,6 @@ def solve(
     losses: Losses = DEFAULT_LOSSES,
     relative_tolerance: float = _COST_ROUNDING,
     relaxed_steps: int = 0,
-    threads: int = 1,
     most_steps: int = MAX_STEPS,
     most_tries: int = MAX_TRIES,
 ) -> Solution:
@@ -238,7 +237,6 @@ def solve(
         relative_tolerance: or by less than this share.
         relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
             that a start lies in.
-        threads: on how many cores chains are eliminated.
         most_steps: how many to try, relaxed ones aside.
         most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
     """
@@ -259,7 +257,7 @@ def solve(
     while n_steps < most_steps and n_linearised < last and not damping.exhausted:
         n_steps += 1
         try:
-            step, expected = _step(arrowhead, system, damping, rows, threads)
+            step, expected = _step(arrowhead, system, damping, rows)
         except UnderDeterminedError:
             return ended("a variable is in no factor", converged=False)
         if expected <= cost_tolerance + relative_tolerance * cost:
@@ -289,13 +287,13 @@ def solve(
     return ended(reason, converged=False)
 
 
-def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows, threads: int) -> tuple[FloatArray, float]:
+def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows) -> tuple[FloatArray, float]:
     """The next step, damped as it has to be, and by how much the linear model says that the cost falls.
 
     Raises:
         UnderDeterminedError: no damping helps.
     """
-    factorisation, used = factorised(arrowhead, system, damping.share, rows, threads)
+    factorisation, used = factorised(arrowhead, system, damping.share, rows)
     damping.needed(used)
     step = -factorisation.solve_in_order(system.gradient)
     return step, _expected_decrease(system, step, damping.share)
@@ -312,7 +310,7 @@ def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cos
 
 
 def factorised(
-    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None, threads: int = 1
+    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None
 ) -> tuple[Factorisation, float]:
     """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
 
@@ -321,7 +319,7 @@ def factorised(
     """
     while True:
         try:
-            return arrowhead.factorise(system, damping, out, threads), damping
+            return arrowhead.factorise(system, damping, out), damping
         except UnderDeterminedError:
             if damping > _MOST_FLOOR:
                 raise

@@ -16,22 +16,20 @@ from groundsbot.offline.sam.linearisation.blocks import Rows, System
 
 
 @jitted
-def eliminate(tree: Tree, system: System, damping: float, rows: Rows, begin: int, end: int) -> int:
-    """Eliminates some nodes, but for the top, whose front is left in the workspace.
+def eliminate(tree: Tree, system: System, damping: float, rows: Rows) -> int:
+    """Eliminates all nodes but the top, whose front is left in the workspace.
 
     Args:
         tree: the order.
         system: the blocks.
         damping: share of the diagonal that is added to it.
-        rows: takes the result; its workspace must be zero but for what earlier nodes have left for the top.
-        begin: the first node.
-        end: one beyond the last; they are whole chains, or the top, or both.
+        rows: takes the result; its workspace must be zero.
 
     Returns:
         -1, or the first column whose pivot is not positive.
     """
     tree, system, rows = borrowed(tree), borrowed(system), borrowed(rows)
-    for node in range(begin, end):
+    for node in range(len(tree.level)):
         front = _front_of(tree, node, rows.workspace)
         if tree.level[node] == 0:
             failed = eliminate_leaf(tree, system, damping, node, rows, front)

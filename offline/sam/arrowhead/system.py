@@ -14,12 +14,12 @@ from scipy import linalg
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead import block_substitution, substitution
 from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
+from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.preintegration import expand
 from groundsbot.offline.sam.arrowhead.prior_blocks import MeasuredBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import rolled
-from groundsbot.offline.sam.arrowhead.threads import eliminate_chains
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
@@ -131,24 +131,21 @@ class Arrowhead:
             inside=np.empty((int((tree.end - tree.first)[tree.level == 0].max(initial=0)), 3)),
         )
 
-    def factorise(
-        self, system: System, damping: float = 0.0, out: Rows | None = None, threads: int = 1
-    ) -> "Factorisation":
+    def factorise(self, system: System, damping: float = 0.0, out: Rows | None = None) -> "Factorisation":
         """R with R^T R = H + damping diag(H).
 
         Args:
             system: the blocks; they are used again by the factorisation.
             damping: Levenberg-Marquardt's, as a share of the diagonal.
             out: room to write into; a factorisation that used it before is lost.
-            threads: on how many cores to eliminate chains. What the chains leave for the top is then added up in
-                another order, which changes the result by rounding.
 
         Raises:
             UnderDeterminedError: something is not tied down.
         """
         tree = self.tree
         rows = out if out is not None else self.empty_rows()
-        failed = eliminate_chains(tree, system, damping, rows, threads)
+        rows.workspace[:] = 0.0
+        failed = eliminate(tree, system, damping, rows)
         if failed >= 0:
             raise UnderDeterminedError(self._tangent_column(failed))
         columns = tree.front[tree.front_start[-2] :]

@@ -1,8 +1,7 @@
 """Losses that bound what one wrong measurement can do, as weights of plain squares.
 
 With s the squared length of a whitened residual, a loss rho(s) has the weight rho'(s) in the normal equations.
-Barron, "A general and adaptive robust loss function" (2019); for graduated non-convexity Yang, Antonante, Tzoumas and
-Carlone, "Graduated non-convexity for robust spatial perception" (2020).
+Huber, "Robust estimation of a location parameter" (1964).
 """
 
 from typing import Final, NamedTuple
@@ -14,13 +13,7 @@ from groundsbot.offline.foundation import inlined, inner, jitted
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
-_CAUCHY: Final = 2
-_GEMAN_MCCLURE: Final = 3
-_TRUNCATED: Final = 4
 
-# What is cut off keeps this share of its force: a tag of which no reading fits is still somewhere, a thousand times
-# less certain than they say.
-_TRUNCATED_WEIGHT: Final = 1e-6
 # None at all would leave a tag that is only read beyond the threshold without a place to go to.
 _LEAST_CURVATURE: Final = 0.01
 
@@ -52,54 +45,19 @@ def curved(loss: Loss) -> Loss:
     """The same loss with the matrix of its steps as near to its second derivative as leaves it a square root.
 
     By weights alone each step leaves over a share of the way, nearly all of it where many readings lie beyond the
-    threshold. Of losses that forget the second derivative is negative far out; they keep their weights.
+    threshold.
     """
     return loss._replace(least_curvature=_LEAST_CURVATURE) if loss.form == _HUBER else loss
-
-
-def cauchy(threshold: float) -> Loss:
-    """c^2 log(1 + s / c^2): a force that dies away with distance."""
-    return Loss(_CAUCHY, threshold)
-
-
-def graduated(threshold: float, control: float) -> Loss:
-    """Geman and McClure's c^2 s / (c^2 + s), surrogate with c^2 = control threshold^2; the loss itself at control 1.
-
-    Nearly squares for a large control. `graduated.solve_graduated` solves with a falling one.
-    """
-    return Loss(_GEMAN_MCCLURE, threshold * float(np.sqrt(control)))
-
-
-def truncated(threshold: float) -> Loss:
-    """Squares up to the threshold, then as good as constant: what lies beyond has no say.
-
-    Only for a start near the solution: what is cut off where the solve begins will not be heard again.
-    """
-    return Loss(_TRUNCATED, threshold)
-
-
-def forgets(loss: Loss) -> bool:
-    """Whether what is far off loses its say altogether, so that where the solve begins decides what is believed."""
-    return loss.form in (_GEMAN_MCCLURE, _TRUNCATED)
 
 
 @inner
 def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
     """Loss rho and weight rho' of a squared length."""
     c2 = loss.threshold * loss.threshold
-    if loss.form == _HUBER:
-        if square <= c2:
-            return square, 1.0
-        length = np.sqrt(square)
-        return loss.threshold * (2.0 * length - loss.threshold), loss.threshold / length
-    if loss.form == _CAUCHY:
-        return c2 * np.log1p(square / c2), c2 / (c2 + square)
-    if loss.form == _GEMAN_MCCLURE:
-        share = c2 / (c2 + square)
-        return share * square, share * share
-    if loss.form == _TRUNCATED and square > c2:
-        return c2 + _TRUNCATED_WEIGHT * (square - c2), _TRUNCATED_WEIGHT
-    return square, 1.0
+    if loss.form == _SQUARES or square <= c2:
+        return square, 1.0
+    length = np.sqrt(square)
+    return loss.threshold * (2.0 * length - loss.threshold), loss.threshold / length
 
 
 @inlined

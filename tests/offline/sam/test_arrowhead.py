@@ -11,12 +11,12 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
 from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, cauchy, graduated, huber, truncated
-from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem, solve
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.graphs import made_graph, with_measured
 
-LOSSES = (SQUARES, huber(1.5), cauchy(1.5), graduated(2.0, 4.0), truncated(2.5))
+LOSSES = (SQUARES, huber(1.5))
 
 
 def arrowhead_of(problem: Problem) -> Arrowhead:
@@ -213,26 +213,3 @@ def test_a_distance_from_the_middle_of_a_chain_is_refused() -> None:
     distances = replace(problem.measured.distances, pose_a=np.array([5]), tag_a=np.array([-1]))
     with pytest.raises(ValueError, match="first pose of a chain"):
         arrowhead_of(replace(problem, measured=replace(problem.measured, distances=distances)))
-
-
-@pytest.mark.parametrize("threads", [2, 3, 8])
-def test_several_cores_give_the_same_result(threads: int) -> None:
-    problem, truth = made_graph(5, [40, 65, 3, 120, 9], 9)
-    arrowhead = problem.arrowhead
-    system, _ = arrowhead.linearise(truth)
-    alone = arrowhead.factorise(system).solve_in_order(system.gradient)
-    shared = arrowhead.factorise(system, threads=threads).solve_in_order(system.gradient)
-    np.testing.assert_allclose(shared, alone, rtol=0.0, atol=1e-11 * float(np.abs(alone).max()))
-    start = State(truth.poses, truth.tags + 0.05, truth.calibration)
-    one, several = (solve(problem, start, losses=PLAIN_SQUARES, threads=n) for n in (1, threads))
-    np.testing.assert_allclose(several.state.poses, one.state.poses, atol=1e-9)
-    np.testing.assert_allclose(several.state.tags, one.state.tags, atol=1e-9)
-
-
-def test_several_cores_name_what_is_not_tied_down() -> None:
-    problem, truth = made_graph(5, [40, 65], 9)
-    arrowhead = problem.arrowhead
-    system, _ = arrowhead.linearise(truth)
-    system.pose[50] = 0.0
-    with pytest.raises(UnderDeterminedError):
-        arrowhead.factorise(system, threads=2)

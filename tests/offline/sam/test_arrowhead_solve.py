@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.factors.odometry_and_readings import State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, cauchy, graduated, huber
+from groundsbot.offline.sam.factors.robust_losses import SQUARES, huber
 from groundsbot.offline.sam.solver import Losses, Problem, solve
 from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet
 from tests.support.data.graphs import made_graph, reordered
@@ -93,15 +93,14 @@ def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
     assert (sigma > 1e3).all()
 
 
-@pytest.mark.parametrize("loss", [huber(3.0), cauchy(3.0), graduated(3.0, 1.0)], ids=["huber", "cauchy", "graduated"])
-def test_robust_losses_bound_what_a_wrong_reading_does(loss: Loss) -> None:
+def test_hubers_loss_bounds_what_a_wrong_reading_does() -> None:
     fleet = made_fleet(5, 1, 400, 20)
     value = fleet.problem.readings.value.copy()
     value[::25, 0] += 1.5
     wrong = replace(fleet.problem, readings=replace(fleet.problem.readings, value=value))
     clean = solve(fleet.problem, fleet.truth, losses=PLAIN).state.tags
     bent = np.abs(solve(wrong, fleet.truth, losses=PLAIN).state.tags - clean).max()
-    robust = np.abs(solve(wrong, fleet.truth, losses=Losses(SQUARES, loss)).state.tags - clean).max()
+    robust = np.abs(solve(wrong, fleet.truth, losses=Losses(SQUARES, huber(3.0))).state.tags - clean).max()
     assert robust < 0.5 * bent
 
 

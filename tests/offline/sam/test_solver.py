@@ -14,7 +14,7 @@ from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, State
-from groundsbot.offline.sam.factors.robust_losses import cauchy, losses_and_weights
+from groundsbot.offline.sam.factors.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.drives import FAMILY, START_NS, made_positions, made_robot, made_run
@@ -142,7 +142,7 @@ def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
     assert distance(made.problem, solution.state, made.truth) < 1e-7
 
 
-@pytest.mark.parametrize("losses", [DEFAULT_LOSSES, PLAIN_SQUARES, Losses(cauchy(3.0), cauchy(3.0))], ids=str)
+@pytest.mark.parametrize("losses", [DEFAULT_LOSSES, PLAIN_SQUARES, Losses(huber(3.0), huber(3.0))], ids=str)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
     """One linearisation, no step: by the linear model there is nothing left to win."""
