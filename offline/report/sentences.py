@@ -94,7 +94,7 @@ def _joined(document: dict[str, Any]) -> str:
             f"one map: they fall into {len(components)} components, each in a frame of its own, of which the largest "
             f"holds {counted(len(first['runs']), 'run')} and {counted(len(first['tags']), 'tag')}."
         )
-    names = enumerated([run["run"] for run in document["runs"]])
+    names = enumerated([*dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"])])
     if len(document["runs"]) == 1:
         return (
             f"One run, {names}, drove {driven_m:.1f} m and placed {counted(n_tags, 'tag')}; nothing was to be joined."

@@ -35,6 +35,12 @@ def test_doubts_are_said() -> None:
     assert "1 measurement by hand does not fit to the rest" in words_of(measurements=[taped])
 
 
+def test_a_run_that_was_parted_is_one_run() -> None:
+    runs = map_as_json(made_map())["runs"]
+    parted = [*runs, runs[1] | {"run": "blue_two_stretch2", "stretch_of": "blue_two"}]
+    assert "2 runs (red_one and blue_two; " in words_of(runs=parted)
+
+
 def test_unknown_numbers_are_not_said() -> None:
     unknown = replace(made_component(), joint_covariance=np.full((12, 12), np.nan))
     tags = tuple(replace(tag, covariance=np.full((2, 2), np.nan)) for tag in unknown.tags)
