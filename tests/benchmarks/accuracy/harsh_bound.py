@@ -80,18 +80,66 @@ def shape_bound_m(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) ->
     """
     told: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
     places = {(tag["family"], tag["tag_id"]): np.array(tag["position_m"][:2]) for tag in told["tags"]}
-    seen = sorted(
-        {
-            (run.tags[t].family, run.tags[t].tag_id)
-            for run in runs
-            for t in _true_readings(run, told["runs"][run.name])[1].tolist()
-        }
-    )
+    seen = sorted({key for run in runs for key in _seen(run, told)})
     index = {key: i for i, key in enumerate(seen)}
     tags_m = np.array([places[key] for key in seen])
-    drives = [_drive(run, told["runs"][run.name], index) for run in runs]
+    return _rmse_of_shape(_tag_covariance(runs, told, harsh, [index] * len(runs), tags_m), tags_m)
+
+
+def shift_sigmas(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) -> dict[int, float]:
+    """By how many sigmas of what can be known at most each changed tag was moved, all other tags where they were.
+
+    Args:
+        runs: of one seed, driven one after the other; tags were changed after the first.
+        truth: truth.json of the same, where a changed tag has two places, instances a and b.
+        harsh: the switches that are on.
+
+    Returns:
+        By id; of tags that only one side of the change read, nothing is known: they are left out.
+    """
+    told: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
+    first = min(runs, key=lambda run: int(told["runs"][run.name]["poses"][0][0]))
+    places = {
+        (tag["family"], tag["tag_id"], tag.get("instance") or ""): np.array(tag["position_m"][:2])
+        for tag in told["tags"]
+    }
+
+    def named(run: Run, key: tuple[str, int]) -> tuple[str, int, str]:
+        return (*key, ("a" if run is first else "b") if (*key, "b") in places else "")
+
+    seen = sorted({named(run, key) for run in runs for key in _seen(run, told)})
+    index = {name: i for i, name in enumerate(seen)}
+    of_runs = [{key: index[named(run, key)] for key in _seen(run, told)} for run in runs]
+    tags_m = np.array([places[name] for name in seen])
+    covariance = _tag_covariance(runs, told, harsh, of_runs, tags_m)
+    found = {}
+    for family, tag_id, instance in seen:
+        if instance == "a" and (family, tag_id, "b") in index:
+            i, j = index[family, tag_id, "a"], index[family, tag_id, "b"]
+            rows = [2 * i, 2 * i + 1, 2 * j, 2 * j + 1]
+            difference = np.hstack([-np.eye(2), np.eye(2)])
+            off_m = tags_m[j] - tags_m[i]
+            shift = difference @ covariance[np.ix_(rows, rows)] @ difference.T
+            found[tag_id] = float(np.sqrt(off_m @ np.linalg.solve(shift, off_m)))
+    return found
+
+
+def _seen(run: Run, told: dict[str, Any]) -> set[tuple[str, int]]:
+    """Family and id of the tags that a run read rightly."""
+    return {(run.tags[t].family, run.tags[t].tag_id) for t in _true_readings(run, told["runs"][run.name])[1].tolist()}
+
+
+def _tag_covariance(
+    runs: Sequence[Run],
+    told: dict[str, Any],
+    harsh: Collection[Harsh],
+    indices: Sequence[dict[tuple[str, int], int]],
+    tags_m: FloatArray,
+) -> FloatArray:
+    """(2T, 2T) the bound of the tags (T, 2), which each run's readings are of by its index; the first pose is held."""
+    drives = [_drive(run, told["runs"][run.name], index) for run, index in zip(runs, indices, strict=True)]
     n_poses = sum(len(each.poses) for each in drives)
-    tags_at, robots_at = 3 * n_poses, 3 * n_poses + 2 * len(seen)
+    tags_at, robots_at = 3 * n_poses, 3 * n_poses + 2 * len(tags_m)
     n = robots_at + _N_ROBOT * len(drives) + 1
     information = sparse.lil_matrix((n, n))
     information.setdiag(
@@ -109,8 +157,7 @@ def shape_bound_m(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) ->
     columns = np.arange(tags_at, robots_at)
     units = np.zeros((n, len(columns)))
     units[columns, np.arange(len(columns))] = 1.0
-    covariance = splu(sparse.csc_matrix(total + held)).solve(units)[columns]
-    return _rmse_of_shape(covariance, tags_m)
+    return np.asarray(splu(sparse.csc_matrix(total + held)).solve(units)[columns])
 
 
 def _rmse_of_shape(covariance: FloatArray, tags_m: FloatArray) -> float:
