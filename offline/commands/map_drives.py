@@ -150,9 +150,10 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
-    if verbose:
+    if verbose or result.measurements:  # who measured asks what that does for the scale
         lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
-        lines += [] if result.noise_fit is None else _noise_lines(result.noise_fit)
+    if verbose and result.noise_fit is not None:
+        lines += _noise_lines(result.noise_fit)
     lines += _floor_lines(result)
     lines += [*verdict_lines(result.robot_numbers), *refused_lines(result)]
     lines += _to_act_on(result, verbose=verbose)
