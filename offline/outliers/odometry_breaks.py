@@ -317,7 +317,7 @@ def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_P
     chi_square = 2.0 * (joined - apart.cost)
     if chi_square <= bound:
         return None
-    jump = _jump(local_map.graph, apart.state, *place)
+    jump = unexplained_motion(local_map.graph, apart.state, *place)
     reach = min(other.end for other in equal) - 1, max(other.begin for other in equal)
     return Break(place.end, place.begin, reach, jump, chi_square, float(bound))
 
@@ -329,7 +329,7 @@ def _freed(problem: Problem, end: int, begin: int) -> Problem:
     return replace(problem, odometry=replace(problem.odometry, whitening=weak))
 
 
-def _jump(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
+def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
     """(3,) the motion that the wheels do not have."""
     odometry = graph.chains[0].odometry.part(end - 1, begin)
     told = odometry.dead_reckoned(graph.wheel_calibration(state, 0))[-1]

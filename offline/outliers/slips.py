@@ -14,11 +14,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray, counted
-from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Chain
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
-from groundsbot.offline.sam import Solution, build_graph, solve
+from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
+from groundsbot.offline.sam import build_graph, solve
 
 # Motions that are no more strained than one in a hundred is by chance are not tried.
 _STRAINED: Final = float(chi2.isf(1e-2, 3))
@@ -73,7 +73,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     if not found:
         return local_map, []
     slips = [
-        Slip(first, end, _jump(local_map, solution, first, end), found[i])
+        Slip(first, end, unexplained_motion(local_map.graph, solution.state, first + 1, end), found[i])
         for i, (first, end) in zip(found, motions[list(found)].tolist(), strict=True)
     ]
     freed_map = replace(local_map, chain=graph.chains[0], graph=graph, solution=solution)
@@ -107,10 +107,3 @@ def _freed(chain: Chain, motions: IntArray) -> Chain:
     for first, end in motions.tolist():
         covariance[first:end] += _FREED * np.eye(3)
     return replace(chain, odometry=replace(chain.odometry, covariance=covariance))
-
-
-def _jump(local_map: LocalMap, solution: Solution, first: int, end: int) -> FloatArray:
-    wheels = local_map.graph.wheel_calibration(solution.state, 0)
-    by_wheels = local_map.chain.odometry.part(first, end).dead_reckoned(wheels)[-1]
-    poses = solution.state.poses
-    return se2.between(by_wheels, se2.between(poses[first], poses[end]))
