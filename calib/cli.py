@@ -52,13 +52,13 @@ def tags(
 
     A tag's size is the outer edge of its black border. The white margin belongs to the tag: cut outside of it.
     """
-    from groundsbot.calib.foundation import counted
+    from groundsbot.calib.foundation import plural
     from groundsbot.calib.printing import print_tags
     from groundsbot.calib.tags import parse_tag_ids
 
     wanted = parse_tag_ids(ids, family)
     n_sheets = print_tags(family, wanted, size_mm, paper, output, packed, overwrite)
-    typer.echo(f"{output}: {counted(len(wanted), 'tag')} {family} of {size_mm:g} mm on {counted(n_sheets, 'sheet')}")
+    typer.echo(f"{output}: {plural(len(wanted), 'tag')} {family} of {size_mm:g} mm on {plural(n_sheets, 'sheet')}")
     typer.echo("print at 100 %, check the rulers; in robot.yaml:")
     typer.echo(f"tags: [{{family: {family}, default_size_m: {size_mm / 1e3:g}}}]")
 

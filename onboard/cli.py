@@ -41,10 +41,10 @@ def record(
     import sys
 
     from groundsbot.onboard.monitoring import STATUS_SUFFIX, Housekeeper
-    from groundsbot.onboard.process import ConsoleLines, Notifier, keep_memory, told_to_end
+    from groundsbot.onboard.process import ConsoleLines, Notifier, keep_memory, stop_event
     from groundsbot.onboard.recorder import LiveRecorder, RobotFiles
 
-    stop = told_to_end()
+    stop = stop_event()
     with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
@@ -128,7 +128,7 @@ def capture(
     from groundsbot.calib.board import parse_board
     from groundsbot.onboard.camera import camera_for
     from groundsbot.onboard.capture import Capture, CaptureGuide, CaptureView, summary
-    from groundsbot.onboard.process import RunClock, told_to_end
+    from groundsbot.onboard.process import RunClock, stop_event
     from groundsbot.onboard.recorder import capture_settings
 
     guide = CaptureGuide(parse_board(board), views)
@@ -137,9 +137,9 @@ def capture(
     view = CaptureView(Console())
     looked_at = picture or robot.with_name("capture.jpg")
     taking = Capture(camera, clock, guide, output, looked_at, view.show, view.say)
-    stop = told_to_end()
+    stop = stop_event()
     try:
-        with view.shown():
+        with view.live():
             taking.run(stop)
     finally:
         for line in summary(guide, output):

@@ -2,7 +2,7 @@ from .board import DEFAULT_BOARD, DEFAULT_VIEWS, MARKER_SHARE, Board, parse_boar
 from .finder import BoardFinder, View
 from .missing import why_no_board
 from .picture_source import GreyPicture, grey_pictures
-from .view_spread import SeenBoard, Spread, region_shares, seen_board
+from .view_spread import SeenBoard, Spread, describe_board, region_shares
 
 __all__ = [
     "DEFAULT_BOARD",
@@ -14,9 +14,9 @@ __all__ = [
     "SeenBoard",
     "Spread",
     "View",
+    "describe_board",
     "grey_pictures",
     "parse_board",
     "region_shares",
-    "seen_board",
     "why_no_board",
 ]

@@ -69,7 +69,7 @@ class Corners:
         return Corners(*(getattr(self, field.name)[mask] for field in dataclass_fields(self)))
 
 
-def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
+def fit_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
     """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
     known = (around.pixels[:, None], around.squares_px, around.growth_px, around.bend)
     inside = np.all([np.isfinite(each).all(axis=(1, 2)) for each in known], axis=0)
@@ -78,7 +78,7 @@ def fitted_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundin
     if not inside.any():
         none = np.zeros((0, 2))
         return Corners(ids[:0], none, np.zeros((0, 2, 2)), none[:, 0], none[:, 0])
-    return _Patches(picture, around.where(inside)).fitted(ids[inside])
+    return _Patches(picture, around.where(inside)).fit(ids[inside])
 
 
 class _Patches:
@@ -99,12 +99,12 @@ class _Patches:
         self._places = places.astype(np.float64)  # (N, P, 2)
         self._marker = around.marker_light(self._places)  # (N, P)
 
-    def fitted(self, ids: IntArray) -> Corners:
+    def fit(self, ids: IntArray) -> Corners:
         """The corners that look right."""
-        p = self._settled(self._start())
-        return self._judged(ids, p, self._looks_right(p))
+        p = self._minimise(self._start())
+        return self._with_covariances(ids, p, self._looks_right(p))
 
-    def _settled(self, p: FloatArray) -> FloatArray:
+    def _minimise(self, p: FloatArray) -> FloatArray:
         """Levenberg-Marquardt on all patches at once, each with its own damping, until it has arrived."""
         residual, jacobian = self._linearise(p)
         cost, damping = (residual**2).sum(axis=1), np.full(len(p), 1e-3)
@@ -200,7 +200,7 @@ class _Patches:
             & (np.exp(p[:, _BLURS]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
         )
 
-    def _judged(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
+    def _with_covariances(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
         """The good ones with their covariance: bright pixels are noisier, so it is made of each one's own residual."""
         residual, jacobian = self._linearise(p)
         residual, jacobian, count = residual[good], jacobian[good], self._seen[good].sum(axis=1)

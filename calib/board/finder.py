@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board.board import Board
-from groundsbot.calib.board.corner_fit import FIRST_BLUR_PX, Corners, fitted_corners
+from groundsbot.calib.board.corner_fit import FIRST_BLUR_PX, Corners, fit_corners
 from groundsbot.calib.board.corner_surroundings import FIRST_RADIUS_PX, RADIUS_PX, Surroundings, bends
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
@@ -48,7 +48,7 @@ class BoardFinder:
         squares, straight = self._local_squares(numbers, pixels), np.zeros((len(numbers), 2, 3))
         growth, blur_px = np.zeros((len(numbers), 2, 3)), np.full(len(numbers), FIRST_BLUR_PX)
         around = self._surroundings(numbers, pixels, squares, growth, straight, blur_px, FIRST_RADIUS_PX)
-        corners = fitted_corners(picture, numbers, around)
+        corners = fit_corners(picture, numbers, around)
         return View(name, picture, corners) if len(corners.ids) >= _LEAST_CORNERS else None
 
     def find_again(self, view: View, projected_px: FloatArray) -> View:
@@ -68,7 +68,7 @@ class BoardFinder:
         blur_px = np.full(len(at), np.median(view.corners.blur_px) if len(view.corners.ids) else FIRST_BLUR_PX)
         ids = np.arange(len(at))
         around = self._surroundings(ids, at, squares, growth, bend, blur_px, RADIUS_PX)
-        return View(view.name, view.picture, fitted_corners(view.picture, ids, around))
+        return View(view.name, view.picture, fit_corners(view.picture, ids, around))
 
     def places_around_m(self) -> FloatArray:
         """(K, 13, 3) in the board's frame, around each corner.
@@ -81,7 +81,7 @@ class BoardFinder:
         return np.asarray(self.corners_m[:, None] + _STEP * self._board.square_mm / 1000.0 * steps)
 
     @staticmethod
-    def moved_by_bends_px(before_px: FloatArray, after_px: FloatArray) -> FloatArray:
+    def largest_shift_px(before_px: FloatArray, after_px: FloatArray) -> FloatArray:
         """How far at most corners move where edges bend otherwise, of places (..., 13, 2) around them before and after.
 
         By the mean over the edge of what it bends away from its tangent: a third of that at its end.

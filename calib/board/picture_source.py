@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import MOST_PIXELS, claimed_size, is_complete
+from groundsbot.calib.foundation import MOST_PIXELS, is_complete, size_in_header
 
 _PICTURES: Final = frozenset({".png", ".jpg", ".jpeg"})
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".mjpeg", ".mjpg"})
@@ -65,7 +65,7 @@ def _picture(path: Path) -> GreyPicture:
         raise CalibError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if not is_complete(encoded):
         raise CalibError(f"{path}: is cut short, or neither PNG nor JPEG; leave it out")
-    width_px, height_px = claimed_size(encoded)
+    width_px, height_px = size_in_header(encoded)
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise CalibError(f"{path}: claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all; leave it out")
     # None where there is no picture, which OpenCV's stubs do not know.

@@ -47,7 +47,7 @@ class SeenBoard:
     share: float
 
 
-def seen_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tuple[int, int]) -> SeenBoard | None:
+def describe_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tuple[int, int]) -> SeenBoard | None:
     """Describes a view.
 
     Args:
@@ -90,7 +90,7 @@ class Spread:
         """One more."""
         self._views.append(view)
 
-    def covered(self, row: int, column: int) -> bool:
+    def is_covered(self, row: int, column: int) -> bool:
         """Whether enough views show corners in a region of the picture."""
         return sum((row, column) in view.regions for view in self._views) >= _VIEWS_OF_EACH
 
@@ -103,7 +103,7 @@ class Spread:
             " ".join(filter(None, (_ROWS[row], _COLUMNS[column]))) or "middle"
             for row in range(3)
             for column in range(3)
-            if not self.covered(row, column)
+            if not self.is_covered(row, column)
         ]
         if bare:
             yield f"show the board at the picture's {', '.join(bare)}"

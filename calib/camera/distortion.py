@@ -96,11 +96,11 @@ class Distortion:
     def remove(self, distorted: FloatArray) -> FloatArray:
         """Undistorted points `[..., 2]`, whose images are `distorted` to 1e-12; NaN where there is none."""
         with np.errstate(all="ignore"):  # a point without a solution may run away; it is refused below
-            points = self._radially_undistorted(distorted)
+            points = self._invert_radial(distorted)
             if self.p1 or self.p2:
                 for _ in range(_POLISH_STEPS):
                     image, jacobian = self._apply(points)
-                    step = _solved(jacobian, image - distorted)
+                    step = _solve_pairs(jacobian, image - distorted)
                     points = points - step
                     if not np.any(np.abs(step) > _POLISHED):
                         break
@@ -109,7 +109,7 @@ class Distortion:
             found = (error < _RESIDUAL * scale) & (np.hypot(points[..., 0], points[..., 1]) < self.limit)
         return np.where(found[..., np.newaxis], points, np.nan)
 
-    def _radially_undistorted(self, distorted: FloatArray) -> FloatArray:
+    def _invert_radial(self, distorted: FloatArray) -> FloatArray:
         """The start for the tangential terms: exact without them. Newton on r g(r^2), kept in a bracket."""
         target = np.minimum(np.hypot(distorted[..., 0], distorted[..., 1]), self.distorted_limit)
         low, high = np.zeros_like(target), np.full_like(target, self.limit)
@@ -175,7 +175,7 @@ def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
     return float(min(real.min(initial=bound), bound))
 
 
-def _solved(matrices: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_pairs(matrices: FloatArray, right: FloatArray) -> FloatArray:
     """Solutions of `[..., 2, 2]` systems; not finite where singular, which LAPACK would refuse for all of them."""
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
     determinant = a * d - b * c

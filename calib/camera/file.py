@@ -15,7 +15,7 @@ from groundsbot.calib.camera.distortion import COEFFICIENTS
 from groundsbot.calib.camera.kalibr import camera_from_kalibr, is_kalibr
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import FloatArray, parse_mapping, read_text, validated, written_whole
+from groundsbot.calib.foundation import FloatArray, atomic_write, parse_mapping, read_text, validate
 
 _ROUNDED_UP: Final = 1.001  # by whoever wrote the file
 
@@ -94,7 +94,7 @@ def read_camera_yaml(path: Path) -> CameraModel:
     content = parse_mapping(read_text(path), str(path))
     if is_kalibr(content):
         return camera_from_kalibr(content, str(path))
-    info = validated(_CameraInfo, content, str(path))
+    info = validate(_CameraInfo, content, str(path))
     fx, skew, cx, *lower = info.camera_matrix.data
     below, fy, cy = lower[:3]
     if skew or below or lower[3:] != [0.0, 0.0, 1.0]:
@@ -125,7 +125,7 @@ def read_estimate(path: Path) -> CameraEstimate | None:
     Raises:
         CalibError: it says something that cannot be.
     """
-    return validated(_Estimated, parse_mapping(read_text(path), str(path)), str(path)).groundsbot_estimate
+    return validate(_Estimated, parse_mapping(read_text(path), str(path)), str(path)).groundsbot_estimate
 
 
 def fitted_coefficients(coefficients: list[float], expected: int | None) -> list[float]:
@@ -153,7 +153,7 @@ def write_camera_yaml(model: CameraModel, path: Path, estimate: CameraEstimate |
     if estimate is not None:
         info["groundsbot_estimate"] = estimate.model_dump()
     text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None, width=120)
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 

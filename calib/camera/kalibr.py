@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import validated
+from groundsbot.calib.foundation import validate
 
 _DISTORTIONS: Final = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
 _FinitePart = Annotated[float, Field(allow_inf_nan=False)]
@@ -45,7 +45,7 @@ def camera_from_kalibr(content: Mapping[str, Any], source: str) -> CameraModel:
     names = [name for name in content if str(name).startswith("cam") and isinstance(content[name], Mapping)]
     if len(names) != 1:
         raise CalibError(f"{source}: has {len(names)} cameras ({', '.join(names)}); leave the one that is meant")
-    camera = validated(_KalibrCamera, content[names[0]], f"{source}: {names[0]}")
+    camera = validate(_KalibrCamera, content[names[0]], f"{source}: {names[0]}")
     if camera.camera_model != "pinhole" or camera.distortion_model not in _DISTORTIONS:
         raise CalibError(
             f"{source}: {names[0]} is {camera.camera_model} with {camera.distortion_model} but must be pinhole with "

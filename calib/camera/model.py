@@ -95,7 +95,7 @@ class CameraModel:
         unit: FloatArray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return unit
 
-    def scaled(self, factor: float) -> "CameraModel":
+    def resize(self, factor: float) -> "CameraModel":
         """The same camera where its pictures are resized by `factor`: the picture's edges stay, not pixel (0, 0).
 
         A size that does not come out whole is rounded, and each axis scaled by what it really is.

@@ -36,7 +36,7 @@ def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArra
     good = np.isfinite(rays).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         return []
-    turn = _turned_ahead(rays[good].mean(axis=0))
+    turn = _rotation_onto_axis(rays[good].mean(axis=0))
     turned = rays[good] @ turn.T
     if turned[:, 2].min() < _LEAST_COSINE:
         return []
@@ -56,7 +56,7 @@ def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArra
     return poses
 
 
-def _turned_ahead(ray: FloatArray) -> FloatArray:
+def _rotation_onto_axis(ray: FloatArray) -> FloatArray:
     """The least turn `[3, 3]` that takes a ray in front of the camera onto its axis."""
     x, y, z = (ray / np.linalg.norm(ray)).tolist()
     share = 1.0 / (1.0 + z)

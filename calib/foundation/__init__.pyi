@@ -1,9 +1,9 @@
 from .arrays import BoolArray, FloatArray, IntArray
 from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
-from .files import folder_written_whole, sync, written_whole
-from .picture_bytes import JPEG_END, MOST_PIXELS, claimed_size, is_complete, is_jpeg
-from .words import counted
-from .yaml_file import parse_mapping, read_text, validated, write_model
+from .files import atomic_write, folder_written_whole, sync
+from .picture_bytes import JPEG_END, MOST_PIXELS, is_complete, is_jpeg, size_in_header
+from .words import plural
+from .yaml_file import parse_mapping, read_text, validate, write_model
 
 __all__ = [
     "EXIT_DONE",
@@ -14,17 +14,17 @@ __all__ = [
     "BoolArray",
     "FloatArray",
     "IntArray",
-    "claimed_size",
-    "counted",
+    "atomic_write",
     "folder_written_whole",
     "is_complete",
     "is_jpeg",
     "new_app",
     "parse_mapping",
+    "plural",
     "read_text",
     "run",
+    "size_in_header",
     "sync",
-    "validated",
+    "validate",
     "write_model",
-    "written_whole",
 ]

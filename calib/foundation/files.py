@@ -11,7 +11,7 @@ from groundsbot.calib.errors import CalibError
 
 
 @contextmanager
-def written_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
+def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yields a temporary path beside `path`; renames it over `path` if the block ends well, else removes it.
 
     Args:
@@ -58,7 +58,7 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
     made = [each for each in folder.parents if not each.exists()]
     partial, replaced = (folder.with_name(f".{folder.name}.{os.getpid()}.{word}") for word in ("partial", "replaced"))
     try:
-        with _told(folder):
+        with _errors_as_calib_error(folder):
             if folder.is_mount():
                 raise CalibError(
                     f"{folder}: is where a disk is mounted, and is filled by renaming; name a folder in it"
@@ -66,7 +66,7 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
             _put_back(folder, partial, replaced)  # of a process of the same number that was killed, as in containers
             partial.mkdir(parents=True)
         yield partial
-        with _told(folder):
+        with _errors_as_calib_error(folder):
             for each in (*partial.rglob("*"), partial):
                 sync(each)
             if replace and folder.exists():
@@ -89,7 +89,7 @@ def _put_back(folder: Path, partial: Path, replaced: Path) -> None:
 
 
 @contextmanager
-def _told(folder: Path) -> Iterator[None]:
+def _errors_as_calib_error(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

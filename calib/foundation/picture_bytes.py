@@ -10,7 +10,7 @@ _PNG_SIZE_AT: Final = 16
 _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers that begin a frame
 
 
-def claimed_size(encoded: bytes) -> tuple[int, int]:
+def size_in_header(encoded: bytes) -> tuple[int, int]:
     """(width_px, height_px) as a PNG or JPEG file's head has them, (0, 0) where it has none; nothing is decoded."""
     if not is_jpeg(encoded):
         width_px, height_px = struct.unpack_from(">II", encoded.ljust(_PNG_SIZE_AT + 8, b"\0"), _PNG_SIZE_AT)

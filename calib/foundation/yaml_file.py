@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -109,11 +109,11 @@ def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[s
         reason = " ".join(str(error).split())[:_LONGEST_VALUE]
         raise CalibError(f"{source}: not valid YAML ({reason}); write plain `field: value` lines") from error
     if not isinstance(data, dict):
-        raise CalibError(f"{source}: holds {_shown(data)} where fields were expected; write `field: value` lines")
+        raise CalibError(f"{source}: holds {_abbreviate(data)} where fields were expected; write `field: value` lines")
     return cast(dict[str, Any], data)
 
 
-def validated(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
+def validate(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
     """`data` as a `model`.
 
     Raises:
@@ -125,29 +125,30 @@ def validated(model: type[Model], data: Mapping[str, Any], source: str) -> Model
         # A default worked out from a bad value is no mistake of its own.
         problems = [each for each in error.errors(include_url=False) if each["type"] != "default_factory_not_called"]
         more = f" (and {len(problems) - 1} more after that)" if len(problems) > 1 else ""
-        raise CalibError(f"{source}: {_explained(model, problems[0])}{more}") from error
+        raise CalibError(f"{source}: {_explain(model, problems[0])}{more}") from error
 
 
 def write_model(model: BaseModel, path: Path) -> None:
     """Writes every field of `model`, defaults included, as YAML; whole or not at all."""
     text = yaml.safe_dump(model.model_dump(), sort_keys=False, allow_unicode=True, width=120)
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
-def _explained(model: type[BaseModel], problem: ErrorDetails) -> str:
+def _explain(model: type[BaseModel], problem: ErrorDetails) -> str:
     field = _field_path(problem["loc"])
     if problem["type"] == "missing":
         return f"{field} is missing; add it"
     if problem["type"] == "extra_forbidden":
-        return f"{field} (given as {_shown(problem['input'])}) is not a field; {_nearest_field(model, problem['loc'])}"
+        given = _abbreviate(problem["input"])
+        return f"{field} (given as {given}) is not a field; {_nearest_field(model, problem['loc'])}"
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "value_error":  # our own validators say the way out themselves
         return f"{field}: {message}" if field else message
     if problem["type"] == "model_type":
         message = "must have its own `field: value` lines"
     message = re.sub(r"^\w+ should ", "must ", message)
-    return f"{field} is {_shown(problem['input'])} but {message}; correct it"
+    return f"{field} is {_abbreviate(problem['input'])} but {message}; correct it"
 
 
 def _field_path(location: tuple[int | str, ...]) -> str:
@@ -179,6 +180,6 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[
     return list(current.model_fields)
 
 
-def _shown(value: object) -> str:
+def _abbreviate(value: object) -> str:
     text = _SHORT.repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

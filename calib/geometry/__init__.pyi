@@ -1,8 +1,8 @@
 from . import se2, wheels
-from .se2 import chained, fit_transform
+from .se2 import chain_motions, fit_transform
 
 __all__ = [
-    "chained",
+    "chain_motions",
     "fit_transform",
     "se2",
     "wheels",

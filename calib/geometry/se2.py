@@ -27,9 +27,7 @@ def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> FloatArray:
     """T_a_c = T_a_b o T_b_c, heading wrapped into (-pi, pi]."""
     first, second = _arrays(T_a_b, T_b_c)
-    return _stack(
-        *_rotated_and_moved(first, second[..., 0], second[..., 1]), wrap_angle(first[..., 2] + second[..., 2])
-    )
+    return _stack(*_transform(first, second[..., 0], second[..., 1]), wrap_angle(first[..., 2] + second[..., 2]))
 
 
 def inverse(T_a_b: ArrayLike) -> FloatArray:
@@ -51,7 +49,7 @@ def apply(T_a_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
     """Points `[..., 2]` of frame b in frame a; the batch shapes of transform and points broadcast."""
     transform = np.asarray(T_a_b, dtype=np.float64)
     points = np.asarray(points_b, dtype=np.float64)
-    x, y = _rotated_and_moved(transform, points[..., 0], points[..., 1])
+    x, y = _transform(transform, points[..., 0], points[..., 1])
     return np.stack([x, y], axis=-1)
 
 
@@ -141,7 +139,7 @@ def _affine(
     return out
 
 
-def _rotated_and_moved(transform: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _transform(transform: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     cos, sin = np.cos(transform[..., 2]), np.sin(transform[..., 2])
     return transform[..., 0] + cos * x - sin * y, transform[..., 1] + sin * x + cos * y
 
@@ -175,7 +173,7 @@ def _rest_of_sin_over_square(omega: FloatArray) -> FloatArray:
     return np.where(small, series, (safe - np.sin(safe)) / (safe * safe))
 
 
-def chained(motions: FloatArray, start: FloatArray) -> FloatArray:
+def chain_motions(motions: FloatArray, start: FloatArray) -> FloatArray:
     """(N+1, 3) poses reached from `start` (3,) by N motions one after the other."""
     theta = start[2] + np.concatenate([[0.0], np.cumsum(motions[:, 2])])
     cos, sin = np.cos(theta[:-1]), np.sin(theta[:-1])

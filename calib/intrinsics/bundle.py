@@ -55,7 +55,7 @@ class Poses:
     rotation: FloatArray  # (V, 3, 3)
     place_m: FloatArray  # (V, 3)
 
-    def moved(self, step: FloatArray) -> "Poses":
+    def retract(self, step: FloatArray) -> "Poses":
         """Turned by (V, 0:3) and shifted by (V, 3:6) of `step`."""
         turns = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return Poses(turns @ self.rotation, self.place_m + step[:, 3:])
@@ -111,7 +111,7 @@ def inverse(information: FloatArray) -> FloatArray:
     return np.asarray((vectors * bounded) @ vectors.T * scale[:, None] * scale)
 
 
-def adjusted(
+def adjust_bundle(
     start: CameraModel, poses: Poses, seen: Observations, whitening: FloatArray, hold_intrinsics: bool = False
 ) -> Fit:
     """The camera and the poses of least squares, from a start.
@@ -125,15 +125,15 @@ def adjusted(
     """
     system = _System(seen, whitening)
     model, damping = start, 1e-4
-    blocks = system.linearised(model, poses)
+    blocks = system.linearise(model, poses)
     for _ in range(_ROUNDS):
         step_b, step_poses = blocks.step(damping, hold_intrinsics)
-        tried_model, tried_poses = _moved(model, step_b), poses.moved(-step_poses)
+        tried_model, tried_poses = _retract_camera(model, step_b), poses.retract(-step_poses)
         cost = np.inf if tried_model is None else system.cost(tried_model, tried_poses)
         if tried_model is not None and cost < blocks.cost:
             gain = blocks.cost - cost
             model, poses, damping = tried_model, tried_poses, max(0.1 * damping, _LEAST_DAMPING)
-            blocks = system.linearised(model, poses)
+            blocks = system.linearise(model, poses)
             if gain < _ARRIVED * blocks.cost:
                 break
         elif damping > _MOST_DAMPING or cost - blocks.cost < _ARRIVED * blocks.cost:
@@ -144,7 +144,7 @@ def adjusted(
     return Fit(model, poses, blocks.residual_px, blocks.whitened, information, by_view)
 
 
-def _moved(model: CameraModel, step: FloatArray) -> CameraModel | None:
+def _retract_camera(model: CameraModel, step: FloatArray) -> CameraModel | None:
     """None where the step leads to what no camera can be."""
     try:
         return with_parameters(model, parameters_of(model) - step)
@@ -203,19 +203,19 @@ class _System:
 
     def cost(self, model: CameraModel, poses: Poses) -> float:
         """Infinite where a corner that counts has no image."""
-        whitened = self._whitened(model.project(poses.points(self._seen.view, self._seen.points_m)[0]))[1]
+        whitened = self._whiten(model.project(poses.points(self._seen.view, self._seen.points_m)[0]))[1]
         cost = float((whitened**2).sum())
         return cost if np.isfinite(cost) else np.inf
 
-    def _whitened(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _whiten(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         residual = pixels - self._seen.pixels
         counted = np.where(self._used[:, None], residual, 0.0)
         return residual, np.einsum("nij,nj->ni", self._whitening, counted)
 
-    def linearised(self, model: CameraModel, poses: Poses) -> _Blocks:
+    def linearise(self, model: CameraModel, poses: Poses) -> _Blocks:
         points, turned = poses.points(self._seen.view, self._seen.points_m)
         pixels, by_point = model.project_with_jacobian(points)
-        residual, whitened = self._whitened(pixels)
+        residual, whitened = self._whiten(pixels)
         by_turn = np.cross(turned[:, None, :], by_point)  # of J (w x p): the row p x J
         J = np.concatenate([pixels_by_parameters(model, points, pixels), by_turn, by_point], axis=-1)
         J = self._whitening @ np.where(self._used[:, None, None], J, 0.0)
@@ -244,7 +244,7 @@ def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) 
     return Poses(rotation, place), good
 
 
-def renumbered(seen: Observations, kept: BoolArray) -> Observations:
+def select_views(seen: Observations, kept: BoolArray) -> Observations:
     """The corners of the views of the mask (V,), their views numbered anew."""
     number = np.cumsum(kept) - 1
     own = seen.where(np.asarray(kept[seen.view]))

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.board import Board, BoardFinder, GreyPicture, Spread, View, seen_board, why_no_board
+from groundsbot.calib.board import Board, BoardFinder, GreyPicture, Spread, View, describe_board, why_no_board
 from groundsbot.calib.camera import CameraEstimate, parameter_names
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import FloatArray, counted
-from groundsbot.calib.intrinsics.model_choice import KINDS, Calibration, calibrated, first_fit
+from groundsbot.calib.foundation import FloatArray, plural
+from groundsbot.calib.intrinsics.model_choice import KINDS, Calibration, calibrate_camera, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, expected_error_px, projection_covariance
 from groundsbot.calib.intrinsics.view_choice import distinct, most_telling
 
@@ -64,7 +64,7 @@ def require_board(found: Search, board: Board, finder: BoardFinder) -> None:
     """
     if not found.views:
         why = why_no_board(found.some_without, board, finder)
-        pictures = counted(len(found.without), "picture")
+        pictures = plural(len(found.without), "picture")
         raise CalibError(f"board {board.specification} is not seen clearly in any of {pictures}, {why}")
 
 
@@ -113,7 +113,7 @@ def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, mo
         lens = first_fit(views, finder, name, kinds)
         kept = np.nonzero(lens.views)[0][most_telling(lens.fit.by_view, most)]
         views = [views[index] for index in kept]
-    result = calibrated(views, finder, name, kinds)
+    result = calibrate_camera(views, finder, name, kinds)
     _refuse_unclear(result)
     return result
 
@@ -138,7 +138,7 @@ def error_map(result: Calibration) -> tuple[PictureGrid, FloatArray]:
     return grid, expected_error_px(projection_covariance(result.model, result.lens.covariance(), grid))
 
 
-def left_out(result: Calibration) -> list[str]:
+def unused_view_lines(result: Calibration) -> list[str]:
     """A line for each view that was not used."""
     lines = []
     for index, view in enumerate(result.views):
@@ -165,7 +165,7 @@ def verdict(result: Calibration, board: Board) -> list[str]:
         lines.append(f"at the {place} they are {np.nanmax(expected):.2f} px off: show the board there")
     size_px = model.width_px, model.height_px
     used = (view for view, kept in zip(result.views, result.lens.views, strict=True) if kept)
-    boards = (seen_board(view.corners.ids, view.corners.pixels, board, size_px) for view in used)
+    boards = (describe_board(view.corners.ids, view.corners.pixels, board, size_px) for view in used)
     missing = Spread(each for each in boards if each is not None).missing()
     lines += [f"to make it surer still, {each}" for each in missing] if enough else missing
     sigma = np.hypot(estimate.sigmas[0] / model.fx_px, estimate.sigmas[1] / model.fy_px)
@@ -194,7 +194,7 @@ def refuse_few(views: Sequence[View]) -> None:
     """
     if len(views) < _LEAST_VIEWS:
         raise CalibError(
-            f"the board is seen in {counted(len(views), 'picture')} only but at least {_LEAST_VIEWS} are needed, 20 to "
+            f"the board is seen in {plural(len(views), 'picture')} only but at least {_LEAST_VIEWS} are needed, 20 to "
             "40 are good; take more, all over the picture and tilted every way"
         )
     another_px = _ANOTHER_VIEW_SHARE * views[0].picture.shape[1]
@@ -221,7 +221,7 @@ def _refuse_unclear(result: Calibration) -> None:
         )
     if lens.views.sum() < _LEAST_VIEWS:
         raise CalibError(
-            f"only {counted(int(lens.views.sum()), 'view')} of {len(lens.views)} are sharp and agree, at least "
+            f"only {plural(int(lens.views.sum()), 'view')} of {len(lens.views)} are sharp and agree, at least "
             f"{_LEAST_VIEWS} are needed; take more, holding board and camera still"
         )
     sigma = float(np.sqrt(lens.covariance()[0, 0])) / model.fx_px

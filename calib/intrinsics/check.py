@@ -16,9 +16,9 @@ from groundsbot.calib.board import BoardFinder, View
 from groundsbot.calib.camera import CameraEstimate, CameraModel, parameters_of
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.intrinsics.bundle import adjusted
+from groundsbot.calib.intrinsics.bundle import adjust_bundle
 from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_few
-from groundsbot.calib.intrinsics.model_choice import Calibration, calibrated
+from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, difference_px, rms_px
 
 _CHANCE: Final = 0.001
@@ -45,7 +45,7 @@ class Check:
     lines: list[str]
 
 
-def checked(model: CameraModel, estimate: CameraEstimate | None, views: Sequence[View], finder: BoardFinder) -> Check:
+def compare(model: CameraModel, estimate: CameraEstimate | None, views: Sequence[View], finder: BoardFinder) -> Check:
     """Compares a camera with pictures.
 
     Raises:
@@ -58,7 +58,7 @@ def checked(model: CameraModel, estimate: CameraEstimate | None, views: Sequence
             f"{model.width_px}x{model.height_px}; take pictures of the size that was calibrated, or calibrate again"
         )
     refuse_few(views)
-    again = calibrated(views, finder, model.name, [model.distortion_model])
+    again = calibrate_camera(views, finder, model.name, [model.distortion_model])
     with np.errstate(over="ignore", invalid="ignore"):  # a camera that no lens has puts points nowhere
         with_file = _residuals_with(model, again)
         chance = _chance(model, estimate, again, with_file)
@@ -75,7 +75,7 @@ def _residuals_with(model: CameraModel, again: Calibration) -> FloatArray:
     seen, poses = lens.seen, lens.fit.poses
     imaged = np.asarray(np.isfinite(model.project(poses.points(seen.view, seen.points_m)[0])).all(axis=1))
     whitening = np.where(imaged[:, None, None], seen.whitening(lens.extra_sigma_px), 0.0)
-    fit = adjusted(model, poses, seen, whitening, hold_intrinsics=True)
+    fit = adjust_bundle(model, poses, seen, whitening, hold_intrinsics=True)
     return np.where(imaged[:, None], fit.residual_px, float(model.width_px))
 
 

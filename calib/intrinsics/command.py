@@ -7,17 +7,17 @@ from typing import Final
 from groundsbot.calib.board import DEFAULT_BOARD, BoardFinder, grey_pictures, parse_board
 from groundsbot.calib.camera import read_camera_yaml, read_estimate, write_camera_yaml
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import counted, written_whole
+from groundsbot.calib.foundation import atomic_write, plural
 from groundsbot.calib.intrinsics.calibration import (
     calibrate_from,
     check_ruler,
     estimate_of,
-    left_out,
     require_board,
     search,
+    unused_view_lines,
     verdict,
 )
-from groundsbot.calib.intrinsics.check import Check, checked
+from groundsbot.calib.intrinsics.check import Check, compare
 from groundsbot.calib.intrinsics.report import report_html
 
 _MOST_NAMED: Final = 20  # a video may have hundreds
@@ -42,13 +42,13 @@ def calibrate_camera(
     result = calibrate_from(found, finder, name, model, most_views)
     sentences = verdict(result, printed)
     try:
-        with written_whole(page) as partial:
+        with atomic_write(page) as partial:
             partial.write_text(report_html(result, sentences), encoding="utf-8")
             write_camera_yaml(result.model, output, estimate_of(result))
     except OSError as error:
         raise CalibError(f"{output}: cannot be written ({error.strerror}); name a file that you may write") from error
-    used = f"{int(result.lens.views.sum())} of {counted(len(found.views), 'view')} used"
-    return [*_without_board(found.without), *left_out(result), *sentences, f"{output}: {used}; look at {page}"]
+    used = f"{int(result.lens.views.sum())} of {plural(len(found.views), 'view')} used"
+    return [*_without_board(found.without), *unused_view_lines(result), *sentences, f"{output}: {used}; look at {page}"]
 
 
 def check_camera(camera: Path, pictures: Sequence[Path], board: str | None) -> Check:
@@ -62,7 +62,7 @@ def check_camera(camera: Path, pictures: Sequence[Path], board: str | None) -> C
     finder = BoardFinder(printed)
     found = search(grey_pictures(pictures), finder)
     require_board(found, printed, finder)
-    return checked(model, estimate, found.views, finder)
+    return compare(model, estimate, found.views, finder)
 
 
 def _without_board(names: Sequence[str]) -> list[str]:

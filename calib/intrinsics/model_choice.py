@@ -16,8 +16,8 @@ from groundsbot.calib.board import BoardFinder, View
 from groundsbot.calib.camera import COEFFICIENTS, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
-from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fitted_lens
+from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjust_bundle, poses_of, select_views
+from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fit_lens
 
 KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # the fewest coefficients first
 _FOLDS: Final = 5
@@ -55,20 +55,24 @@ class Calibration:
         return float(np.sqrt(np.median((self.lens.fit.residual_px**2).sum(axis=1)) / MEDIAN_CHI2))
 
 
-def calibrated(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS) -> Calibration:
+def calibrate_camera(
+    views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS
+) -> Calibration:
     """The camera that took the views, of the kind that predicts best what it was not fitted to.
 
     Raises:
         CalibError: the views do not tell a camera.
     """
     lens = first_fit(views, finder, name, kinds)
-    found = _looked(_Look(views, lens, every_pose(lens, observed(views, finder), len(views))), finder)
+    found = _refine_corners(
+        _Look(views, lens, every_pose(lens, collect_observations(views, finder), len(views))), finder
+    )
     scores = {found.lens.fit.model.distortion_model: 0.0}
     if len(kinds) > 1:
-        chosen, scores = _cross_validated(found.lens, kinds)
+        chosen, scores = _cross_validate(found.lens, kinds)
         if chosen.distortion_model != found.lens.fit.model.distortion_model:
-            found = _looked(_refitted(found, chosen, finder), finder)
-    return Calibration(found.lens, found.views, found.poses, blurred(found.views), scores)
+            found = _refine_corners(_refit(found, chosen, finder), finder)
+    return Calibration(found.lens, found.views, found.poses, find_blurred(found.views), scores)
 
 
 @dataclass(frozen=True)
@@ -81,14 +85,14 @@ class _Look:
     expected: FloatArray | None = None
 
 
-def _looked(look: _Look, finder: BoardFinder) -> _Look:
+def _refine_corners(look: _Look, finder: BoardFinder) -> _Look:
     """Looks for corners where the camera says that they are, as bent as it says, until it says the same afterwards."""
     for _ in range(_LOOKS):
         expected = _expected_places(look, finder)
-        if look.expected is not None and _settled(look, finder.moved_by_bends_px(look.expected, expected)):
+        if look.expected is not None and _has_converged(look, finder.largest_shift_px(look.expected, expected)):
             break
         views = [finder.find_again(view, each) for view, each in zip(look.views, expected, strict=True)]
-        look = _refitted(replace(look, views=views, expected=expected), look.lens.fit.model, finder)
+        look = _refit(replace(look, views=views, expected=expected), look.lens.fit.model, finder)
     return look
 
 
@@ -98,7 +102,7 @@ def _expected_places(look: _Look, finder: BoardFinder) -> FloatArray:
     return look.lens.fit.model.project(places + look.poses.place_m[:, None, None])
 
 
-def _settled(look: _Look, moved_px: FloatArray) -> bool:
+def _has_converged(look: _Look, moved_px: FloatArray) -> bool:
     """Whether corners that move by (V, K) move no camera: all together, no more than noise moves its parameters."""
     corners = [view.corners for view in look.views]
     moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
@@ -106,14 +110,14 @@ def _settled(look: _Look, moved_px: FloatArray) -> bool:
     return bool((moved**2 / variance).sum() < len(look.lens.fit.information))
 
 
-def _refitted(look: _Look, start: CameraModel, finder: BoardFinder) -> _Look:
+def _refit(look: _Look, start: CameraModel, finder: BoardFinder) -> _Look:
     """With the camera and the poses that follow from its views, the camera from a start."""
-    seen = observed(look.views, finder)
-    lens = _fitted_without(blurred(look.views), seen, start)
+    seen = collect_observations(look.views, finder)
+    lens = _fit_without(find_blurred(look.views), seen, start)
     return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
 
 
-def observed(views: Sequence[View], finder: BoardFinder) -> Observations:
+def collect_observations(views: Sequence[View], finder: BoardFinder) -> Observations:
     """The corners of all views."""
     corners = [view.corners for view in views]
     return Observations(
@@ -134,12 +138,12 @@ def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequ
         CalibError: none fits.
     """
     size_px = views[0].picture.shape[1], views[0].picture.shape[0]
-    seen = observed(views, finder)
+    seen = collect_observations(views, finder)
     found: list[tuple[LensFit, float]] = []
     why = ""
     for kind in sorted(kinds, key=lambda kind: COEFFICIENTS[kind]):
         try:
-            lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, kind, name))
+            lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, kind, name))
         except CalibError as error:
             why = str(error)
             continue
@@ -161,18 +165,18 @@ def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
     poses.rotation[lens.views], poses.place_m[lens.views] = lens.fit.poses.rotation, lens.fit.poses.place_m
     for view in np.nonzero(~lens.views)[0]:
         alone = np.arange(n_views) == view
-        own = renumbered(seen, alone)
+        own = select_views(seen, alone)
         imaged = np.asarray(
             np.isfinite(model.project(poses.where(alone).points(own.view, own.points_m)[0])).all(axis=1)
         )
         if imaged.any():
             whitening = imaged[:, None, None] * np.eye(2)
-            fit = adjusted(model, poses.where(alone), own, whitening, hold_intrinsics=True)
+            fit = adjust_bundle(model, poses.where(alone), own, whitening, hold_intrinsics=True)
             poses.rotation[view], poses.place_m[view] = fit.poses.rotation[0], fit.poses.place_m[0]
     return poses
 
 
-def blurred(views: Sequence[View]) -> BoolArray:
+def find_blurred(views: Sequence[View]) -> BoolArray:
     """(V,) views more blurred than the scatter among them allows, or without corners."""
     blur_px = np.array([np.median(view.corners.blur_px) if len(view.corners.ids) else np.inf for view in views])
     logarithm = np.log(blur_px)
@@ -181,18 +185,18 @@ def blurred(views: Sequence[View]) -> BoolArray:
     return np.asarray(logarithm - middle > _TOO_BLURRED * scatter)
 
 
-def _fitted_without(left_out: BoolArray, seen: Observations, start: CameraModel) -> LensFit:
+def _fit_without(left_out: BoolArray, seen: Observations, start: CameraModel) -> LensFit:
     """Fits the views that are not left out; the answer is about all of them."""
     kept = ~left_out
     of_kept = np.asarray(kept[seen.view])
-    lens = fitted_lens(renumbered(seen, kept), int(kept.sum()), start)
+    lens = fit_lens(select_views(seen, kept), int(kept.sum()), start)
     views, corners = np.zeros(len(kept), dtype=np.bool_), np.zeros(len(seen.view), dtype=np.bool_)
     misfit = np.full(len(kept), np.nan)
     views[kept], corners[of_kept], misfit[kept] = lens.views, lens.corners, lens.view_misfit
     return replace(lens, views=views, corners=corners, view_misfit=misfit)
 
 
-def _cross_validated(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, dict[str, float]]:
+def _cross_validate(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, dict[str, float]]:
     """The simplest kind whose error in views left out of its fit is within one standard error of the best one's.
 
     The rule of one standard error: Breiman et al., Classification and Regression Trees, 1984.
@@ -221,13 +225,13 @@ def _as_kind(lens: LensFit, kind: str) -> Fit | None:
             start = replace(model, distortion_model=kind, distortion=(*model.distortion, 0.0, 0.0, 0.0))
         else:
             start = first_guess(seen, n_views, (model.width_px, model.height_px), kind, model.name)
-        robust = fitted_lens(seen, n_views, start)
+        robust = fit_lens(seen, n_views, start)
     except CalibError:
         return None
     poses = every_pose(robust, seen, n_views)
     if not np.isfinite(robust.fit.model.project(poses.points(seen.view, seen.points_m)[0])).all():
         return None
-    return adjusted(robust.fit.model, poses, seen, seen.whitening(lens.extra_sigma_px))
+    return adjust_bundle(robust.fit.model, poses, seen, seen.whitening(lens.extra_sigma_px))
 
 
 def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
@@ -238,12 +242,12 @@ def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
     for fold in range(min(_FOLDS, n_views)):
         tested = np.arange(n_views) % _FOLDS == fold
         own = np.asarray(~tested[seen.view])
-        trained = adjusted(fit.model, fit.poses.where(~tested), renumbered(seen, ~tested), whitening[own]).model
-        test = renumbered(seen, tested)
+        trained = adjust_bundle(fit.model, fit.poses.where(~tested), select_views(seen, ~tested), whitening[own]).model
+        test = select_views(seen, tested)
         poses = fit.poses.where(tested)
         imaged = np.asarray(np.isfinite(trained.project(poses.points(test.view, test.points_m)[0])).all(axis=1))
         weights = np.where(imaged[:, None, None], whitening[~own], 0.0)
-        again = adjusted(trained, poses, test, weights, hold_intrinsics=True)
+        again = adjust_bundle(trained, poses, test, weights, hold_intrinsics=True)
         square = np.where(imaged, (again.residual_px**2).sum(axis=1), float(trained.width_px) ** 2)
         out[tested] = np.bincount(test.view, weights=square) / np.bincount(test.view)
     return out

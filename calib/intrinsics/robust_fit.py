@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from groundsbot.calib.camera import CameraModel, undistorted_camera
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjusted, poses_of, renumbered
+from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjust_bundle, poses_of, select_views
 
 _FOCALS: Final = np.geomspace(0.15, 5.0, 30)  # of the picture's width: from a fisheye to a telescope
 _VIEWS_FOR_GUESS: Final = 8
@@ -65,7 +65,7 @@ class LensFit:
         return self.fit.covariance() * self.variance
 
 
-def fitted_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit:
+def fit_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit:
     """Fits a camera robustly.
 
     Args:
@@ -81,9 +81,9 @@ def fitted_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit
     views &= counts >= _LEAST_CORNERS
     if views.sum() < 1:
         raise CalibError("the board fits no view; is it the board that the pictures show?")
-    model, fitted = _robust(start, poses.where(views), renumbered(seen, views))
+    model, fitted = _robust(start, poses.where(views), select_views(seen, views))
     poses.rotation[views], poses.place_m[views] = fitted.rotation, fitted.place_m
-    poses, views = _posed_again(model, poses, views, seen)
+    poses, views = _reestimate_poses(model, poses, views, seen)
     views &= counts >= _LEAST_CORNERS
     return _without_outliers(seen, views, model, poses.where(views))
 
@@ -93,7 +93,7 @@ def first_guess(seen: Observations, n_views: int, size_px: tuple[int, int], kind
     some = np.zeros(n_views, dtype=np.bool_)
     largest_first = np.argsort(-np.bincount(seen.view, minlength=n_views), kind="stable")
     some[largest_first[:_VIEWS_FOR_GUESS]] = True
-    own, count = renumbered(seen, some), int(some.sum())
+    own, count = select_views(seen, some), int(some.sum())
 
     def misfit(camera: CameraModel) -> float:
         poses, good = poses_of(camera, own, count)
@@ -111,7 +111,7 @@ def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[Camer
     for _ in range(_ROBUST_ROUNDS):
         imaged = np.isfinite(model.project(poses.points(seen.view, seen.points_m)[0])).all(axis=1)
         whitening = np.where(imaged, np.sqrt(weight), 0.0)[:, None, None] * np.eye(2)
-        fit = adjusted(model, poses, seen, whitening)
+        fit = adjust_bundle(model, poses, seen, whitening)
         model, poses = fit.model, fit.poses
         square = np.nan_to_num((fit.residual_px**2).sum(axis=1), nan=np.inf)
         scale = float(np.median(square)) / MEDIAN_CHI2 * _CAUCHY**2
@@ -119,15 +119,17 @@ def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[Camer
     return model, poses
 
 
-def _posed_again(model: CameraModel, poses: Poses, views: BoolArray, seen: Observations) -> tuple[Poses, BoolArray]:
+def _reestimate_poses(
+    model: CameraModel, poses: Poses, views: BoolArray, seen: Observations
+) -> tuple[Poses, BoolArray]:
     """Poses that a start far from the truth put wrong, a board's mirror image say, and views that it gave none."""
     for rank in (0, 1):
         fresh, found = poses_of(model, seen, len(views), rank)
-        own = renumbered(seen, found)
+        own = select_views(seen, found)
         imaged = np.asarray(
             np.isfinite(model.project(fresh.where(found).points(own.view, own.points_m)[0])).all(axis=1)
         )
-        settled = adjusted(
+        settled = adjust_bundle(
             model, fresh.where(found), own, imaged[:, None, None] * np.eye(2), hold_intrinsics=True
         ).poses
         fresh.rotation[found], fresh.place_m[found] = settled.rotation, settled.place_m
@@ -166,17 +168,17 @@ def _without_outliers(seen: Observations, views: BoolArray, model: CameraModel, 
     misfit = np.full(len(views), np.nan)
     for _ in range(_REJECTING_ROUNDS):
         corners, stay, misfit, extra_px = _agreeing(seen, kept, misfit)
-        own = renumbered(seen.where(corners), stay)
-        fit = adjusted(kept.model, kept.poses.where(stay[kept.views]), own, own.whitening(extra_px))
+        own = select_views(seen.where(corners), stay)
+        fit = adjust_bundle(kept.model, kept.poses.where(stay[kept.views]), own, own.whitening(extra_px))
         unchanged = np.array_equal(corners, kept.corners) and np.array_equal(stay, kept.views)
         kept = _Kept(stay, corners, fit.model, fit.poses)
         if unchanged:
             break
-    own = renumbered(seen.where(kept.corners), kept.views)
+    own = select_views(seen.where(kept.corners), kept.views)
     residual_px = kept.model.project(kept.poses.points(own.view, own.points_m)[0]) - own.pixels
     freedom = _freedom(len(own.view), len(kept.poses.place_m), 4 + len(model.distortion))
     extra_px = _extra_sigma_px(own, residual_px, freedom, typical=False)
-    fit = adjusted(kept.model, kept.poses, own, own.whitening(extra_px))
+    fit = adjust_bundle(kept.model, kept.poses, own, own.whitening(extra_px))
     return LensFit(fit, own, kept.views, kept.corners, extra_px, misfit)
 
 

@@ -16,7 +16,7 @@ from groundsbot.calib.printing.sheet import (
     black_cells,
     paper_size_mm,
     room_on,
-    sheets_written,
+    write_sheets,
 )
 
 
@@ -26,7 +26,9 @@ def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -
     Raises:
         CalibError: it does not fit on the paper either way, the paper is unknown, or the file cannot be written.
     """
-    with sheets_written(path, _turned(board, paper), f"groundsbot board {board.specification}", overwrite) as sheets:
+    with write_sheets(
+        path, _paper_orientation(board, paper), f"groundsbot board {board.specification}", overwrite
+    ) as sheets:
         sheets.rulers()
         _write_head(sheets, board)
         left_mm, top_mm, width_mm, height_mm = room_on((sheets.width_mm, sheets.height_mm))
@@ -36,7 +38,7 @@ def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -
         sheets.end_sheet()
 
 
-def _turned(board: Board, paper: str) -> tuple[float, float]:
+def _paper_orientation(board: Board, paper: str) -> tuple[float, float]:
     """The paper's width and height, upright or lying, as the board fits."""
     upright_mm = paper_size_mm(paper)
     wanted_mm = board.size_mm

@@ -8,7 +8,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import BoolArray, written_whole
+from groundsbot.calib.foundation import BoolArray, atomic_write
 
 try:
     from reportlab.lib.units import mm
@@ -138,7 +138,7 @@ class Sheets:
 
 
 @contextmanager
-def sheets_written(path: Path, size_mm: tuple[float, float], title: str, overwrite: bool) -> Iterator[Sheets]:
+def write_sheets(path: Path, size_mm: tuple[float, float], title: str, overwrite: bool) -> Iterator[Sheets]:
     """A PDF of sheets of one size, there as a whole when the block ends, or not at all.
 
     Raises:
@@ -147,7 +147,7 @@ def sheets_written(path: Path, size_mm: tuple[float, float], title: str, overwri
     if path.exists() and not overwrite:
         raise CalibError(f"{path}: exists already; name another file, or give --overwrite")
     try:
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             sheets = Sheets(temporary, size_mm, title)
             yield sheets
             sheets.save()

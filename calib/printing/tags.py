@@ -11,8 +11,8 @@ from groundsbot.calib.printing.sheet import (
     black_cells,
     paper_size_mm,
     room_on,
-    sheets_written,
     text_width_mm,
+    write_sheets,
 )
 from groundsbot.calib.tags import tag_bits
 
@@ -80,7 +80,7 @@ def print_tags(
     paper_mm = max((upright_mm, upright_mm[::-1]), key=lambda each: _fitting(piece, each)) if packed else upright_mm
     places = _places(piece, paper_mm, _grid(piece, paper_mm) if packed else (1, 1))
     batches = [ids[first : first + len(places)] for first in range(0, len(ids), len(places))]
-    with sheets_written(path, paper_mm, f"groundsbot tags {family} {size_mm:g} mm", overwrite) as sheets:
+    with write_sheets(path, paper_mm, f"groundsbot tags {family} {size_mm:g} mm", overwrite) as sheets:
         for index, batch in enumerate(batches, start=1):
             sheets.rulers()
             _write_head(sheets, piece, f"sheet {index} of {len(batches)}")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from groundsbot.calib.foundation import parse_mapping, read_text, validated
+from groundsbot.calib.foundation import parse_mapping, read_text, validate
 
 # Wider than anything that drives, and within what sums of squares can hold.
 Sigma = Annotated[float, Field(ge=1e-9, le=1e3)]
@@ -40,4 +40,4 @@ def read_noise_yaml(path: Path) -> NoiseParameters:
     Raises:
         CalibError: one line that names file, field, value, limit and way out.
     """
-    return validated(NoiseParameters, parse_mapping(read_text(path), str(path)), str(path))
+    return validate(NoiseParameters, parse_mapping(read_text(path), str(path)), str(path))

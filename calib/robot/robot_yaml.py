@@ -13,7 +13,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import parse_mapping, read_text, validated, write_model
+from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -259,7 +259,7 @@ def parse_robot_yaml(text: str, source: str) -> Robot:
     Raises:
         CalibError: one line that names file, field, value, limit and way out.
     """
-    return validated(Robot, parse_mapping(text, source), source)
+    return validate(Robot, parse_mapping(text, source), source)
 
 
 def read_robot_yaml(path: Path) -> Robot:

@@ -38,6 +38,6 @@ def outward(corners_px: FloatArray) -> FloatArray:
     return moved
 
 
-def moved_out(corners_px: FloatArray, by_px: float) -> FloatArray:
+def shift_edges(corners_px: FloatArray, by_px: float) -> FloatArray:
     """(..., 4, 2) the corners with all sides so many pixels further out."""
     return corners_px if by_px == 0.0 else corners_px + by_px * outward(corners_px)

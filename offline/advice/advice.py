@@ -52,13 +52,13 @@ def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResul
         solution: of that graph.
         component: its index.
     """
-    is_sound = solution.converged and not solution.untied.n_directions
+    is_sound = solution.converged and not solution.unobservable.n_directions
     if not graph.tags or not is_sound or solution.relative_error() > MAX_RELATIVE_ERROR:
         return []
-    return [_result(graph, solution, each, component) for each in judged(graph, solution)]
+    return [_result(graph, solution, each, component) for each in best_candidates(graph, solution)]
 
 
-def judged(graph: Graph, solution: Solution) -> list[Judged]:
+def best_candidates(graph: Graph, solution: Solution) -> list[Judged]:
     """The best pass and the best tag, as far as there are any, the better one first."""
     _, drives, view, passes, places = candidates_of(graph, solution.state)
     gains: list[tuple[str, Pass | Place, Gain]] = []
@@ -66,7 +66,7 @@ def judged(graph: Graph, solution: Solution) -> list[Judged]:
         with suppress(LinAlgError):  # a pass that rounding leaves untied tells nothing
             gains.append(("pass", each, gain_of_pass(graph, solution.state, each)))
     gains += [("tag", each, gain_of_place(drives, view, each)) for each in places]
-    known = known_of(solution, [gain for _, _, gain in gains])
+    known = joint_covariance_of(solution, [gain for _, _, gain in gains])
     now_m = known.sigmas_m()
     then = []
     for kind, candidate, gain in gains:
@@ -88,7 +88,7 @@ def candidates_of(graph: Graph, state: State) -> Candidates:
     return Candidates(sightings, drives, view, passes_of(ways, sightings), places_of(drives, view))
 
 
-def known_of(solution: Solution, gains: Sequence[Gain]) -> Known:
+def joint_covariance_of(solution: Solution, gains: Sequence[Gain]) -> Known:
     """The joint covariance of all tags and of whatever else the gains are about."""
     tags = solution.problem.columns.tags.reshape(-1)
     others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)

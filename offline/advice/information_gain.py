@@ -16,7 +16,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam import Linearised, stacked
+from groundsbot.offline.sam import Linearised, stack
 
 # Directions of an information matrix that tell this much less than the best one are rounding.
 _LEAST_SHARE: Final = 1e-10
@@ -73,7 +73,7 @@ class Known(NamedTuple):
         return diagonal[::2], mixed, diagonal[1::2]
 
 
-def condensed(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> Gain:
+def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> Gain:
     """What measurements tell of the map's columns when their own variables have given way.
 
     Own variables must be tied down where the map's are known; nothing may be added here to help that, which would hold
@@ -87,7 +87,7 @@ def condensed(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> G
     Raises:
         LinAlgError: own variables are not tied down.
     """
-    jacobian, _ = stacked(kinds, n_own + len(columns))
+    jacobian, _ = stack(kinds, n_own + len(columns))
     normal = sparse.coo_array(jacobian.T @ jacobian)
     row, column = normal.coords
     band, rest = np.zeros((min(_BAND, n_own - 1) + 1, n_own)), np.zeros((len(columns), n_own + len(columns)))

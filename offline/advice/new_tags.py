@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.advice.information_gain import Gain, condensed
+from groundsbot.offline.advice.information_gain import Gain, marginal_information
 from groundsbot.offline.advice.passes import SIGHTING_GAP_M
 from groundsbot.offline.sam import Columns, Graph, ReadingFactors, State
 
@@ -106,13 +106,13 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
     }
     start_m = np.arange(0.0, view.far_m, _LEAST_SPACING_M)
     at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.ways[0][:-1], start_m)}
-    first = list(islice(_seen_twice(drives, view, at_start), most // 3))
-    others = list(_seen_twice(drives, view, beside - at_start))
+    first = list(islice(_places_with_two_views(drives, view, at_start), most // 3))
+    others = list(_places_with_two_views(drives, view, beside - at_start))
     again = [place for place in others if place.n_sightings > 1]
     return first + _spread(again or others, drives.state.tags, most - len(first))
 
 
-def _seen_twice(drives: Drives, view: View, where: set[tuple[int, int]]) -> Iterator[Place]:
+def _places_with_two_views(drives: Drives, view: View, where: set[tuple[int, int]]) -> Iterator[Place]:
     """Of places beside some chains and keyframes those that more than one pose views."""
     for chain, keyframe in sorted(where):
         for side in (1.0, -1.0):
@@ -167,7 +167,7 @@ def gain_of_place(drives: Drives, view: View, place: Place, seen: BoolArray | No
     extended = State(state.poses, np.concatenate([state.tags, place.position_m[None]]), state.calibration)
     own, columns = _own_columns(of_map, poses)
     readings = _readings(drives, view, place, poses)
-    return condensed((readings.linearise(extended, own),), 2, columns)
+    return marginal_information((readings.linearise(extended, own),), 2, columns)
 
 
 def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.advice.information_gain import Gain, condensed
+from groundsbot.offline.advice.information_gain import Gain, marginal_information
 from groundsbot.offline.sam import Columns, Graph, State
 
 # A pass is a trip, not the whole drive again: at most this share of the longest run, and so far.
@@ -96,7 +96,7 @@ def passes_of(ways: list[FloatArray], sightings: list[Sighting], most: int = MOS
     n_keyframes = sum(each.last - each.first + 1 for each in found)
     most = min(most, max(1, len(found) * _MOST_KEYFRAMES // max(n_keyframes, 1)))
     found = _evenly(found, most)
-    work = sum((2.0 * len(_passed(each, sightings))) ** 3 for each in found)
+    work = sum((2.0 * len(_tags_along(each, sightings))) ** 3 for each in found)
     return _evenly(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
 
 
@@ -107,7 +107,7 @@ def _evenly(passes: list[Pass], most: int) -> list[Pass]:
     return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
 
 
-def _passed(wanted: Pass, sightings: list[Sighting]) -> set[int]:
+def _tags_along(wanted: Pass, sightings: list[Sighting]) -> set[int]:
     """The tags seen on the way."""
     return {
         each.tag
@@ -126,7 +126,9 @@ def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> Gain:
     odometry = replace(odometry, **{name: value[driven] for name, value in vars(odometry).items()})
     readings = replace(readings, **{name: value[read] for name, value in vars(readings).items()})
     own, columns = _own_columns(problem.columns, np.arange(first, last + 1), np.unique(readings.tag))
-    return condensed((odometry.linearise(state, own), readings.linearise(state, own)), 3 * (last - first + 1), columns)
+    return marginal_information(
+        (odometry.linearise(state, own), readings.linearise(state, own)), 3 * (last - first + 1), columns
+    )
 
 
 def _own_columns(of_map: Columns, poses: IntArray, tags: IntArray) -> tuple[Columns, IntArray]:

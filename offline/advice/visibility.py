@@ -18,7 +18,7 @@ _RADII: Final = np.sqrt(-2.0 * np.log1p(-np.array([1.0, 3.0, 5.0]) / 6.0))
 _ANGLES: Final = np.arange(8) * np.pi / 4.0
 
 
-def seen_shares(drives: Drives, view: View, place: Place, known: Known) -> FloatArray:
+def visibility_probabilities(drives: Drives, view: View, place: Place, known: Known) -> FloatArray:
     """(k,) with which probability each viewer of a place has a tag in view that hangs by the pose beside it.
 
     Args:
@@ -33,7 +33,7 @@ def seen_shares(drives: Drives, view: View, place: Place, known: Known) -> Float
     shares = []
     for viewer in place.viewers.tolist():
         joint = known.of(np.concatenate([columns[beside], columns[viewer]]))
-        by = np.hstack([_moved(drives, beside, place), -_moved(drives, viewer, place)])
+        by = np.hstack([_place_jacobian(drives, beside, place), -_place_jacobian(drives, viewer, place)])
         values, vectors = np.linalg.eigh(by @ joint @ by.T)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         circle = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -50,7 +50,7 @@ def expected_sigmas_m(drives: Drives, view: View, place: Place, known: Known) ->
     that count by their probability would promise as good as all of it. What puts one viewer too far off mostly puts
     those near it too far off as well, so they are taken to miss it in the order of their probabilities.
     """
-    shares = seen_shares(drives, view, place, known)
+    shares = visibility_probabilities(drives, view, place, known)
     levels = np.unique(shares)[::-1]
     chances = -np.diff(np.append(levels, 0.0))
     expected: FloatArray = (1.0 - levels[0]) * known.sigmas_m()
@@ -59,7 +59,7 @@ def expected_sigmas_m(drives: Drives, view: View, place: Place, known: Known) ->
     return expected
 
 
-def _moved(drives: Drives, pose: int, place: Place) -> FloatArray:
+def _place_jacobian(drives: Drives, pose: int, place: Place) -> FloatArray:
     """(2, 3) how the place moves in map with a pose that it hangs by, perturbed on the right."""
     theta = drives.state.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)

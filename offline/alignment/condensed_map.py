@@ -109,7 +109,7 @@ class AnchorTree:
         places, anchors = self.places(xi)
         # A node's step moves all that hangs on it by the twist Ad(T) Jr dxi in the frame of the start.
         by_step = se2.adjoint(anchors) @ se2.right_jacobian(xi[: 3 * n].reshape(n, 3))
-        moved = by_step[None, :, :2] + quarter_turned(places)[:, None, :, None] * by_step[None, :, None, 2]
+        moved = by_step[None, :, :2] + rotate_quarter(places)[:, None, :, None] * by_step[None, :, None, 2]
         out = np.zeros((n, 2, 5 * n))
         out[..., : 3 * n] = (moved * self.above[:, :, None, None]).transpose(0, 2, 1, 3).reshape(n, 2, 3 * n)
         cos, sin = np.cos(anchors[:, 2]), np.sin(anchors[:, 2])
@@ -145,7 +145,7 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
     )
 
 
-def quarter_turned(vectors: FloatArray) -> FloatArray:
+def rotate_quarter(vectors: FloatArray) -> FloatArray:
     """(..., 2) turned by a quarter to the left: how points move when all turns."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
@@ -155,7 +155,7 @@ def _in_anchors(joint: FloatArray, T_start_anchor: FloatArray, tag_m: FloatArray
     n = len(tag_m)
     cos, sin = np.cos(T_start_anchor[:, 2]), np.sin(T_start_anchor[:, 2])
     turn = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
-    quarter = quarter_turned(tag_m)
+    quarter = rotate_quarter(tag_m)
 
     def rows(matrix: FloatArray) -> FloatArray:
         out = matrix.copy()

@@ -39,7 +39,7 @@ class Link:
         """Sorts the surest first."""
         return -self.evidence_nats, self.names
 
-    def seen_from(self, index: int) -> tuple[int, FloatArray, FloatArray]:
+    def transform_from(self, index: int) -> tuple[int, FloatArray, FloatArray]:
         """The other map, T_index_other, and its right tangent's covariance."""
         if index == self.a:
             return self.b, self.T_a_b, self.covariance
@@ -121,7 +121,7 @@ def gap_of(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
     """
     T, covariance, here = np.zeros(3), np.zeros((3, 3)), begin
     for link in links:
-        here, T_here_there, own = link.seen_from(here)
+        here, T_here_there, own = link.transform_from(here)
         carried = se2.adjoint(se2.inverse(T_here_there))
         T = se2.compose(T, T_here_there)
         covariance = carried @ covariance @ carried.T + own

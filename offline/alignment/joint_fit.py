@@ -28,7 +28,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
-from groundsbot.offline.alignment.condensed_map import AnchorTree, quarter_turned
+from groundsbot.offline.alignment.condensed_map import AnchorTree, rotate_quarter
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, ill_fitting, worth_nats
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
 
@@ -120,7 +120,7 @@ class JointFit:
         """Both maps as they are."""
         return Bend(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
 
-    def linearised(self, bend: Bend) -> Linear:
+    def linearise(self, bend: Bend) -> Linear:
         """The differences around a bend."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
         if bent:
@@ -137,13 +137,13 @@ class JointFit:
         centre = in_a.mean(axis=0)
         by_transform = np.zeros((self.n, 2, 3))
         by_transform[:, :, :2] = -np.eye(2)
-        by_transform[:, :, 2] = -quarter_turned(in_a - centre)
+        by_transform[:, :, 2] = -rotate_quarter(in_a - centre)
         apart = (f_a - in_a).reshape(-1) - J_a @ bend.xi_a - by_b @ bend.xi_b
         covariance = S_a + turned
         covariance[np.diag_indices(2 * self.n)] += self.unmodelled_m2
         return Linear(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
 
-    def moved(self, linear: Linear, held: "Held") -> Bend:
+    def retract(self, linear: Linear, held: "Held") -> Bend:
         """The bend that the tags held ask for."""
         pull = np.zeros(2 * self.n)
         pull[held.rows] = held.pull
@@ -153,12 +153,12 @@ class JointFit:
             -self.b.covariance @ (linear.by_b.T @ pull),
         )
 
-    def settled(self, bend: Bend, members: BoolArray) -> tuple[Linear, "Held"]:
+    def solve(self, bend: Bend, members: BoolArray) -> tuple[Linear, "Held"]:
         """Where the steps end that these tags (n,) ask for, from a bend nearby."""
-        linear = self.linearised(bend)
+        linear = self.linearise(bend)
         held = hold(linear, members)
         for _ in range(_STEPS):
-            linear = self.linearised(self.moved(linear, held))
+            linear = self.linearise(self.retract(linear, held))
             before, held = held, hold(linear, members)
             left = float(held.motion @ held.information @ held.motion)
             if left < _CONVERGED_SIGMAS**2 and abs(before.rise - held.rise) < _CONVERGED_SIGMAS * (1.0 + held.rise):

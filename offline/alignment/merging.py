@@ -85,8 +85,8 @@ def merge(
         variance_factors: by which each map's noise is larger than its solve was told; from what the solve left over
             where None, 1 at least.
     """
-    condensed = _condensed(maps, variance_factors or [variance_factor(each) for each in maps])
-    pairs = tuple(_aligned_pairs(maps, condensed, placements or {}))
+    condensed = _condense(maps, variance_factors or [variance_factor(each) for each in maps])
+    pairs = tuple(_align_pairs(maps, condensed, placements or {}))
     links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
     return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
 
@@ -105,7 +105,7 @@ def variance_factor(local_map: LocalMap) -> float:
     return factor if goodness.fits else max(factor, goodness.chi_square / max(goodness.expected, 1))
 
 
-def _condensed(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
+def _condense(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
     """Each map reduced to the tags that others have too; None where there are none."""
     count: dict[TagKey, int] = {}
     for local_map in maps:
@@ -115,7 +115,7 @@ def _condensed(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[Conde
     return [condense(m, tags, factor) if tags else None for m, tags, factor in zip(maps, shared, factors, strict=True)]
 
 
-def _aligned_pairs(
+def _align_pairs(
     maps: Sequence[LocalMap],
     condensed: Sequence[CondensedMap | None],
     placements: Mapping[tuple[int, int], Placement],
@@ -175,7 +175,7 @@ def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
         members = [first]
         for here in members:
             for link in neighbours[here]:
-                there, T_here_there, _ = link.seen_from(here)
+                there, T_here_there, _ = link.transform_from(here)
                 if there not in placed:
                     placed[there] = se2.compose(placed[here], T_here_there)
                     members.append(there)

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.condensed_map import quarter_turned
+from groundsbot.offline.alignment.condensed_map import rotate_quarter
 from groundsbot.offline.alignment.joint_fit import Held, Linear, hold
 from groundsbot.offline.alignment.ransac import Explanation, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, log_wrong
@@ -134,7 +134,7 @@ class Rivalry:
     def covariance(self, explanation: Explanation) -> FloatArray:
         """(3, 3) of the right tangent of T_a_b."""
         by_motion = np.eye(3)
-        by_motion[:2, 2] = -quarter_turned(explanation.linear.centre)
+        by_motion[:2, 2] = -rotate_quarter(explanation.linear.centre)
         by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
         covariance: FloatArray = by_motion @ explanation.held.motion_covariance() @ by_motion.T
         return covariance

@@ -19,7 +19,7 @@ from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.joint_fit import JointFit
 from groundsbot.offline.alignment.model_selection import CHANCE_NATS, Rivalry
-from groundsbot.offline.alignment.ransac import Explanation, explanations, halves, settled, without
+from groundsbot.offline.alignment.ransac import Explanation, explanations, halves, refine_inliers, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM
 from groundsbot.offline.measurements import REACH_M, Placement, TagKey
 
@@ -126,10 +126,10 @@ class _Judge(Rivalry):
             return None
         if not any(self._agrees(each) for each in explained):
             self.placement = None  # a slip of the tape or of the pen: it tells none of them from the others
-        found = self._united(explained)
+        found = self._unite_groups(explained)
         evidence, best = found[0]
         groups = [each for _, each in found]
-        found += self._doubted(evidence, best)
+        found += self._drop_unneeded(evidence, best)
         for each in halves(self.fit, best):
             found.append((self.evidence(each), each))
             each.held.without_root()
@@ -139,11 +139,11 @@ class _Judge(Rivalry):
         for each in self.rivals(best, found, groups):
             if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
-        told = tuple(self._told(rival, found, groups, (), is_sure=False) for rival in rivals)
+        told = tuple(self._alignment(rival, found, groups, (), is_sure=False) for rival in rivals)
         beats_chance = best.n == len(self.shared) or evidence > CHANCE_NATS
-        return self._told(best, found, groups, told, is_sure=beats_chance and not rivals)
+        return self._alignment(best, found, groups, told, is_sure=beats_chance and not rivals)
 
-    def _doubted(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
+    def _drop_unneeded(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
         """The best without tags that it gains little from, and with others that fit then.
 
         Several together too, as two wrong ones bear each other out.
@@ -179,7 +179,7 @@ class _Judge(Rivalry):
     def _likeliest(found: list[tuple[float, Explanation]], least_nats: float) -> list[tuple[float, Explanation]]:
         return sorted((f for f in found if f[0] > least_nats), key=lambda f: -f[0])[:_BEAM]
 
-    def _united(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
+    def _unite_groups(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
         """Best first: what was found, and what becomes of groups of tags far from each other that agree on the place.
 
         From two tags in one corner a tag in another is foretold too ill to be counted; with two there it is told.
@@ -193,7 +193,7 @@ class _Judge(Rivalry):
                 if members.tobytes() in tried or members.tobytes() in found or not self.is_same_place(one, other):
                     continue
                 tried.add(members.tobytes())
-                together = settled(self.fit, one.linear.at, members)
+                together = refine_inliers(self.fit, one.linear.at, members)
                 if together is None or together.members.tobytes() in found:
                     continue
                 if (evidence := self.evidence(together)) > max(its, others):
@@ -247,7 +247,7 @@ class _Judge(Rivalry):
                 covering = covariance_union(covering, self.covariance(each) + np.outer(off, off))
         return covering
 
-    def _told(
+    def _alignment(
         self,
         explanation: Explanation,
         found: Sequence[tuple[float, Explanation]],

@@ -97,12 +97,12 @@ def explanations(fit: JointFit) -> list[Explanation]:
     found: list[Explanation] = []
     together = np.zeros((fit.n, fit.n), dtype=np.bool_)
     most = 0
-    for draw, (i, j, fits) in enumerate(_drawn_pairs(fit)):
-        if draw >= _draws_needed(0.5 * most / fit.n):
+    for draw, (i, j, fits) in enumerate(_random_pairs(fit)):
+        if draw >= _n_draws(0.5 * most / fit.n):
             break
         if not fits or together[i, j]:
             continue
-        explanation = _grown(fit, i, j)
+        explanation = _grow(fit, i, j)
         if explanation is not None and not any((explanation.members == each.members).all() for each in found):
             found.append(explanation)
             together |= np.outer(explanation.members, explanation.members)
@@ -138,12 +138,12 @@ def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
                 yield without(explanation, held[part == which])
 
 
-def _draws_needed(share: float) -> float:
+def _n_draws(share: float) -> float:
     """Draws of two tags until both belong to this share of all at least once, but for MISSED."""
     return log(MISSED) / log(1.0 - share**2) if share > 0.0 else float("inf")
 
 
-def _drawn_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
+def _random_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
     """Pairs of tags in random order, none twice, and whether their distance is the same in both maps."""
     first, second = np.triu_indices(fit.n, 1)
     order = np.random.default_rng(_SEED).permutation(len(first))[:_MOST_DRAWS]
@@ -173,7 +173,7 @@ def distances(
     return length, np.maximum(np.einsum("pi,pij,pj->p", along, spread, along), 0.0)
 
 
-def _grown(fit: JointFit, i: int, j: int) -> Explanation | None:
+def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
     """From two tags outward, then once more over all tags until nothing changes."""
     members = np.zeros(fit.n, dtype=np.bool_)
     members[[i, j]] = True
@@ -181,9 +181,9 @@ def _grown(fit: JointFit, i: int, j: int) -> Explanation | None:
     pair = [i, j]
     bend = fit.unbent(through(fit.places_a[pair], fit.places_b[pair]))
     for _ in range(_MOST_CHANGES):
-        linear = fit.linearised(bend)
+        linear = fit.linearise(bend)
         held = hold(linear, members)
-        bend = fit.moved(linear, held)
+        bend = fit.retract(linear, held)
         worst = _worst(held, members)
         if worst is not None:
             members[worst] = False
@@ -197,14 +197,14 @@ def _grown(fit: JointFit, i: int, j: int) -> Explanation | None:
         following = size <= _NEXT_VARIANCE * size.min()
         tried |= following
         members |= following & (ill_fitting(off, spread) < 1.0)
-    return settled(fit, bend, members)
+    return refine_inliers(fit, bend, members)
 
 
-def settled(fit: JointFit, bend: Bend, members: BoolArray) -> Explanation | None:
+def refine_inliers(fit: JointFit, bend: Bend, members: BoolArray) -> Explanation | None:
     """Takes in all that fits and drops what does not; what was dropped does not come back."""
     banned = np.zeros_like(members)
     for _ in range(_MOST_CHANGES):
-        linear, held = fit.settled(bend, members)
+        linear, held = fit.solve(bend, members)
         bend = linear.at
         worst = _worst(held, members)
         if worst is None and not held.closes:

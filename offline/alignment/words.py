@@ -10,7 +10,7 @@ from groundsbot.offline.measurements import TagKey
 _MOST_NAMED = 8
 
 
-def why_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
+def reason_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
     """Why run b is not joined to a, by name; they share a tag at least."""
     if alignment is not None and alignment.rivals:
         return _ambiguous(a, b, alignment)

@@ -10,7 +10,7 @@ from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_ro
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import metre_line, read_robot_files, say
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Stages, compilation_announced
+from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.mapping import Workings, build_map, read_runs
 from groundsbot.offline.maps import CalibrationResult, MapResult
 from groundsbot.offline.measurements import Run, TapeOptions
@@ -19,10 +19,10 @@ from groundsbot.offline.self_calibration import (
     Learnt,
     Owned,
     choice_words,
-    corrected,
+    correct_robot,
     learnt_lines,
     parse_calibrate,
-    refocused,
+    with_focal_lengths,
 )
 from groundsbot.onboard.log import find_logs
 
@@ -65,7 +65,7 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
     logs, robot_files = find_logs(list(options.logs)), read_robot_files(options.robots)
     if options.output.exists():
         raise OfflineError(f"-o {options.output}: is there already; name a new file or folder, nothing is written over")
-    with compilation_announced(say), progress_bar() as show:
+    with announce_compilation(say), progress_bar() as show:
         stages = Stages(show)
         result = build_map(
             read_runs(logs, robot_files, stages),
@@ -78,11 +78,11 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
         )
     robots = _robots(workings.runs)
     paths = _paths(options.output, [*robots])
-    learnt = _best_known(result.calibration)
+    learnt = _most_certain(result.calibration)
     corrections = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in learnt}
     written = []
     for robot_id, run in robots.items():
-        written += _write(corrected(run.robot, corrections), _camera(run, corrections), paths[robot_id])
+        written += _write(correct_robot(run.robot, corrections), _camera(run, corrections), paths[robot_id])
     return Calibrated(result, tuple(learnt), tuple(written))
 
 
@@ -131,7 +131,7 @@ def _numbers(run: Run) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def _best_known(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:
+def _most_certain(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:
     """Each number once: from the component that tells it best."""
     best: dict[Owned, CalibrationResult] = {}
     for each in calibration:
@@ -154,7 +154,7 @@ def _paths(output: Path, robot_ids: Sequence[str]) -> dict[str, Path]:
 
 
 def _camera(run: Run, learnt: dict[Owned, Learnt]) -> CameraModel | None:
-    return refocused(run.camera, learnt.get(Owned(run.robot_id, FOCAL_SCALE)))
+    return with_focal_lengths(run.camera, learnt.get(Owned(run.robot_id, FOCAL_SCALE)))
 
 
 def _write(robot: Robot, camera: CameraModel | None, path: Path) -> list[Path]:

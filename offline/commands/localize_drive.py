@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, counted, folder_written_whole, written_whole
+from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, atomic_write, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, read_robot_files, say
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Stages, compilation_announced
+from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.localization import Candidate, Localization, LocatedRun, NotLocated, localize
 from groundsbot.offline.mapping import check_robots
 from groundsbot.offline.maps import read_map, write_tum
@@ -67,7 +67,7 @@ def localize_log(options: LocalizeOptions) -> Localization:
         check_output(options.output, [*logs, options.map], JSON_FILE, overwrite=options.overwrite)
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
-    with compilation_announced(say), progress_bar() as show:
+    with announce_compilation(say), progress_bar() as show:
         run = load_run(logs[0], robot_files)
         check_robots([run], robot_files)
         found = localize(run, known, options.map, noise=noise, component=options.component, stages=Stages(show))
@@ -80,11 +80,11 @@ def _write(found: Localization, output: Path, *, overwrite: bool) -> None:
     try:
         with folder_written_whole(output, replace=overwrite) as folder:
             text = json.dumps(as_json(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-            with written_whole(folder / JSON_FILE) as partial:
+            with atomic_write(folder / JSON_FILE) as partial:
                 partial.write_text(text, encoding="utf-8")
             for run in found.runs:
                 write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
-                with written_whole(folder / f"{run.name}.csv") as partial:
+                with atomic_write(folder / f"{run.name}.csv") as partial:
                     partial.write_text(trajectory_csv(run), encoding="ascii")
     except OSError as error:
         raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
@@ -179,9 +179,9 @@ def summary(found: Localization, output: Path | None) -> list[str]:
 
 
 def _run_lines(run: LocatedRun) -> list[str]:
-    n = counted(len(run.tags), "tag")
+    n = plural(len(run.tags), "tag")
     return [
-        f"{run.name}: {counted(len(run.stamps_ns), 'keyframe')}, {run.distance_m:.1f} m, held by {n} of the map",
+        f"{run.name}: {plural(len(run.stamps_ns), 'keyframe')}, {run.distance_m:.1f} m, held by {n} of the map",
         f"  start {_place(run, 0)}",
         f"  end   {_place(run, -1)}",
     ]

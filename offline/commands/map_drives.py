@@ -8,12 +8,12 @@ from math import degrees, radians
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, counted, folder_written_whole
+from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, metre_line, read_robot_files, say
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import StageCost, Stages, compilation_announced
+from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
 from groundsbot.offline.mapping import Workings, build_map, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
@@ -32,7 +32,7 @@ from groundsbot.offline.maps import (
 )
 from groundsbot.offline.measurements import TapeOptions
 from groundsbot.offline.report import advice_sentence, contradiction_sentence, headline, write_picture
-from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refused_lines, verdict_lines
+from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
 from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
@@ -74,11 +74,11 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     upright_sigma_rad = _upright_sigma_rad(options.upright_deg, corners=options.corners)
     logs = find_logs(list(options.logs))
     check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
-    extending = None if options.extend is None else _read_extended(options.extend, options)
+    extending = None if options.extend is None else _read_map_to_extend(options.extend, options)
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
-    with compilation_announced(say), progress_bar() as show:
+    with announce_compilation(say), progress_bar() as show:
         stages, workings = Stages(show), Workings()
         result = build_map(
             read_runs(logs, robot_files, stages),
@@ -113,7 +113,7 @@ def _write_files(result: MapResult, workings: Workings, folder: Path, output: Pa
         raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
 
 
-def _read_extended(path: Path, options: MapOptions) -> MapResult:
+def _read_map_to_extend(path: Path, options: MapOptions) -> MapResult:
     """The map that is kept: its folder, or map.json in it."""
     folder = path.parent if path.name == JSON_FILE else path
     check_output(options.output, [folder], JSON_FILE, overwrite=options.overwrite)
@@ -155,7 +155,7 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
     if verbose and result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
     lines += _floor_lines(result)
-    lines += [*verdict_lines(result.robot_numbers), *refused_lines(result)]
+    lines += [*verdict_lines(result.robot_numbers), *refusal_lines(result)]
     lines += _to_act_on(result, verbose=verbose)
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
 
@@ -197,14 +197,14 @@ def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
 def _component_lines(component: Component, *, several: bool) -> list[str]:
     lines = []
     if several:
-        lines.append(f"component in the frame of {component.frame_run}: {counted(len(component.tags), 'tag')}")
+        lines.append(f"component in the frame of {component.frame_run}: {plural(len(component.tags), 'tag')}")
     for run in component.runs:
         n_tags = sum(run.name in tag.runs for tag in component.tags)
         lines.append(
-            f"{run.name}: {counted(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {counted(n_tags, 'tag')}"
+            f"{run.name}: {plural(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {plural(n_tags, 'tag')}"
         )
     if not several:
-        lines.append(f"{counted(len(component.tags), 'tag')} in one map, in the frame of {component.frame_run}'s start")
+        lines.append(f"{plural(len(component.tags), 'tag')} in one map, in the frame of {component.frame_run}'s start")
     return lines
 
 
@@ -236,7 +236,7 @@ def _noise_lines(fit: FittedNoise) -> list[str]:
     ]
     lines = []
     if fitted:
-        lines.append(f"noise as {counted(len(fit.runs), 'run')} show it (with 99 %): " + ", ".join(fitted))
+        lines.append(f"noise as {plural(len(fit.runs), 'run')} show it (with 99 %): " + ", ".join(fitted))
     kept: dict[str, list[str]] = {}
     for each in fit.parameters:
         if each.kept not in ("", NOT_NEEDED):

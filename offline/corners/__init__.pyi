@@ -1,7 +1,7 @@
 from .bundle_adjustment import Refined, refine
 from .factors import SpatialState
 from .graph import corner_graph
-from .initial_tag_poses import hung_otherwise
+from .initial_tag_poses import alternative_states
 from .multifrontal.fronts import NotPositiveError
 from .solver import CornerSolution, solve_corners
 
@@ -10,8 +10,8 @@ __all__ = [
     "NotPositiveError",
     "Refined",
     "SpatialState",
+    "alternative_states",
     "corner_graph",
-    "hung_otherwise",
     "refine",
     "solve_corners",
 ]

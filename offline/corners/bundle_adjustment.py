@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.robot import Mount
-from groundsbot.offline.corners.floor_noise import LEVEL, fitted_wobble, guessed_wobble, with_wobble
+from groundsbot.offline.corners.floor_noise import LEVEL, fit_attitude_sigmas, initial_attitude_sigmas, with_wobble
 from groundsbot.offline.corners.floor_slope_test import stretches_off_level
 from groundsbot.offline.corners.graph import CornerGraph, corner_graph
 from groundsbot.offline.corners.initial_tag_poses import tags_rehung
@@ -93,12 +93,12 @@ def refine(
     if reason := _too_large(graph, corners.problem):
         return None, [_NOT_REFINED.format(reason)]
     found = solve_corners(corners.problem, start)
-    too_many = _too_many_coupled(graph, found)
-    sigma = LEVEL if too_many else guessed_wobble(found.problem, found.state, found.factor, found.pictures)
+    too_many = _reason_for_level_floor(graph, found)
+    sigma = LEVEL if too_many else initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
         found = solve_corners(found.problem, tags_rehung(found.problem, found.state))
-        sigma = fitted_wobble(found.problem, found.state)
+        sigma = fit_attitude_sigmas(found.problem, found.state)
         found = solve_corners(with_wobble(found.problem, sigma), found.state)
     off_level = [*too_many, *stretches_off_level(graph, found)]
     reason = "" if found.converged else found.reason
@@ -128,9 +128,9 @@ def _log_bytes(graph: Graph) -> int:
     return sum(run.log_bytes for run in {chain.run.name: chain.run for chain in graph.chains}.values())
 
 
-def _too_many_coupled(graph: Graph, found: CornerSolution) -> list[str]:
+def _reason_for_level_floor(graph: Graph, found: CornerSolution) -> list[str]:
     """Why the floor is taken for level, where its logs are not worth the work of asking; no sentence else."""
-    n_pairs, n_bytes = found.problem.n_coupled, _log_bytes(graph)
+    n_pairs, n_bytes = found.problem.n_pairs_in_pictures, _log_bytes(graph)
     most = _FREE_PAIRS + n_bytes // _BYTES_A_PAIR
     if not n_bytes or n_pairs <= most:
         return []

@@ -14,12 +14,12 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.initial_tag_poses import eyes_of
-from groundsbot.offline.corners.kernels.lens import CENTRE, distorted_at
+from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues
-from groundsbot.offline.foundation import borrowed, jitted
+from groundsbot.offline.foundation import borrowed, njit
 
 
-def facing_as_predicted(factors: CornerFactors, state: SpatialState) -> CornerFactors:
+def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> CornerFactors:
     """The factors with sides that face as the state has them; as they were where a lens has no image of a corner."""
     looks = factors.looks
     predicted_px = np.empty_like(looks.corners_px)
@@ -29,7 +29,7 @@ def facing_as_predicted(factors: CornerFactors, state: SpatialState) -> CornerFa
     return replace(factors, looks=replace(looks, outward=np.where(is_seen, found, looks.outward)))
 
 
-@jitted
+@njit
 def project(looks: LookArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
     """Sets the pixels (M, 4, 2) of all corners, before sides are seen too far out; NaN where a lens has no image."""
     looks, values = borrowed(looks), borrowed(values)
@@ -47,7 +47,7 @@ def project(looks: LookArrays, lenses: FloatArray, values: SpatialValues, out: F
             y = values.tags[tag, 1] + R[1, 0] * u + R[1, 1] * v - places[k, 1]
             z = values.heights_m[tag] + R[2, 0] * u + R[2, 1] * v - places[k, 2]
             W = axes[k]
-            px, py, _, _, _, _, _ = distorted_at(
+            px, py, _, _, _, _, _ = distort(
                 lens,
                 W[0, 0] * x + W[0, 1] * y + W[0, 2] * z,
                 W[1, 0] * x + W[1, 1] * y + W[1, 2] * z,

@@ -145,7 +145,7 @@ class CornerFactors:
 
     def residual(self, state: SpatialState) -> FloatArray:
         """(M, 8), whitened; NaN where the lens has no image of a corner."""
-        return self._residual(state, self._seen(state))
+        return self._residual(state, self._predict(state))
 
     def linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
         """Residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by WOBBLE.
@@ -153,11 +153,11 @@ class CornerFactors:
         The last answer is kept: a floor's sigmas are looked for at one state.
         """
         if not self._last or self._last[0][0] is not state or self._last[0][1] is not columns:
-            self._last[:] = [(state, columns, self._linearised(state, columns))]
+            self._last[:] = [(state, columns, self._linearise(state, columns))]
         return self._last[0][2]
 
-    def _linearised(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
-        seen = self._seen(state)
+    def _linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
+        seen = self._predict(state)
         wobble = np.concatenate([_by_turning(seen.by_base, seen.in_base)[..., :2], -seen.by_base[..., 2:]], axis=-1)
         whitened = wobble.reshape(len(self.looks), 8, 3) / self.looks.sigma_px[:, None, None]
         block = self.columns(columns), self._jacobian(state, seen)
@@ -227,9 +227,9 @@ class CornerFactors:
         """(M, 6) as corrected, and R_base_camera (M, 3, 3)."""
         mount = self.looks.mount + state.calibration[self.looks.mount_parameters]
         roll, pitch, yaw = mount[:, 3], mount[:, 4], mount[:, 5]
-        return mount, _about_up(yaw) @ _about_left(pitch) @ _about_forward(roll) @ _LEVEL_OPTICAL
+        return mount, _about_up(yaw) @ _rotation_about_left(pitch) @ _about_forward(roll) @ _LEVEL_OPTICAL
 
-    def _seen(self, state: SpatialState) -> Seen:
+    def _predict(self, state: SpatialState) -> Seen:
         looks = self.looks
         flat = self._corners(state)
         in_map = flat @ state.turns[looks.tag][..., :2].swapaxes(-1, -2)
@@ -241,7 +241,7 @@ class CornerFactors:
         in_base = _from(se2.compose(looks.moved, se2.exp(late)), in_keyframe)
         mount, rotation = self._mount(state)
         in_camera = (in_base - mount[:, None, :3]) @ rotation
-        pixels, by_camera = self._projected(in_camera)
+        pixels, by_camera = self._project(in_camera)
         focal, centres = self._focal(state)[:, None, None], self._centres()
         pixels, by_camera = centres + focal * (pixels - centres), focal[..., None] * by_camera
         return Seen(in_base, pixels, by_camera @ rotation[:, None].swapaxes(-1, -2), in_keyframe, rotation)
@@ -254,7 +254,7 @@ class CornerFactors:
         """(M, 1, 2) principal points."""
         return np.array([[each.cx_px, each.cy_px] for each in self.cameras])[self.looks.camera][:, None]
 
-    def _projected(self, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _project(self, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         if len(self.cameras) == 1:
             return self.cameras[0].project_with_jacobian(in_camera)
         pixels, by_camera = np.empty((*in_camera.shape[:-1], 2)), np.empty((*in_camera.shape[:-1], 2, 3))
@@ -308,7 +308,7 @@ def _about_up(angle_rad: FloatArray) -> FloatArray:
     return _about(angle_rad, 0, 1)
 
 
-def _about_left(angle_rad: FloatArray) -> FloatArray:
+def _rotation_about_left(angle_rad: FloatArray) -> FloatArray:
     return _about(angle_rad, 2, 0)
 
 

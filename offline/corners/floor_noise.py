@@ -33,7 +33,7 @@ _UNLIKELINESS_TOLERANCE: Final = 0.1  # chance moves it by more
 _MOST_LOOKS: Final = 40
 
 
-def guessed_wobble(
+def initial_attitude_sigmas(
     problem: CornerProblem, state: SpatialState, factor: FrontFactor | None = None, pictures: Pictures | None = None
 ) -> FloatArray:
     """(3,) sigmas in WOBBLE to begin with, zeros where a level floor explains the corners as well.
@@ -72,14 +72,14 @@ def _shows(problem: CornerProblem, pictures: Pictures, factor: FrontFactor) -> b
         for probe in probes:
             signs = random.choice([-1.0, 1.0], size=force[:, of].shape)
             add_vectors(kind, np.einsum("mk,mkc->mc", signs[picture], coupled[:, of]), probe)
-        left = whole - float((factor.whitened(probes) ** 2).sum()) / _PROBES
+        left = whole - float((factor.whiten(probes) ** 2).sum()) / _PROBES
         spread = float(np.sqrt(2.0 * (own[:, of, of] ** 2).sum())) * left / whole
         if (force[:, of] ** 2).sum() - left > _SHOWS * spread:
             return True
     return False
 
 
-def fitted_wobble(problem: CornerProblem, state: SpatialState) -> FloatArray:
+def fit_attitude_sigmas(problem: CornerProblem, state: SpatialState) -> FloatArray:
     """(3,) sigmas in WOBBLE of an uneven floor, looked for from the problem's own.
 
     Args:

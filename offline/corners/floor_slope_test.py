@@ -72,8 +72,8 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
     firsts = graph.first_pose.tolist()
     cut = [each for chain, first in zip(graph.chains, firsts, strict=True) for each in _cut(chain, first, pictures)]
     asked = _show(pictures, cut)
-    couplings = [_coupled(pictures, each, solution.problem.columns.n) for each in asked]
-    taken = solution.factor.whitened(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
+    couplings = [_coupling(pictures, each, solution.problem.columns.n) for each in asked]
+    taken = solution.factor.whiten(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
     cross = (taken @ taken.T).reshape(len(asked), 3, len(asked), 3).swapaxes(1, 2)
     slope = np.array([pictures.slope[each].sum(axis=0) for each in asked]).reshape(-1, 3)
     left = -cross
@@ -132,7 +132,7 @@ def _show(pictures: _Pictures, cut: Sequence[slice]) -> list[slice]:
     return [cut[c] for c in np.flatnonzero(square > _MAY_BE).tolist()]
 
 
-def _coupled(pictures: _Pictures, which: slice, n: int) -> FloatArray:
+def _coupling(pictures: _Pictures, which: slice, n: int) -> FloatArray:
     """C (3, n) of a stretch."""
     looks = np.flatnonzero((pictures.look_picture >= which.start) & (pictures.look_picture < which.stop))
     coupled = np.zeros((3, n + 1))  # the last takes what is held

@@ -11,10 +11,10 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import wheels
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, FOCAL_SCALE, MOUNT_PARAMETERS, TIME_OFFSET
 from groundsbot.calib.tags import outward
-from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, Looks, SpatialState
-from groundsbot.offline.corners.initial_calibration import calibrated
-from groundsbot.offline.corners.initial_tag_poses import tags_hung
+from groundsbot.offline.corners.initial_calibration import initial_calibration
+from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
 from groundsbot.offline.measurements import Chain
@@ -89,8 +89,8 @@ def corner_graph(
         heights_m=np.where(seen, np.nan, 0.0),
         turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
     )
-    start = calibrated(problem, tags_hung(problem, start))
-    problem = replace(problem, corners=facing_as_predicted(problem.corners, start))
+    start = initial_calibration(problem, with_initial_tag_poses(problem, start))
+    problem = replace(problem, corners=with_predicted_facings(problem.corners, start))
     vars(problem)["motions"] = floor.arrowhead.odometry  # where the property has it: they rise by pose in a graph
     return CornerGraph(problem, graph, parameters), start
 
@@ -111,7 +111,7 @@ def _looks(
             cameras.append(camera)
         own = [parameters.index(each) for each in (_height_parameter(chain), _focal_parameter(chain))]
         of_chain.append((own[0], own[1], cameras.index(camera)))
-        shown.append(_shown(chain, mask, camera.height_px))
+        shown.append(_corner_arrays(chain, mask, camera.height_px))
     found = _Shown(*(np.concatenate(each) for each in zip(*shown, strict=True)))
     heights, focal, camera_of = np.repeat(of_chain, [len(each.sigma_px) for each in shown], axis=0).T
     index: dict[str, IntArray] = {
@@ -150,14 +150,14 @@ class _Shown(NamedTuple):
     mount: FloatArray
 
 
-def _shown(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
+def _corner_arrays(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
     """Of those readings of one chain that have corners."""
     robot, readings = chain.run.robot, chain.readings
     corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
     unit = parts.of((_CORNER_NOISE,))[0]
     variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
     sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
-    moved, twist = _moved(chain, readings.keyframe[mask], corners_px, height_px)
+    moved, twist = _base_motion(chain, readings.keyframe[mask], corners_px, height_px)
     return _Shown(
         corners_px,
         np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
@@ -173,7 +173,9 @@ def _trace(matrices: FloatArray) -> FloatArray:
     return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
 
 
-def _moved(chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: int) -> tuple[FloatArray, FloatArray]:
+def _base_motion(
+    chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: int
+) -> tuple[FloatArray, FloatArray]:
     """How base moved by the wheels (M, 4, 3) from a keyframe to when each corner's row was read, and its twist (M, 3).
 
     A stamp is that of the middle row.

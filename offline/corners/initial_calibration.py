@@ -21,7 +21,7 @@ from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem, colum
 _LOOKS: Final = 0  # among the kinds of factors
 
 
-def calibrated(problem: CornerProblem, state: SpatialState) -> SpatialState:
+def initial_calibration(problem: CornerProblem, state: SpatialState) -> SpatialState:
     """The state after one step of tags and calibration on a few looks of each tag; as it was where that helps none.
 
     Args:
@@ -40,7 +40,7 @@ def calibrated(problem: CornerProblem, state: SpatialState) -> SpatialState:
         step = -order.factorise(system, unseen).solve(system.gradient)
     except NotPositiveError:
         return state
-    moved = own.moved(state, step)
+    moved = own.retract(state, step)
     return moved if _system(own, order, moved, is_whole=False)[1] < cost else state
 
 

@@ -11,38 +11,38 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, SAME_RAD, allowed, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import POSED_LOOKS, judges, looks_by_tag, posed
+from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, SAME_RAD, candidate_poses, fit, rays_of
+from groundsbot.offline.corners.kernels.view_selection import POSED_LOOKS, judges, looks_by_tag, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem
 
 
-def tags_hung(problem: CornerProblem, state: SpatialState) -> SpatialState:
+def with_initial_tag_poses(problem: CornerProblem, state: SpatialState) -> SpatialState:
     """The state with every tag that was seen where its looks put it, the robots' poses held.
 
     Args:
         problem: which tags were seen from where.
         state: its turns and heights do not count where no tag has them yet (NaN).
     """
-    tags, places, turns, losses = _fitted(problem.corners, state)
+    tags, places, turns, losses = _fit_poses(problem.corners, state)
     order = np.lexsort((losses, tags))
     first = order[np.unique(tags[order], return_index=True)[1]]
     first = first[np.isfinite(losses[first])]
-    return _hung(state, tags[first], places[first], turns[first])
+    return _with_tag_poses(state, tags[first], places[first], turns[first])
 
 
-def hung_otherwise(problem: CornerProblem, state: SpatialState, tag: int) -> list[SpatialState]:
+def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) -> list[SpatialState]:
     """The state with one tag in each other way that single looks and its looks from all around allow.
 
     The robots' poses are held: a solve from there tells what each is worth.
     """
     own = CornerFactors(problem.corners.looks.where(problem.corners.looks.tag == tag), problem.corners.cameras)
-    _, places, turns, losses = _fitted(own, replace(state, turns=np.full_like(state.turns, np.nan)))
+    _, places, turns, losses = _fit_poses(own, replace(state, turns=np.full_like(state.turns, np.nan)))
     found: list[SpatialState] = []
     known = [state.turns[tag]]
     for i in np.argsort(losses, kind="stable")[: int(np.isfinite(losses).sum())].tolist():
         if all(Rotation.from_matrix(turn.T @ turns[i]).magnitude() > SAME_RAD for turn in known):
             known.append(turns[i])
-            found.append(_hung(state, np.array([tag]), places[i : i + 1], turns[i : i + 1]))
+            found.append(_with_tag_poses(state, np.array([tag]), places[i : i + 1], turns[i : i + 1]))
     return found
 
 
@@ -62,17 +62,17 @@ def tags_rehung(problem: CornerProblem, state: SpatialState) -> SpatialState:
         shown = np.zeros(n, dtype=np.bool_)
         shown[picture[looks.tag == tag]] = True
         own = replace(problem, corners=replace(problem.corners, looks=looks.where(shown[picture])))
-        state = min([state, *hung_otherwise(own, state, tag)], key=own.looks_cost)
+        state = min([state, *alternative_states(own, state, tag)], key=own.looks_cost)
     return state
 
 
-def _hung(state: SpatialState, tags: IntArray, places: FloatArray, turns: FloatArray) -> SpatialState:
+def _with_tag_poses(state: SpatialState, tags: IntArray, places: FloatArray, turns: FloatArray) -> SpatialState:
     places_m, heights_m, all_turns = state.tags.copy(), state.heights_m.copy(), state.turns.copy()
     places_m[tags], heights_m[tags], all_turns[tags] = places[:, :2], places[:, 2], turns
     return replace(state, tags=places_m, heights_m=heights_m, turns=all_turns)
 
 
-def _fitted(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """(C,) tags, with places (C, 3) and turns (C, 3, 3) fitted to looks from along the drive, and their losses (C,).
 
     They begin where single looks put them, and where they hang in the state if they do.
@@ -80,10 +80,10 @@ def _fitted(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, Floa
     tag, values = factors.looks.tag, spatial_values(state)
     by_tag = looks_by_tag(tag, len(state.tags))
     chosen = np.empty((len(state.tags), POSED_LOOKS), dtype=np.int64)
-    posed(factors.looks.corners_px, by_tag, chosen)
+    select_views(factors.looks.corners_px, by_tag, chosen)
     chosen = chosen[chosen >= 0]
     places, turns = np.empty((len(chosen), POSES, 3)), np.empty((len(chosen), POSES, 3, 3))
-    allowed(factors.arrays, values, chosen, _rays(factors, chosen), places, turns)
+    candidate_poses(factors.arrays, values, chosen, _rays(factors, chosen), places, turns)
     own = np.flatnonzero(
         (np.diff(by_tag.begin) > 0) & np.isfinite(state.turns).all((-1, -2)) & np.isfinite(state.heights_m)
     )

@@ -40,7 +40,7 @@ def pictures_at(problem: CornerProblem, state: SpatialState) -> Pictures:
     weight = _BY_THE_LOSS
     if problem.wobble_sigma.any():
         linearised, wobble = corners.linearise(state, problem.columns)
-        weight = problem.weighed(linearised.residual, wobble).weight
+        weight = problem.weigh(linearised.residual, wobble).weight
     found = Pictures(picture, np.empty(n_looks), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.empty((n_looks, 3, N_LOOK)))
     add_wobble(corners.arrays, corners.lenses, CORNER_LOSS, spatial_values(state), weight, *found)
     return found

@@ -105,7 +105,7 @@ class CornerProblem:
         return picture, len(poses)
 
     @property
-    def n_coupled(self) -> int:
+    def n_pairs_in_pictures(self) -> int:
         """How many pairs of looks share a picture."""
         seen = np.bincount(self.pictures[0])
         return int((seen * (seen - 1) // 2).sum())
@@ -213,7 +213,7 @@ class CornerProblem:
         cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.look_order, system)
         return cost if np.isfinite(cost) else np.inf
 
-    def weighed(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
+    def weigh(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
         """Weighs looks whose pictures may stand off level.
 
         Args:
@@ -238,18 +238,18 @@ class CornerProblem:
     def looks_cost(self, state: SpatialState) -> float:
         """Twice the cost of the looks alone; infinite where a lens has no image of a corner."""
         linearised, wobble = self.corners.linearise(state, self.columns)
-        cost = self.weighed(linearised.residual, wobble).cost
+        cost = self.weigh(linearised.residual, wobble).cost
         return cost if np.isfinite(cost) else np.inf
 
     def log_spread(self, state: SpatialState) -> float:
         """Logarithm of the determinant of the whitened corners' covariance I + J S J^T; 0 where all is level."""
         linearised, wobble = self.corners.linearise(state, self.columns)
-        weight = self.weighed(linearised.residual, wobble).weight
+        weight = self.weigh(linearised.residual, wobble).weight
         own = self._by_picture(wobble.swapaxes(-1, -2) @ (weight[:, None, None] * wobble))
         _, logarithms = np.linalg.slogdet(np.eye(3) + self.wobble_sigma**2 * own)
         return float(np.sum(logarithms))
 
-    def moved(self, state: SpatialState, step: FloatArray) -> SpatialState:
+    def retract(self, state: SpatialState, step: FloatArray) -> SpatialState:
         """The state after a step (n,): tags move along with their anchors as on a rigid body, see `solver.Problem`."""
         columns = self.columns
         padded = np.append(step, 0.0)
@@ -269,7 +269,7 @@ class CornerProblem:
     def _looks(self, state: SpatialState) -> tuple[Normal, Normal, float]:
         """Of looks and of pairs that share a picture, how the pictures stand eliminated; and twice their cost."""
         linearised, wobble = self.corners.linearise(state, self.columns)
-        weighed = self.weighed(linearised.residual, wobble)
+        weighed = self.weigh(linearised.residual, wobble)
         if not np.isfinite(weighed.cost):
             weighed = weighed._replace(cost=float("inf"))
         ((_, jacobian),) = linearised.blocks

@@ -77,7 +77,7 @@ class _Step(NamedTuple):
     by_slope: float
     state: SpatialState
 
-    def promised(self, share: float) -> float:
+    def predicted_decrease(self, share: float) -> float:
         """By how much the cost falls with a share of it, by the linear model: evenly, but for a square."""
         return share * self.by_slope - share**2 * (self.by_slope - self.expected)
 
@@ -122,19 +122,19 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
             state = step.state
             return ended("converged", step.factor if damping.is_least else problem.factor(state))
         if step.expected <= _NEAR and damping.is_least:
-            closed_in = _closed_in(problem, step, cost)
+            closed_in = _last_steps(problem, step, cost)
             if closed_in is not None:
                 state = closed_in.state
                 costs += closed_in.costs
                 return ended("converged", step.factor)
-        taken = _taken(problem, state, step, cost)
+        taken = _take_step(problem, state, step, cost)
         if taken is not None:
-            damping.step_taken(taken.gain)
+            damping.accept_step(taken.gain)
             state, system, cost = taken.state, taken.system, taken.cost
             costs.append(cost)
             continue
-        damping.step_rejected()
-        if damping.exhausted:
+        damping.reject_step()
+        if damping.is_exhausted:
             return ended("no step lowers the cost")
         system, _ = problem.system(state)  # its entries became the factor
     return ended(f"stopped after {_MOST_STEPS} steps")
@@ -149,20 +149,20 @@ def _step(problem: CornerProblem, system: System, state: SpatialState, share: fl
     expected = 0.5 * by_slope
     if raised is not None:
         expected += 0.5 * float((raised * step**2).sum())
-    return _Step(factor, step, expected, by_slope, problem.moved(state, step))
+    return _Step(factor, step, expected, by_slope, problem.retract(state, step))
 
 
-def _taken(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _Taken | None:
+def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _Taken | None:
     """The step, or less of it; None where none of that goes down."""
     for share in _SHARES:
-        there = step.state if share == 1.0 else problem.moved(state, share * step.by)
+        there = step.state if share == 1.0 else problem.retract(state, share * step.by)
         system, found = problem.system(there)
         if found < cost:
-            return _Taken(there, system, found, (cost - found) / step.promised(share))
+            return _Taken(there, system, found, (cost - found) / step.predicted_decrease(share))
     return None
 
 
-def _closed_in(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | None:
+def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | None:
     """The last steps, by one factor, as H hardly changes any more; None where it takes more than a few."""
     state, costs, before = step.state, list[float](), step.expected
     while True:
@@ -172,6 +172,6 @@ def _closed_in(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | 
         if not (now < cost and expected < _CLOSING * before):
             return None
         costs.append(now)
-        state, cost, before = problem.moved(state, by), now, expected
+        state, cost, before = problem.retract(state, by), now, expected
         if expected <= _COST_TOLERANCE:
             return _ClosedIn(state, costs)

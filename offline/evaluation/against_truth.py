@@ -79,7 +79,7 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
         starts=starts,
         tags=tuple(_tag_error(tag, error) for tag, error in zip(tags, errors, strict=True)),
         tags_rmse_m=_rms(errors),
-        tags_rmse_aligned_m=_rms(aligned(found, true) - true) if len(tags) > 1 else None,
+        tags_rmse_aligned_m=_rms(align_points(found, true) - true) if len(tags) > 1 else None,
         trajectory_rmse_m=_rms(_trajectory_errors(component.runs, truth, T_world_map)),
         nees_tags_per_dim=nees_tags,
         nees_start_per_dim=nees_start,
@@ -87,7 +87,7 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
     )
 
 
-def aligned(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
+def align_points(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
     """Points (N, 2) turned and moved, not scaled, so that they lie on others (N, 2) with least squares.
 
     S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991).
@@ -166,7 +166,7 @@ def _notes(component: Component, truth: Truth) -> list[str]:
     unknown_runs = [run.name for run in component.runs if run.run not in truth.runs]
     if unknown_runs:
         notes.append(f"not in the truth, left out: runs {', '.join(unknown_runs)}")
-    late = sum(_n_not_covered(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
+    late = sum(_n_outside_truth(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
     if late:
         notes.append(f"{late} keyframes lie outside the truth's time, left out of trajectory_rmse_m")
     unknown_tags = [tag.full_label for tag in component.tags if not _knows(truth, tag)]
@@ -175,7 +175,7 @@ def _notes(component: Component, truth: Truth) -> list[str]:
     return notes
 
 
-def _n_not_covered(run: RunResult, true_run: TrueRun) -> int:
+def _n_outside_truth(run: RunResult, true_run: TrueRun) -> int:
     return int((~true_run.at(run.stamps_ns)[1]).sum())
 
 

@@ -161,18 +161,18 @@ def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> 
         placed = se2.apply(T_map_survey, survey_m)
         jacobian = _by_transform(placed)
         normal = jacobian.T @ information @ jacobian
-        step = _solved(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
+        step = _solve_least_norm(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
         T_map_survey = se2.compose(np.array([0.0, 0.0, step[2]]), T_map_survey) + np.array([step[0], step[1], 0.0])
         if np.abs(step).max() < 1e-12:
             break
     placed = se2.apply(T_map_survey, survey_m)
     jacobian = _by_transform(placed)
     weighted = information @ jacobian
-    reliability: FloatArray = information - weighted @ _solved(jacobian.T @ weighted, weighted.T)
+    reliability: FloatArray = information - weighted @ _solve_least_norm(jacobian.T @ weighted, weighted.T)
     return _Adjusted(T_map_survey, (map_m - placed).reshape(-1), reliability)
 
 
-def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_least_norm(normal: FloatArray, right: FloatArray) -> FloatArray:
     """Of all solutions the shortest: where the entries that are left lie in one place, any turn will do."""
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
@@ -192,7 +192,7 @@ def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEn
     covariance = component.tag_covariance[np.ix_(rows, rows)]
     covariance = covariance + np.diag(np.repeat([entry.sigma_m**2 for entry in entries], 2))
     good = _fitting(map_m, survey_m, covariance)
-    swapped = _swapped(map_m, survey_m, covariance, good)
+    swapped = _find_swaps(map_m, survey_m, covariance, good)
     judged = []
     for k, i in enumerate(tags):
         part, adjusted = _with(map_m, survey_m, covariance, [*sorted({*good, k})])
@@ -240,7 +240,7 @@ def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) ->
     return good
 
 
-def _swapped(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, good: Sequence[int]) -> dict[int, int]:
+def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, good: Sequence[int]) -> dict[int, int]:
     """Among the entries that do not fit, pairs that do once exchanged."""
     found: dict[int, int] = {}
     odd = [k for k in range(len(map_m)) if k not in good]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.foundation import counted, folder_written_whole, written_whole
+from groundsbot.calib.foundation import atomic_write, folder_written_whole, plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.export.frc_layout import fmap_of, frc_layout_of
 from groundsbot.offline.export.g2o import g2o_text
@@ -46,7 +46,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
             lines = [_measure(component)]
         else:
             text, lines = _TEXTS[options.form](component, result, options)
-            with written_whole(options.output) as partial:
+            with atomic_write(options.output) as partial:
                 partial.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OfflineError(
@@ -61,7 +61,7 @@ def _component(result: MapResult, index: int | None) -> Component:
     if index is None and n == 1:
         return result.components[0]
     which = ", ".join(
-        f"{i} (frame of {each.frame_run}, {counted(len(each.runs), 'run')}, {counted(len(each.tags), 'tag')})"
+        f"{i} (frame of {each.frame_run}, {plural(len(each.runs), 'run')}, {plural(len(each.tags), 'tag')})"
         for i, each in enumerate(result.components)
     )
     if index is None:
@@ -80,7 +80,7 @@ def _suspects(result: MapResult, component: Component) -> Lines:
 
 
 def _measure(component: Component) -> str:
-    runs, tags = counted(len(component.runs), "run"), counted(len(component.tags), "tag")
+    runs, tags = plural(len(component.runs), "run"), plural(len(component.tags), "tag")
     return f"{runs}, {tags}, in the frame of {component.frame_run}'s start"
 
 

@@ -30,9 +30,9 @@ def g2o_text(component: Component) -> str:
 def _vertices(component: Component) -> Iterator[str]:
     poses = np.concatenate([run.T_map_base for run in component.runs]).tolist()
     for i, pose in enumerate(poses):
-        yield f"VERTEX_SE2 {i} {_joined(pose)}"
+        yield f"VERTEX_SE2 {i} {_join(pose)}"
     for i, tag in enumerate(component.tags, start=len(poses)):
-        yield f"VERTEX_XY {i} {_joined(tag.position_m.tolist())}"
+        yield f"VERTEX_XY {i} {_join(tag.position_m.tolist())}"
 
 
 def _names(component: Component) -> Iterator[str]:
@@ -47,7 +47,7 @@ def _names(component: Component) -> Iterator[str]:
 def _edges(edges: GraphEdges, first_tag: int) -> Iterator[str]:
     motions = zip(edges.first.tolist(), edges.motion.tolist(), _upper(edges.motion_information), strict=True)
     for first, motion, information in motions:
-        yield f"EDGE_SE2 {first} {first + 1} {_joined(motion)} {_joined(information)}"
+        yield f"EDGE_SE2 {first} {first + 1} {_join(motion)} {_join(information)}"
     places = zip(
         edges.pose.tolist(),
         (edges.tag + first_tag).tolist(),
@@ -56,7 +56,7 @@ def _edges(edges: GraphEdges, first_tag: int) -> Iterator[str]:
         strict=True,
     )
     for pose, tag, place, information in places:
-        yield f"EDGE_SE2_XY {pose} {tag} {_joined(place)} {_joined(information)}"
+        yield f"EDGE_SE2_XY {pose} {tag} {_join(place)} {_join(information)}"
 
 
 def _upper(matrices: FloatArray) -> list[list[float]]:
@@ -66,5 +66,5 @@ def _upper(matrices: FloatArray) -> list[list[float]]:
     return found
 
 
-def _joined(values: list[float]) -> str:
+def _join(values: list[float]) -> str:
     return " ".join(map(repr, values))

@@ -69,7 +69,7 @@ def tags_in_space(
         z_m, yaw_rad = _first(z_m, options.tag_height_m), _first(yaw_rad, viewed.get(_key(tag)))
         if z_m is None or yaw_rad is None:
             raise OfflineError(_what_is_missing(tag, z_m, options))
-        placed.append(PlacedTag(tag, z_m, _turned(tag, yaw_rad)))
+        placed.append(PlacedTag(tag, z_m, _rotate(tag, yaw_rad)))
     said = [] if tags and not n_upright else ["taken for upright, with x out of the face"]
     if 0 < n_upright < len(placed):
         said = [f"taken for upright, with x out of the face: {n_upright} of {len(placed)} tags"]
@@ -87,7 +87,7 @@ def _first(value: float | None, otherwise: float | None) -> float | None:
     return otherwise if value is None else value
 
 
-def _turned(tag: TagResult, yaw_rad: float) -> Rotation:
+def _rotate(tag: TagResult, yaw_rad: float) -> Rotation:
     """R_map_tag in the axes of layouts, the face to a direction, tilted as the map has it."""
     if tag.pose is None:
         return Rotation.from_euler("z", yaw_rad)

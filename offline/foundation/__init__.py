@@ -1,6 +1,6 @@
 """Compiled loops, stages with their costs, and small file helpers. Knows nothing of robots.
 
-In: files and functions. Out: `jitted` and its kin (numba with a cache that follows edits), `Stages`, typed CSV tables,
+In: files and functions. Out: `njit` and its kin (numba with a cache that follows edits), `Stages`, typed CSV tables,
 guarded .npz files, and what the logs of one command may cost together. The paper has no such block.
 """
 

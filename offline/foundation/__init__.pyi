@@ -1,6 +1,6 @@
 from .csv_table import CsvTable, read_table
 from .input_budget import ALONE, Inputs, size_bytes
-from .jit import borrowed, compilation_announced, inlined, inner, jitted
+from .jit import announce_compilation, borrowed, inline, inner, njit
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
 
@@ -11,11 +11,11 @@ __all__ = [
     "Progress",
     "StageCost",
     "Stages",
+    "announce_compilation",
     "borrowed",
-    "compilation_announced",
-    "inlined",
+    "inline",
     "inner",
-    "jitted",
+    "njit",
     "open_arrays",
     "read_table",
     "size_bytes",

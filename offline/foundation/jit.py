@@ -18,7 +18,7 @@ from numba.core import event, types
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 
 _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
-_COMPILED: Final = re.compile(rb"^ *@(jitted|inner|inlined)\b", re.MULTILINE)  # the decorators below
+_COMPILED: Final = re.compile(rb"^ *@(njit|inner|inline)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
 
 COMPILING: Final = "compiling the solver, this once; some twenty seconds"
@@ -33,7 +33,7 @@ _OPTIONS: Final = {"error_model": "numpy", "fastmath": {"contract"}, "no_cfunc_w
 _njit: Final[Any] = numba.njit  # its types leave some options out
 
 
-def jitted(function: _F) -> _F:
+def njit(function: _F) -> _F:
     """Compiled on first call; kept on disk beside the source or in the user's cache folder, if one can be written."""
     try:
         compiled = _njit(cache=True, **_OPTIONS)(function)
@@ -50,7 +50,7 @@ def inner(function: _F) -> _F:
     return cast("_F", _njit(no_cpython_wrapper=True, **_OPTIONS)(function))
 
 
-def inlined(function: _F) -> _F:
+def inline(function: _F) -> _F:
     """As `inner`, but written out wherever it is called, before types are known: for what inner loops call once or so.
 
     Left to itself the compiler keeps calls of what is long. Written out, readings take a quarter less time and the pass
@@ -109,7 +109,7 @@ class _Announcer(event.Listener):
 
 
 @contextmanager
-def compilation_announced(tell: Callable[[str], None]) -> Iterator[None]:
+def announce_compilation(tell: Callable[[str], None]) -> Iterator[None]:
     """Has the block's first compilation told of; a block that finds all in the cache stays silent."""
     announcer = _Announcer(tell)
     event.register("numba:compile", announcer)  # type: ignore[no-untyped-call] # numba's own
@@ -147,11 +147,11 @@ def _keep_cache_apart() -> None:
         except OSError:
             continue
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined] # numba fills its config at run time
-        _remove_unused(root)
+        _remove_old_folders(root)
         return
 
 
-def _remove_unused(root: Path) -> None:
+def _remove_old_folders(root: Path) -> None:
     """Folders that updates left behind. Another version may be in use beside this one, but then not for so long unused.
 
     Should it be after all, it compiles once more: numba takes files that are gone for files that never were.

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from groundsbot.offline.local_map import FALSE_ALARM, Goodness, LocalMap, fitted_windows, freedom_of
+from groundsbot.offline.local_map import FALSE_ALARM, Goodness, LocalMap, fit_windows, freedom_of
 from groundsbot.offline.sam import Solution
 
 
-def joined_goodness(maps: Sequence[LocalMap], solution: Solution) -> Goodness:
+def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodness:
     """What it costs that all windows of several runs are one map.
 
     Args:
@@ -29,7 +29,7 @@ def joined_goodness(maps: Sequence[LocalMap], solution: Solution) -> Goodness:
         each.is_noisy or each.goodness.odometry_factor == each.goodness.reading_factor == 1.0 for each in maps
     )
     if not is_fitted or len(solution.problem.measured):
-        return fitted_windows(solution.problem).judge(solution.state)
+        return fit_windows(solution.problem).judge(solution.state)
     alone = [each.solution for each in maps]
     n = max(0, freedom_of(solution.problem) - sum(freedom_of(each.problem) for each in alone))
     rise = max(0.0, 2.0 * (solution.cost - sum(each.cost for each in alone)))

@@ -81,7 +81,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         edges=edges_of(graph, solution, refined.solution.state if refined else None),
         model=MapModel.CORNERS if refined else MapModel.FLOOR,
         floor=refined.floor if refined else None,
-        calibration=_kept_calibration(
+        calibration=_archived_calibration(
             [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
         ),
     )
@@ -117,7 +117,7 @@ def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
     return {parameter: float(np.mean(found)) for parameter, found in values.items()}
 
 
-def _kept_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> KeptCalibration:
+def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> KeptCalibration:
     """Of the C numbers that the solve carried: their rows (C, 2 T + C) of the covariance of tags and calibration."""
     n = rows.shape[1] - len(parameters)
     return KeptCalibration(

@@ -33,7 +33,7 @@ def checks_of(graph: Graph, solution: Solution, component: int) -> list[CheckRes
             ("scale", graph.parameters[batch].owner, [batch, wheel_scale]) for batch in graph.tag_scales(i).tolist()
         ]
         for name, batch, indices in [*pairs, ("turn", None, [wheel_scale, track_scale])]:
-            compared = _compared(solution, np.array(indices))
+            compared = _compare(solution, np.array(indices))
             if compared is not None and (name, robot_id, batch) not in found:
                 found[name, robot_id, batch] = CheckResult(name, component, robot_id, batch, *compared)
     return list(found.values())
@@ -69,7 +69,7 @@ def metre_of(graph: Graph, component: int) -> MetreResult:
     return MetreResult(component, total**-0.5 if total else float("inf"), shares)
 
 
-def _compared(solution: Solution, indices: IntArray) -> tuple[float, float, float] | None:
+def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float] | None:
     """First correction less the second, by readings alone, its sigma, and that of the priors; None: they do not say.
 
     With P the covariance of the priors, S that of the estimate m: readings alone have the information S^-1 - P^-1 and

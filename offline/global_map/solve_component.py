@@ -3,11 +3,11 @@
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import Refined, refine
 from groundsbot.offline.foundation import Stages
-from groundsbot.offline.global_map.goodness_of_fit import joined_goodness
+from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import (
@@ -16,7 +16,7 @@ from groundsbot.offline.maps import (
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.outliers import (
     Searched,
-    joined,
+    join_places,
     phantoms,
     read_as_another,
     split_together,
@@ -49,7 +49,7 @@ class SolvedComponent(NamedTuple):
     left_out: frozenset[tuple[str, int]] = frozenset()
 
 
-def solved_component(
+def solve_group(
     maps: Sequence[LocalMap],
     members: Group,
     measurements: Measurements,
@@ -65,16 +65,18 @@ def solved_component(
     told: list[str] = []
     gone: set[TagKey] = set()
     with stages.stage("tags that do not belong"):
-        searched = _searched(graph, solution, [maps[m] for m in members.members])
+        searched = _search_outliers(graph, solution, [maps[m] for m in members.members])
         if searched is not None:
-            suspects, gone, told = _judged(searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members))
+            suspects, gone, told = _outlier_report(
+                searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members)
+            )
             graph, solution = without_tags(searched.graph, searched.solution, gone)
     if keep_suspects and suspects:
-        graph, solution = solve_global_map([joined(each) for each in maps], members, stages, measurements)
+        graph, solution = solve_global_map([join_places(each) for each in maps], members, stages, measurements)
     if misread := read_as_another(graph, solution, [maps[m] for m in members.members]):
         graph, solution = without_tags(graph, solution, misread)
         gone |= misread
-        ids = _listed({(tag.family, tag.tag_id) for tag in misread})
+        ids = _list_ids({(tag.family, tag.tag_id) for tag in misread})
         told = [*told, f"tags {ids} were read once each, where another tag is: taken for misread codes, not placed"]
     left_out = frozenset((tag.family, tag.tag_id) for tag in gone)
     solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told), left_out=left_out)
@@ -85,7 +87,7 @@ def solved_component(
     return solved._replace(refined=refined, told=(*told, *more))
 
 
-def _searched(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
+def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
     """Tags that do not belong apart; None where the drives do not fit even so.
 
     Where a drive whose noise was fitted does not fit, or all do not fit together, what tags seem to have done is not
@@ -96,10 +98,10 @@ def _searched(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Sea
     searched = split_together(graph, solution, maps)
     if searched is None or not any(each.is_noisy for each in maps):
         return searched
-    return searched if len(maps) == 1 or joined_goodness(maps, searched.solution).fits else None
+    return searched if len(maps) == 1 or joint_goodness_of_fit(maps, searched.solution).fits else None
 
 
-def _judged(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
+def _outlier_report(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
     """The tags that do not belong, those that are left out, and a sentence of the latter that are not named.
 
     Noise that was fitted has heavier tails than normal errors have: there a pass that goes astray names no tag.
@@ -113,11 +115,11 @@ def _judged(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[SuspectT
             n for tag, n in zip(searched.graph.tags, searched.graph.n_readings().tolist(), strict=True) if tag in stray
         )
         told.append(
-            f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({counted(n, 'reading')}) of tags {_listed(ids)} "
+            f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'reading')}) of tags {_list_ids(ids)} "
             "went astray from where all others have them: left out"
         )
     return suspects, stray | phantoms(searched.graph, suspects), told
 
 
-def _listed(ids: Collection[tuple[str, int]]) -> str:
+def _list_ids(ids: Collection[tuple[str, int]]) -> str:
     return ", ".join(str(tag_id) for _, tag_id in sorted(ids))

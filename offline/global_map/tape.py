@@ -59,7 +59,7 @@ def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
     return replace(graph, problem=replace(graph.problem, measured=measured))
 
 
-def judged(
+def compare_measurements(
     graph: Graph, solution: Solution | CornerSolution, measurements: Measurements, component: int
 ) -> list[MeasurementResult]:
     """What the component makes of the measurements that it uses."""
@@ -67,7 +67,7 @@ def judged(
     measured, state = graph.problem.measured, solution.state
     by_start, by_distance = measured.linearise(state, solution.problem.columns)
     in_map = state.poses[measured.starts.pose], _lengths(measured.distances, state)
-    told = _told(measurements.frame, starts, distances)
+    told = _measured_values(measurements.frame, starts, distances)
     rows = [(by_start, m) for m in range(len(starts))] + [(by_distance, m) for m in range(len(distances))]
     results = []
     for result, (kind, m), value in zip(told, rows, [*in_map[0], *in_map[1]], strict=True):
@@ -85,10 +85,10 @@ def judged(
     return results
 
 
-def unused(measurements: Measurements, used: Sequence[MeasurementResult]) -> list[MeasurementResult]:
+def unused_measurements(measurements: Measurements, used: Sequence[MeasurementResult]) -> list[MeasurementResult]:
     """Those whose ends lie in different components."""
     known = {(result.kind, result.a, result.b) for result in used}
-    told = _told(measurements.frame, measurements.starts, measurements.distances)
+    told = _measured_values(measurements.frame, measurements.starts, measurements.distances)
     return [result for result in told if (result.kind, result.a, result.b) not in known]
 
 
@@ -150,7 +150,7 @@ def _lengths(distances: DistanceFactors, state: State) -> FloatArray:
     return lengths
 
 
-def _told(
+def _measured_values(
     frame: str, starts: Sequence[MeasuredStart], distances: Sequence[MeasuredDistance]
 ) -> list[MeasurementResult]:
     """As they were measured."""

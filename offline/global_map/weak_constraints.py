@@ -14,14 +14,18 @@ _MOST_NAMED: Final = 12
 
 def weak_parts(graph: Graph, solution: Solution) -> list[str]:
     """Sentences about one component."""
-    return [*_untied(graph, solution), *_seen_once(graph), *_rounded(graph, solution)]
+    return [
+        *_unobservable_warnings(graph, solution),
+        *_single_observation_warnings(graph),
+        *_rounding_warnings(graph, solution),
+    ]
 
 
-def _untied(graph: Graph, solution: Solution) -> list[str]:
+def _unobservable_warnings(graph: Graph, solution: Solution) -> list[str]:
     """Of chains that can still move without any measurement noticing."""
     seen_by = Counter(tag for chain in graph.chains for tag in chain.tags)
     sentences = []
-    for index in solution.untied.chains:
+    for index in solution.unobservable.chains:
         chain = graph.chains[index]
         shared = [tag for tag in chain.tags if seen_by[tag] > 1]
         if not shared:
@@ -29,14 +33,14 @@ def _untied(graph: Graph, solution: Solution) -> list[str]:
         elif len(shared) == 1:
             reason = f"shares only tag {shared[0].tag_id} with the others, about which it can turn"
         else:
-            reason = f"hangs on the others by {_listed(shared)} alone, which leaves it free to move"
+            reason = f"hangs on the others by {_list_tags(shared)} alone, which leaves it free to move"
         sentences.append(
             f"{chain.name} {reason}; its place in this map means nothing, nor do those of tags it alone saw"
         )
     return sentences
 
 
-def _seen_once(graph: Graph) -> list[str]:
+def _single_observation_warnings(graph: Graph) -> list[str]:
     """Of tags that rest on a single reading."""
     readings = graph.problem.readings
     once: IntArray = np.flatnonzero(graph.n_readings()[readings.tag] == 1)
@@ -54,7 +58,7 @@ def _seen_once(graph: Graph) -> list[str]:
     return [f"tags {', '.join(named[:_MOST_NAMED])}{more} were seen once each; nothing checks their places"]
 
 
-def _rounded(graph: Graph, solution: Solution) -> list[str]:
+def _rounding_warnings(graph: Graph, solution: Solution) -> list[str]:
     """Of a solve that double precision does not carry."""
     error = solution.relative_error()
     if error <= MAX_RELATIVE_ERROR:
@@ -63,5 +67,5 @@ def _rounded(graph: Graph, solution: Solution) -> list[str]:
     return [f"{graph.chains[0].name}: rounding spoils the covariances of its map ({reason}); do not trust them"]
 
 
-def _listed(tags: list[TagKey]) -> str:
+def _list_tags(tags: list[TagKey]) -> str:
     return "tags " + ", ".join(str(tag.tag_id) for tag in tags)

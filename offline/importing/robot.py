@@ -136,7 +136,7 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
             return WheelScale(options.track_width_m, None, None, options.tick_flags)
         tick_m = 2 * pi * options.wheel_radius_m / options.ticks_per_turn
         return WheelScale(options.track_width_m, tick_m, tick_m, options.tick_flags)
-    wheels = robot.wheels.model_copy(update=_given_wheels(options))
+    wheels = robot.wheels.model_copy(update=_wheels_from_options(options))
     return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags)
 
 
@@ -170,7 +170,7 @@ def describe_robot(
     if options.robot is not None:
         _apply_wheels(data["wheels"], options)
     else:
-        data["wheels"] |= _given_wheels(options)
+        data["wheels"] |= _wheels_from_options(options)
     remarks = [said]
     if in_camera:
         remarks.append(_apply_mount(data["mount"], options))
@@ -207,12 +207,12 @@ def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> d
 
 
 def _apply_wheels(wheels: dict[str, Any], options: ImportOptions) -> None:
-    for field, value in _given_wheels(options).items():
+    for field, value in _wheels_from_options(options).items():
         wheels[field] = value
         wheels.pop(f"{field}_sigma", None)  # that of another value
 
 
-def _given_wheels(options: ImportOptions) -> dict[str, float]:
+def _wheels_from_options(options: ImportOptions) -> dict[str, float]:
     given = {
         "radius_left_m": options.wheel_radius_m,
         "radius_right_m": options.wheel_radius_m,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
-from groundsbot.calib.foundation import counted, folder_written_whole
+from groundsbot.calib.foundation import folder_written_whole, plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.onboard.log import LogWriter
 
@@ -31,9 +31,9 @@ class ImportReport:
     def lines(self) -> list[str]:
         """For a person."""
         drive = (
-            f"{counted(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
+            f"{plural(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
         )
-        seen = f"{counted(self.n_observations, 'observation')} of {counted(self.n_tags, 'tag')}"
+        seen = f"{plural(self.n_observations, 'observation')} of {plural(self.n_tags, 'tag')}"
         return [
             f"robot {self.robot_id}, run {self.run_id}: {drive}; {seen}",
             *(f"  {remark}" for remark in self.remarks),

@@ -1,15 +1,15 @@
 from .archive import (
-    check_can_be_extended,
+    archive_map,
+    check_extendable,
     check_sizes_in_map,
-    kept_of,
     local_map_of,
-    measured_chain,
     run_without_log,
+    segment_from_arrays,
     tags_of,
     tape_of,
 )
-from .goodness_of_fit import FALSE_ALARM, WINDOW_M, Goodness, fitted_windows, freedom_of
-from .local_map import LocalMap, ShownNoise, first_solution, judged, shown_noise, solve_local_map
+from .goodness_of_fit import FALSE_ALARM, WINDOW_M, Goodness, fit_windows, freedom_of
+from .local_map import LocalMap, ShownNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
 
 __all__ = [
     "FALSE_ALARM",
@@ -17,18 +17,18 @@ __all__ = [
     "Goodness",
     "LocalMap",
     "ShownNoise",
-    "check_can_be_extended",
+    "archive_map",
+    "check_extendable",
     "check_sizes_in_map",
     "first_solution",
-    "fitted_windows",
+    "fit_windows",
     "freedom_of",
-    "judged",
-    "kept_of",
     "local_map_of",
-    "measured_chain",
+    "noise_of_windows",
     "run_without_log",
-    "shown_noise",
+    "segment_from_arrays",
     "solve_local_map",
     "tags_of",
     "tape_of",
+    "with_goodness_of_fit",
 ]

@@ -34,7 +34,7 @@ from groundsbot.offline.measurements import (
 from groundsbot.offline.sam import State, build_graph, solve
 
 
-def kept_of(local_map: LocalMap) -> KeptChain:
+def archive_map(local_map: LocalMap) -> KeptChain:
     """What a later run needs of a local map."""
     chain, state = local_map.chain, local_map.solution.state
     run, odometry, readings = chain.run, chain.odometry, chain.readings
@@ -84,7 +84,7 @@ def local_map_of(kept: KeptChain) -> LocalMap:
     )
 
 
-def measured_chain(
+def segment_from_arrays(
     run: Run,
     stamps_ns: IntArray,
     motions: tuple[FloatArray, FloatArray, FloatArray],
@@ -117,14 +117,14 @@ def measured_chain(
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
-    odometry = ChainOdometry(motion, spread, _settled(spread), jacobian, driven_m)
+    odometry = ChainOdometry(motion, spread, _fixed_parts(spread), jacobian, driven_m)
     n = len(value)
     readings = Readings(
         keyframe,
         tag,
         value,
         covariance,
-        _settled(covariance),
+        _fixed_parts(covariance),
         by_camera,
         polar,
         in_camera,
@@ -135,7 +135,7 @@ def measured_chain(
     return Chain(run.name, run, stamps_ns, odometry, tags, readings)
 
 
-def _settled(covariance: FloatArray) -> CovarianceParts:
+def _fixed_parts(covariance: FloatArray) -> CovarianceParts:
     """On which no noise parameter has a bearing any more."""
     return CovarianceParts((), np.zeros((0, *covariance.shape)), covariance)
 
@@ -175,7 +175,7 @@ def _chain(kept: KeptChain) -> Chain:
         log_bytes=kept.log_bytes,
         lost=kept.lost,
     )
-    chain = measured_chain(
+    chain = segment_from_arrays(
         run,
         kept.stamps_ns,
         (kept.motion, kept.motion_covariance, kept.motion_by_wheels),
@@ -192,7 +192,7 @@ def _chain(kept: KeptChain) -> Chain:
     return replace(chain, name=kept.name, warnings=kept.warnings)
 
 
-def check_can_be_extended(known: MapResult) -> None:
+def check_extendable(known: MapResult) -> None:
     """Refuses a map that did not keep what its runs measured.
 
     Raises:

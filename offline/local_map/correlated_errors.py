@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam import Solution, losses_and_weights, stacked
+from groundsbot.offline.sam import Solution, losses_and_weights, stack
 
 # What was assumed before, that readings share nothing, counts like this many cells.
 _TOLD: Final = 4.0
@@ -71,21 +71,21 @@ def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
     read = _Readings(solution)
     cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
     found, whole = np.empty((4, 4, _N_SIGNS)), np.empty((4, _N_SIGNS))
-    drawn = _drawn(cell)
+    drawn = _random_signs(cell)
     at_once = 4 if 4 * _N_SIGNS * solution.problem.columns.n <= _FEW else 1  # parts
     for part in range(0, 4, at_once):
         rows = np.stack([next(drawn) for _ in range(at_once)], axis=2).reshape(2 * len(cell), -1)
-        kept, length = read.left_over(rows)
+        kept, length = read.residuals(rows)
         own = slice(part, part + at_once)
         found[:, own] = _squares(kept.reshape(len(cell), 2, -1), cells).reshape(4, at_once, _N_SIGNS)
         whole[own] = length.reshape(at_once, _N_SIGNS)
     traces, lengths = found.mean(axis=2).T, whole.mean(axis=1)
     squares = _squares(read.residual.reshape(-1, 2, 1), cells)[:, 0] - (lengths - traces[:, :2].sum(axis=1))
     n_in_cell = np.bincount(cell)
-    return _solved(0.5 * (traces + traces.T), squares, lengths, float((n_in_cell**2).sum() / n_in_cell.sum()))
+    return _solve_variances(0.5 * (traces + traces.T), squares, lengths, float((n_in_cell**2).sum() / n_in_cell.sum()))
 
 
-def _drawn(cell: IntArray) -> Iterator[FloatArray]:
+def _random_signs(cell: IntArray) -> Iterator[FloatArray]:
     """(M, 2, n) random signs in one component, four times: reading by reading twice, then cell by cell."""
     rng = np.random.default_rng(_SEED)
     for part in range(4):
@@ -106,13 +106,13 @@ class _Readings:
     def __init__(self, solution: Solution) -> None:
         problem = solution.problem
         readings = problem.readings.linearise(solution.state, problem.columns)
-        jacobian, residual = stacked((readings,), problem.columns.n)
+        jacobian, residual = stack((readings,), problem.columns.n)
         root = np.repeat(np.sqrt(losses_and_weights(solution.losses.readings, readings.residual)[1]), 2)
         self._jacobian = jacobian * root[:, None]
         self._factorisation = solution.factorisation
         self.residual = residual * root
 
-    def left_over(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residuals(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What remains of rows (2 M, k) once the estimate has taken its share, v - J H^-1 J^T v, and (k,) the squares.
 
         The squares are those of all that is measured, not of readings alone: as v - J H^-1 J^T v is a projection they
@@ -129,7 +129,7 @@ def _squares(readings: FloatArray, cells: sparse.csr_array) -> FloatArray:
     return np.stack([*(readings**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
 
 
-def _solved(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:
+def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:
     """Variances (own twice, shared twice), none below zero, of traces @ variances = squares.
 
     Args:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.geometry import chained
+from groundsbot.calib.geometry import chain_motions
 from groundsbot.offline.local_map.correlated_errors import fit_shared_errors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
@@ -32,7 +32,7 @@ from groundsbot.offline.sam import (
     State,
     losses_and_weights,
     solve,
-    stacked,
+    stack,
 )
 
 # Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
@@ -125,7 +125,7 @@ class Windows:
 
     def judge(self, state: State) -> Goodness:
         """What it costs to join them in the valley of a state."""
-        problem = _scaled(self.problem, self.factors[0], self.factors[1] * self.sharing)
+        problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.sharing)
         most_tries = self.effort.tries(problem, self.share) if self.effort else MAX_TRIES
         together = solve(problem, state, losses=self.losses, most_tries=most_tries)
         if self.effort:
@@ -141,7 +141,7 @@ class Windows:
         )
 
 
-def fitted_windows(
+def fit_windows(
     problem: Problem,
     losses: Losses = DEFAULT_LOSSES,
     effort: Effort | None = None,
@@ -167,16 +167,16 @@ def fitted_windows(
     """
     problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
-    state = _dead_reckoned(problem, apart)
+    state = _dead_reckon(problem, apart)
     left = effort.tries(apart, share, _MAX_FITS * MAX_TRIES) if effort else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
     last = np.ones(2)
     for _ in range(_MAX_FITS):
-        solution = _nearly_solved(_scaled(apart, *factors), state, losses, min(left, MAX_TRIES))
+        solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, min(left, MAX_TRIES))
         left -= solution.n_linearised
         if effort:
             effort.spend(solution)
-        squares, redundancy = _left_over(solution)
+        squares, redundancy = _mean_squares(solution)
         squares = squares * factors**2
         believed = (squares + _TOLD) / (redundancy + _TOLD)
         found = np.maximum(np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD)), least_factor)
@@ -192,16 +192,16 @@ def fitted_windows(
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
-        solution = solve(_scaled(apart, *factors), state, losses=losses, most_tries=most_tries)
+        solution = solve(_scale_noise(apart, *factors), state, losses=losses, most_tries=most_tries)
     else:
-        solution = _nearly_solved(_scaled(apart, *factors), state, losses, most_tries)
+        solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, most_tries)
         if effort:
             effort.spend(solution)
         sharing, known_like = _sharing(problem, solution, least_shared / factors[1] ** 2)
         sharing = np.maximum(sharing, least_factor / factors[1])
         freedom, state = min(freedom, known_like), solution.state
         del solution
-        shared = _scaled(apart, factors[0], factors[1] * sharing)
+        shared = _scale_noise(apart, factors[0], factors[1] * sharing)
         solution = solve(shared, state, losses=losses, most_tries=most_tries)
     if effort:
         effort.spend(solution)
@@ -233,12 +233,12 @@ def _without_the_worst(solution: Solution) -> FloatArray:
 
 def _sharing(problem: Problem, solution: Solution, least_shared: FloatArray | float) -> tuple[FloatArray, float]:
     """Factors on the sigmas of readings, for what neighbours share, and what freedom their variance is known like."""
-    cell = _numbered(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
+    cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
     errors = fit_shared_errors(solution, cell)
     return errors.factors(cell, least_shared), errors.freedom(cell)
 
 
-def _nearly_solved(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
+def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
     """To where its cost is not yet that of the end, but squares of what is left over are."""
     solution = solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries)
     problem.arrowhead.without_scratch()  # who looks at what is left over needs as much room again
@@ -261,7 +261,7 @@ def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
     window = _window_of_pose(problem, window_m)
     odometry, readings = problem.odometry, problem.readings
     inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
-    tag = _numbered(window[readings.pose], readings.tag)
+    tag = _track_numbers(window[readings.pose], readings.tag)
     _, first_reading = np.unique(tag, return_index=True)
     return Problem(
         odometry=_part(odometry, inside),
@@ -299,7 +299,7 @@ def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
     return np.cumsum(begins) - 1
 
 
-def _numbered(part: IntArray, tag: IntArray) -> IntArray:
+def _track_numbers(part: IntArray, tag: IntArray) -> IntArray:
     """(M,) a number of its own for each tag in each part of the way, from 0 without gaps."""
     _, number = np.unique(part * (int(tag.max(initial=0)) + 1) + tag, return_inverse=True)
     return np.asarray(number, dtype=np.int64)
@@ -315,13 +315,13 @@ def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
     return Columns(poses, tags, np.where(calibrated, n + np.cumsum(calibrated) - 1, -1), n + int(calibrated.sum()))
 
 
-def _dead_reckoned(problem: Problem, windows: Problem) -> State:
+def _dead_reckon(problem: Problem, windows: Problem) -> State:
     """Motions one after the other, by nominal calibration; tags where their readings put them on average."""
     first, motion = problem.odometry.first, problem.odometry.motion
     poses = np.zeros((len(problem.columns.poses), 3))
     for part in np.split(np.arange(len(first)), np.flatnonzero(np.diff(first) != 1) + 1):
         if len(part):
-            poses[first[part[0]] : first[part[-1]] + 2] = chained(motion[part], np.zeros(3))
+            poses[first[part[0]] : first[part[-1]] + 2] = chain_motions(motion[part], np.zeros(3))
     readings = windows.readings
     n_tags = len(windows.columns.tags)
     state = State(poses, np.zeros((n_tags, 2)), np.zeros(len(problem.prior.sigma)))
@@ -330,11 +330,11 @@ def _dead_reckoned(problem: Problem, windows: Problem) -> State:
     return State(poses, np.stack(mean, axis=-1), state.calibration)
 
 
-def _scaled(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
+def _scale_noise(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
     """With the noise of wheels and readings so many times as large; (M, 2) where readings differ in that."""
     by_row = np.broadcast_to(reading_factor, problem.readings.value.shape)[..., None]
     odometry, readings = problem.odometry.whitening / odometry_factor, problem.readings.whitening / by_row
-    return problem.reweighed(odometry, readings)
+    return problem.reweigh(odometry, readings)
 
 
 def freedom_of(problem: Problem) -> int:
@@ -342,7 +342,7 @@ def freedom_of(problem: Problem) -> int:
     return problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
 
 
-def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
+def _mean_squares(solution: Solution) -> tuple[FloatArray, FloatArray]:
     """Losses (2,) of wheels and readings at the solution, and how much of them noise accounts for.
 
     The latter is the number of residuals less the trace of J H^-1 J^T, an average over random signs z of
@@ -356,7 +356,7 @@ def _left_over(solution: Solution) -> tuple[FloatArray, FloatArray]:
     pulled = np.zeros((_N_SIGNS, n_columns))
     for begin in range(0, len(problem.odometry.first), _AT_ONCE):
         some = slice(begin, begin + _AT_ONCE)
-        jacobian, _ = stacked((_part(problem.odometry, some).linearise(state, columns),), n_columns)
+        jacobian, _ = stack((_part(problem.odometry, some).linearise(state, columns),), n_columns)
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)

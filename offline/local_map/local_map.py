@@ -15,19 +15,19 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import chained, se2
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fitted_windows
+from groundsbot.calib.geometry import chain_motions, se2
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fit_windows
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
     Chain,
     TagKey,
     coarse_keyframes,
-    coarsened,
-    confirmed,
+    coarsen,
     least_shared,
-    refined,
+    refine_poses,
     telling_keyframes,
+    without_unconfirmed_tracks,
 )
 from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, State, build_graph, parameters_of_wheels, solve
 
@@ -120,18 +120,18 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open
     """
     effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
     effort.check(build_graph([chain]).problem, chain.run.log, chain.name)
-    shown, check = _shown_noise(chain, effort, noise_is_open=noise_is_open)
-    chain, whole = shown.applied_to(chain)
+    shown, check = _noise_of_windows(chain, effort, noise_is_open=noise_is_open)
+    chain, whole = shown.apply_to(chain)
     far_larger = shown.is_far_larger
     graph = build_graph([chain])
     keyframes = coarse_keyframes(chain)
-    coarse = coarsened(chain, keyframes)
-    known = _built_up(_as_shown(coarse, check.noise_factors) if far_larger else coarse, effort)
+    coarse = coarsen(chain, keyframes)
+    known = _build_up(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
     for n_others in range(1 + _OTHER_STARTS):
-        poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
+        poses = refine_poses(chain, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
@@ -144,7 +144,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open
         is_spent = effort.left < _BUILDING_SHARE * effort.allowed
         if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MOST_IN_VAIN):
             break
-        known = _built_up(_redrawn(_as_shown(coarse, check.noise_factors), rng), effort)
+        known = _build_up(_redrawn(_inflate_noise(coarse, check.noise_factors), rng), effort)
     if best is None:
         raise ValueError(f"{chain.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
@@ -183,37 +183,37 @@ class ShownNoise(NamedTuple):
     factors: tuple[float, float]
     added: tuple[str, ...]
 
-    def applied_to(self, chain: Chain) -> tuple[Chain, Chain | None]:
+    def apply_to(self, chain: Chain) -> tuple[Chain, Chain | None]:
         """The chain to solve and, where its noise is unknown, the one with readings that nothing confirms."""
         if not self.is_far_larger:
             return chain, None
         whole = chain.with_position_noise(self.added)
-        return confirmed(whole), whole
+        return without_unconfirmed_tracks(whole), whole
 
 
-def shown_noise(chain: Chain) -> ShownNoise:
+def noise_of_windows(chain: Chain) -> ShownNoise:
     """What the windows show, where the noise that the chain is under is a first guess."""
     effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
-    return _shown_noise(chain, effort, noise_is_open=True)[0]
+    return _noise_of_windows(chain, effort, noise_is_open=True)[0]
 
 
 def first_solution(chain: Chain, shown: ShownNoise) -> tuple[Graph, Solution]:
     """The chain solved once from where building up leads, whether it fits together or not."""
     effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
-    chain, _ = shown.applied_to(chain)
+    chain, _ = shown.apply_to(chain)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far off the priors costs less than the right one
         wheels, readings = (
             shown.factors
         )  # within a window errors that last do not show: readings are no better than told
-        chain = _as_shown(chain, (max(1.0, wheels), max(1.0, readings)))
+        chain = _inflate_noise(chain, (max(1.0, wheels), max(1.0, readings)))
     graph, keyframes = build_graph([chain]), coarse_keyframes(chain)
-    known = _built_up(coarsened(chain, keyframes), effort)
-    poses = refined(chain, keyframes, known.poses, known.wheel_calibration)
+    known = _build_up(coarsen(chain, keyframes), effort)
+    poses = refine_poses(chain, keyframes, known.poses, known.wheel_calibration)
     start = graph.start(poses, known.tags, known.calibration)
     return graph, solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
 
 
-def judged(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
+def with_goodness_of_fit(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
     """The map with its test of goodness of fit made again, under the noise that was fitted to whole drives."""
     chain = local_map.chain
     effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
@@ -223,17 +223,17 @@ def judged(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
     return found
 
 
-def _shown_noise(chain: Chain, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
+def _noise_of_windows(chain: Chain, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
     """What the windows show, and the check of solutions of the chain that `ShownNoise.applied_to` returns."""
     is_left_open = chain.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
-    likely = confirmed(chain) if is_left_open else chain
+    likely = without_unconfirmed_tracks(chain) if is_left_open else chain
     check = _Check(build_graph([likely]), effort)
     factors = check.noise_factors if is_left_open else check.usual_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
     is_beyond_pixels = factors[1] * chain.readings.corner_sigma_px > _MOST_CORNER_PX
     shown = ShownNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
-    applied, whole = shown.applied_to(chain)
+    applied, whole = shown.apply_to(chain)
     if likely is not chain if whole is None else whole.readings is not chain.readings:
         check = _Check(build_graph([applied]), effort)
         shown = shown._replace(factors=check.noise_factors)
@@ -252,12 +252,12 @@ class _Check:
             self._keyframes = coarse_keyframes(chain, share)
             share *= _NEXT_SHARE
         if len(self._keyframes) < len(chain.stamps_ns):
-            chain = coarsened(chain, self._keyframes)
+            chain = coarsen(chain, self._keyframes)
             graph = build_graph([chain])
         # Tags whose few readings all fall out are not in the windows, nor is what only these depend on.
         self._tags = np.array([whole.tags.index(tag) for tag in graph.tags], dtype=np.int64)
         self._calibration = np.array([whole.parameters.index(each) for each in graph.parameters], dtype=np.int64)
-        self._windows: Windows = fitted_windows(
+        self._windows: Windows = fit_windows(
             graph.problem,
             effort=effort,
             share=_WINDOWS_SHARE,
@@ -284,7 +284,7 @@ class _Check:
         )
 
 
-def _as_shown(chain: Chain, factors: tuple[float, float]) -> Chain:
+def _inflate_noise(chain: Chain, factors: tuple[float, float]) -> Chain:
     """The chain under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
     of_wheels, of_readings = factors
     return replace(
@@ -301,7 +301,7 @@ def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
     return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
+def _build_up(chain: Chain, effort: Effort) -> _BuiltUp:
     """Solves the chain piece by piece, each from the solution of the last; dead reckoning where effort ends."""
     known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
@@ -310,7 +310,7 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
         n_keyframes = pieces.next_end(n_keyframes)
         part = chain.prefix(n_keyframes)
         graph = build_graph([part])
-        poses = _extended(part, known.poses, known.wheel_calibration)
+        poses = _extend(part, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         most_tries = effort.tries(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
         solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
@@ -321,7 +321,7 @@ def _built_up(chain: Chain, effort: Effort) -> _BuiltUp:
         if n_keyframes == len(chain.stamps_ns) or effort.left < enough:
             break
         pieces.wheel_covariance = solution.covariance(graph.problem.columns.calibration[graph.wheel_parameters(0)])
-    return known._replace(poses=_extended(chain, known.poses, known.wheel_calibration))
+    return known._replace(poses=_extend(chain, known.poses, known.wheel_calibration))
 
 
 class _Pieces:
@@ -351,11 +351,11 @@ class _Pieces:
         return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
 
 
-def _extended(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+def _extend(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
     """Poses of a longer chain: those known, then dead reckoning from the last one."""
     n_known = len(poses)
     rest = part.odometry.motion[n_known - 1 :]
     if not len(rest):
         return poses
     rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ wheel_calibration))
-    return np.concatenate([poses, chained(rest, poses[-1])[1:]])
+    return np.concatenate([poses, chain_motions(rest, poses[-1])[1:]])

@@ -10,20 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.alignment import MARGIN_NATS, why_not_joined
+from groundsbot.offline.alignment import MARGIN_NATS, reason_not_joined
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.local_map import LocalMap, check_sizes_in_map
-from groundsbot.offline.localization.map_prior import KnownMap, known_map
+from groundsbot.offline.localization.map_prior import KnownMap, prior_from_map
 from groundsbot.offline.localization.placement import Located, locate
 from groundsbot.offline.localization.result import Candidate, Localization, LocatedRun, MovedTag, NotLocated
-from groundsbot.offline.localization.solve_in_map import HeldRun, solve_held
+from groundsbot.offline.localization.solve_in_map import HeldRun, solve_in_map
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import Run, chains_of
-from groundsbot.offline.noise import weighed_as
-from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, told_apart
+from groundsbot.offline.noise import with_noise_of_map
+from groundsbot.offline.outliers import local_maps_of, remove_outliers_under_own_noise, split_duplicates
 
 _MAP = "the map"
 
@@ -55,12 +55,12 @@ def localize(
     """
     stages = stages or Stages()
     check_sizes_in_map(run, known)
-    chains = [told_apart(chain) for chain in chains_of(run, noise or known.noise)]
+    chains = [split_duplicates(chain) for chain in chains_of(run, noise or known.noise)]
     if not any(chain.tags for chain in chains):
         raise OfflineError(f"{run.log}: {run.name} saw no tag, so nothing tells where in {folder} it drove")
     maps, noisy, broken = local_maps_of(chains, stages)
-    maps = weighed_as(maps, noise or known.noise, known.noise_fit if noise is None else None)
-    maps, slipped = judged_under_own_noise(maps, noisy, stages)
+    maps = with_noise_of_map(maps, noise or known.noise, known.noise_fit if noise is None else None)
+    maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages)
     found = localize_maps(maps, known, folder, component=component, stages=stages)
     told = [
         *run.warnings,
@@ -85,7 +85,7 @@ def localize_maps(
     stages = stages or Stages()
     parts = _parts(known, folder, component)
     with stages.stage("looking for the start"):
-        found = [_Stretch(each, _located(each, parts)) for each in maps]
+        found = [_Stretch(each, _locate(each, parts)) for each in maps]
     _check_shared(found, folder, parts)
     home = _home(found)
     here = [stretch.best for stretch in found if stretch.is_in(home)]
@@ -97,14 +97,14 @@ def localize_maps(
     if not here:
         return located
     with stages.stage("solving the run in the map"):
-        held = _held(here, parts[home])
+        held = _solve_in(here, parts[home])
     if not held.solution.converged:
         warnings.append(f"the solve did not converge ({held.solution.reason}); do not trust this trajectory")
     new = {tag.whole for each in here for tag in each.local_map.graph.tags} - set(parts[home].instances)
     return replace(
         located,
         runs=_runs(held),
-        moved=_moved(here, held),
+        moved=_moved_tags(here, held),
         new=tuple(sorted(new)),
         warnings=tuple(warnings),
     )
@@ -144,7 +144,7 @@ class _Stretch:
         best = self.best
         if self.rivals:
             ways = [each for each in (best, *self.rivals) if each.alignment is not None]
-            several = " and ".join(f"tags {_listed(each)} in component {each.component}" for each in ways)
+            several = " and ".join(f"tags {_list_runs(each)} in component {each.component}" for each in ways)
             reason = (
                 f"where {name} drove is ambiguous, because it fits {several}: if both are one place, extend the map by "
                 "this run, which joins them; else choose one with --component"
@@ -153,7 +153,7 @@ class _Stretch:
         if best.is_sure:
             reason = f"{name} is in component {best.component}, the rest of the run in component {home}"
             return NotLocated(name, reason, tuple(_candidates(best)[:1]))
-        reason = why_not_joined(_MAP, name, best.shared, best.alignment)
+        reason = reason_not_joined(_MAP, name, best.shared, best.alignment)
         is_ambiguous = best.alignment is not None and len(best.alignment.rivals) > 0
         return NotLocated(name, reason, tuple(_candidates(best)) if is_ambiguous else ())
 
@@ -162,15 +162,15 @@ def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, K
     """The components to look in."""
     n = len(known.components)
     if component is not None and not 0 <= component < n:
-        raise OfflineError(f"--component {component}: {folder} has {counted(n, 'component')}, 0 to {n - 1}")
+        raise OfflineError(f"--component {component}: {folder} has {plural(n, 'component')}, 0 to {n - 1}")
     which = range(n) if component is None else [component]
-    parts = {i: known_map(known.components[i], str(folder)) for i in which}
+    parts = {i: prior_from_map(known.components[i], str(folder)) for i in which}
     if not any(part.tags for part in parts.values()):
         raise OfflineError(f"{folder}: the map has no tag whose place it knows, so no run can be placed in it")
     return parts
 
 
-def _located(local_map: LocalMap, parts: dict[int, KnownMap]) -> tuple[Located, ...]:
+def _locate(local_map: LocalMap, parts: dict[int, KnownMap]) -> tuple[Located, ...]:
     """In each component that shares a tag, best first."""
     found = [place for i, part in parts.items() if (place := locate(local_map, part, i)) is not None]
     return tuple(sorted(found, key=lambda each: (-_evidence(each), -len(each.pairs), each.component)))
@@ -188,8 +188,8 @@ def _check_shared(found: Sequence[_Stretch], folder: Path, parts: dict[int, Know
     families = sorted({tag.family for part in parts.values() for tag in part.tags})
     named = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in seen[:8])
     raise OfflineError(
-        f"{run.log}: none of the {counted(len(seen), 'tag')} that {run.name} saw ({named}) is in {folder} "
-        f"({counted(sum(len(part.tags) for part in parts.values()), 'tag')} of {', '.join(families)}); is it the "
+        f"{run.log}: none of the {plural(len(seen), 'tag')} that {run.name} saw ({named}) is in {folder} "
+        f"({plural(sum(len(part.tags) for part in parts.values()), 'tag')} of {', '.join(families)}); is it the "
         "map of this place?"
     )
 
@@ -201,10 +201,10 @@ def _home(found: Sequence[_Stretch]) -> int:
     return best.best.component
 
 
-def _held(here: Sequence[Located], known: KnownMap) -> HeldRun:
+def _solve_in(here: Sequence[Located], known: KnownMap) -> HeldRun:
     names, maybe = [each.names() for each in here], [each.others() for each in here]
     starts = np.array([_transform(each) for each in here])
-    return solve_held([each.local_map for each in here], starts, names, maybe, known)
+    return solve_in_map([each.local_map for each in here], starts, names, maybe, known)
 
 
 def _transform(located: Located) -> FloatArray:
@@ -245,7 +245,7 @@ def _in_map_axes(covariance: FloatArray, poses: FloatArray) -> FloatArray:
     return turned
 
 
-def _moved(here: Sequence[Located], held: HeldRun) -> tuple[MovedTag, ...]:
+def _moved_tags(here: Sequence[Located], held: HeldRun) -> tuple[MovedTag, ...]:
     found = [
         MovedTag(
             tag=each.known,
@@ -267,6 +267,6 @@ def _candidates(located: Located) -> list[Candidate]:
     return [Candidate(located.component, way.T_a_b, way.inliers) for way in ways]
 
 
-def _listed(located: Located) -> str:
+def _list_runs(located: Located) -> str:
     tags = () if located.alignment is None else located.alignment.inliers
     return ", ".join(f"{tag.tag_id}{tag.instance}" for tag in tags[:8])

@@ -65,27 +65,27 @@ class KnownMap:
         of_tags = (2 * which[:, None] + np.arange(2)).reshape(-1)
         return np.concatenate([of_tags, 2 * len(self.tags) + np.array(numbers, dtype=np.int64)])
 
-    def condensed(self, tags: Sequence[TagKey], names: Sequence[TagKey]) -> CondensedMap:
+    def condense(self, tags: Sequence[TagKey], names: Sequence[TagKey]) -> CondensedMap:
         """Some tags, one or several times, under other names, for an alignment."""
         n, rows = len(tags), self.rows(tags)
         covariance = np.zeros((5 * n, 5 * n))
         covariance[3 * n :, 3 * n :] = self.covariance[np.ix_(rows, rows)]
         return CondensedMap("the map", tuple(names), np.zeros((n, 3)), self.mean[rows].reshape(n, 2), covariance, 0)
 
-    def held_in(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> Graph:
+    def constrain(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> Graph:
         """The graph with the map's tags and calibration as what is known of them.
 
         Args:
             graph: of runs.
             names: the map's tag of each of the graph's tags that is one.
         """
-        known = self._known(graph, names)
+        known = self._prior(graph, names)
         sigma = graph.problem.prior.sigma.copy()
         sigma[known.calibration] = np.inf  # what robot.yaml says of these is in the map already
         measured = replace(NOTHING_MEASURED, known=known)
         return replace(graph, problem=replace(graph.problem, prior=CalibrationPrior(sigma), measured=measured))
 
-    def _known(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> KnownPlaces:
+    def _prior(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> KnownPlaces:
         tags = [tag for tag in graph.tags if tag in names]
         numbers = self.numbers_among(graph.parameters)
         rows = self.rows([names[tag] for tag in tags], list(numbers.values()))
@@ -107,7 +107,7 @@ class KnownMap:
         return {i: known[key] for i, key in wanted.items() if key in known}
 
 
-def known_map(component: Component, where: str) -> KnownMap:
+def prior_from_map(component: Component, where: str) -> KnownMap:
     """What a component of a map tells of the places of its tags.
 
     Args:

@@ -70,14 +70,14 @@ def locate(local_map: LocalMap, known: KnownMap, component: int) -> Located | No
     ordered = [names[pair] for pair in pairs]
     own = condense(local_map, seen, variance_factor(local_map))
     alignment = align(
-        known.condensed([of_map for _, of_map in pairs], ordered),
-        _repeated(own, [seen.index(tag) for tag, _ in pairs], ordered),
+        known.condense([of_map for _, of_map in pairs], ordered),
+        _repeat_tags(own, [seen.index(tag) for tag, _ in pairs], ordered),
     )
-    told = None if alignment is None else _told(alignment, tuple(of_map for _, of_map in pairs))
+    told = None if alignment is None else _with_map_names(alignment, tuple(of_map for _, of_map in pairs))
     return Located(component, local_map, tuple(pairs), told)
 
 
-def _repeated(condensed: CondensedMap, which: list[int], names: list[TagKey]) -> CondensedMap:
+def _repeat_tags(condensed: CondensedMap, which: list[int], names: list[TagKey]) -> CondensedMap:
     """Tags by index, under other names."""
     n, at = len(condensed.tags), np.array(which, dtype=np.int64)
     rows = np.concatenate(
@@ -93,7 +93,7 @@ def _repeated(condensed: CondensedMap, which: list[int], names: list[TagKey]) ->
     )
 
 
-def _told(alignment: Alignment, tags: tuple[TagKey, ...]) -> Alignment:
+def _with_map_names(alignment: Alignment, tags: tuple[TagKey, ...]) -> Alignment:
     """With the tags under the map's own names."""
-    rivals = tuple(_told(rival, tags) for rival in alignment.rivals)
+    rivals = tuple(_with_map_names(rival, tags) for rival in alignment.rivals)
     return replace(alignment, shared=tags, rivals=rivals)

@@ -20,7 +20,7 @@ from groundsbot.offline.alignment import squared_sigmas
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.localization.map_prior import KnownMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
-from groundsbot.offline.outliers import FALSE_ALARM, renamed
+from groundsbot.offline.outliers import FALSE_ALARM, rename_tags
 from groundsbot.offline.sam import Graph, Solution, State, build_graph, solve, unheld
 
 _MOST_CHANGES: Final = 20
@@ -56,7 +56,7 @@ class HeldRun:
     called: tuple[dict[TagKey, TagKey], ...]
 
 
-def solve_held(
+def solve_in_map(
     members: Sequence[LocalMap],
     T_map_start: FloatArray,
     names: Sequence[dict[TagKey, TagKey]],
@@ -73,12 +73,12 @@ def solve_held(
         known: the map.
     """
     split = _Split(known, members, [dict(each) for each in names], [dict(each) for each in maybe])
-    graph, solution = _solved(members, T_map_start, split, known)
+    graph, solution = _solve(members, T_map_start, split, known)
     judge = _Judge(graph, solution, known)
     for _ in range(_MOST_CHANGES):
-        if not split.changed_by(judge):
+        if not split.update(judge):
             break
-        graph, solution = _solved(members, solution.state.poses[graph.first_pose], split, known)
+        graph, solution = _solve(members, solution.state.poses[graph.first_pose], split, known)
         judge = _Judge(graph, solution, known)
     off = split.elsewhere(judge)
     return HeldRun(
@@ -89,7 +89,7 @@ def solve_held(
             tuple(each for (i, _), each in off.items() if i == m and each.squares > split.bound)
             for m in range(len(members))
         ),
-        tuple(split.called(m) for m in range(len(members))),
+        tuple(split.name_of(m) for m in range(len(members))),
     )
 
 
@@ -108,14 +108,14 @@ class _Split:
         n_tags = sum(len(each) for each in (*held, *loose))
         self.bound = float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2))
 
-    def called(self, member: int) -> dict[TagKey, TagKey]:
+    def name_of(self, member: int) -> dict[TagKey, TagKey]:
         """The name of each tag in the solve: the map's where it is held, else one of its own."""
         own = {tag: _own_name(self.members[member], tag) for tag in self.loose[member]}
         return self.held[member] | own
 
-    def changed_by(self, judge: "_Judge") -> bool:
+    def update(self, judge: "_Judge") -> bool:
         """Frees the tag that all else contradicts most, or holds the one that fits after all; False for none."""
-        off = {key: judge.held(tag) for key, tag in _entries(self.held)}
+        off = {key: judge.tag_offset(tag) for key, tag in _entries(self.held)}
         worst = max(off, key=lambda key: off[key].squares, default=None)
         if worst is not None and off[worst].squares > self.bound and len(off) > 2:
             # In all stretches that saw it: where each has it is told apart from the map's place.
@@ -137,16 +137,16 @@ class _Split:
         return {(i, own): judge.free(tag, _own_name(self.members[i], own)) for (i, own), tag in _entries(self.loose)}
 
 
-def _solved(
+def _solve(
     members: Sequence[LocalMap],
     T_map_start: FloatArray,
     split: "_Split",
     known: KnownMap,
 ) -> tuple[Graph, Solution]:
-    called = [renamed(each, split.called(i)) for i, each in enumerate(members)]
+    called = [rename_tags(each, split.name_of(i)) for i, each in enumerate(members)]
     graph = unheld(build_graph([each.chain for each in called]))
     of_map = {tag: tag for each in split.held for tag in each.values()}
-    graph = known.held_in(graph, of_map)
+    graph = known.constrain(graph, of_map)
     poses = np.concatenate([se2.compose(T, each.T_start_base) for T, each in zip(T_map_start, members, strict=True)])
     tags = {
         tag: se2.apply(T, place)
@@ -187,14 +187,14 @@ class _Judge:
         self._pull = information @ self._off
         self._checked = information - information @ self._joint[:n, :n] @ information
 
-    def held(self, tag: TagKey) -> Elsewhere:
+    def tag_offset(self, tag: TagKey) -> Elsewhere:
         """A tag that is held."""
         at = 2 * self._held.index(tag)
         rows = slice(at, at + 2)
         ways, shares = self._checked[rows, rows], self._pull[rows]
         # Nothing else tells where it is, where the map alone holds it: then nothing can contradict.
         covariance = np.asarray(np.linalg.pinv(ways, rcond=1e-9, hermitian=True), dtype=np.float64)
-        return self._told(tag, tag, covariance @ shares, covariance)
+        return self._tag_offset(tag, tag, covariance @ shares, covariance)
 
     def free(self, tag: TagKey, own: TagKey) -> Elsewhere:
         """A tag of the map that the run has under a name of its own."""
@@ -206,9 +206,9 @@ class _Judge:
         across = self._joint[at, :n] @ by.T
         covariance = self._joint[at, at] - across - across.T + by @ self._joint[:n, :n] @ by.T
         covariance += known.covariance[np.ix_(rows, rows)] - by @ known.covariance[np.ix_(others, rows)]
-        return self._told(tag, own, self._state.tags[self._index[own]] - foretold, covariance)
+        return self._tag_offset(tag, own, self._state.tags[self._index[own]] - foretold, covariance)
 
-    def _told(self, tag: TagKey, own: TagKey, off_m: FloatArray, covariance: FloatArray) -> Elsewhere:
+    def _tag_offset(self, tag: TagKey, own: TagKey, off_m: FloatArray, covariance: FloatArray) -> Elsewhere:
         spread = covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
         squares = float(squared_sigmas(off_m[None], spread[None])[0])
         return Elsewhere(tag, self._state.tags[self._index[own]], off_m, squares)

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.calib.robot import Wheels, parse_robot_yaml
 from groundsbot.offline.errors import OfflineError
 from groundsbot.onboard.log import (
@@ -113,7 +113,7 @@ class LogInfo:
         if not self.tags:
             return "none seen"
         return "; ".join(
-            f"{len(seen)} of {family} in {counted(sum(seen.values()), 'reading')}: {' '.join(map(str, seen))}"
+            f"{len(seen)} of {family} in {plural(sum(seen.values()), 'reading')}: {' '.join(map(str, seen))}"
             for family, seen in self.tags.items()
         )
 
@@ -123,13 +123,13 @@ class LogInfo:
             for gap in self.gaps[:_GAPS_SHOWN]
         ]
         if len(self.gaps) > _GAPS_SHOWN:
-            lines.append(f"  and {counted(len(self.gaps) - _GAPS_SHOWN, 'more gap')}; --json lists them")
+            lines.append(f"  and {plural(len(self.gaps) - _GAPS_SHOWN, 'more gap')}; --json lists them")
         if self.n_pictures_lost:
-            lines.append(f"  {counted(self.n_pictures_lost, 'picture')} lost, by the camera's own count")
+            lines.append(f"  {plural(self.n_pictures_lost, 'picture')} lost, by the camera's own count")
         if self.n_wheel_restarts:
-            lines.append(f"  the wheel controller restarted {counted(self.n_wheel_restarts, 'time')}")
+            lines.append(f"  the wheel controller restarted {plural(self.n_wheel_restarts, 'time')}")
         if self.n_wheel_lines_lost:
-            lines.append(f"  {counted(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
+            lines.append(f"  {plural(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
         lines.extend(f"  damaged: {loss}" for loss in self.losses)
         if self.lost:
             lines.append(f"  lost: {self.lost}")

@@ -26,20 +26,20 @@ def new_log(output: Path) -> Iterator[Path]:
             yield folder
         return
     with ExitStack() as stack:
-        with _told(output):
+        with _errors_as_offline_error(output):
             made = tempfile.TemporaryDirectory(
                 prefix=f".{output.name}.", suffix=".partial", dir=output.parent, ignore_cleanup_errors=True
             )
             folder = Path(stack.enter_context(made))
         yield folder
-        with _told(output):
+        with _errors_as_offline_error(output):
             sync(folder / output.name)
             (folder / output.name).rename(output)
             sync(output.parent)
 
 
 @contextmanager
-def _told(output: Path) -> Iterator[None]:
+def _errors_as_offline_error(output: Path) -> Iterator[None]:
     """Only of what is done to the output: what fails in the block may be another file's."""
     try:
         yield

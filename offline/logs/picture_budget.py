@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from groundsbot.calib.foundation import MOST_PIXELS, claimed_size, is_jpeg
+from groundsbot.calib.foundation import MOST_PIXELS, is_jpeg, size_in_header
 
 # A camera's JPEG spends at least 6 bits on 64 pixels, and cannot be packed further; a bomb takes minutes.
 _PIXELS_PER_BYTE: Final = 128
@@ -15,7 +15,7 @@ _PIXELS_A_PNG_PIXEL: Final = 8
 
 def plausible_pixels(encoded: bytes) -> int | None:
     """Of a PNG or JPEG file; None: more than its bytes can tell, so that it is not worth looking at."""
-    width_px, height_px = claimed_size(encoded)
+    width_px, height_px = size_in_header(encoded)
     n_pixels = width_px * height_px
     return n_pixels if n_pixels <= _PIXELS_PER_BYTE * len(encoded) else None
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import claimed_size
+from groundsbot.calib.foundation import size_in_header
 from groundsbot.calib.robot import parse_robot_yaml
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
@@ -71,7 +71,7 @@ class DetectReport:
     def lines(self) -> list[str]:
         """For a person."""
         lines = [
-            f"{self.n_pictures} pictures: {_told(self.tags_before)} before, {_told(self.tags_after)} now",
+            f"{self.n_pictures} pictures: {_describe(self.tags_before)} before, {_describe(self.tags_after)} now",
             f"{self.n_kept} older detections kept, whose pictures were not" if self.n_kept else "",
             f"{self.n_unusable} pictures are of no use; what was found in them before stays" if self.n_unusable else "",
             *self.losses.lines(),
@@ -79,7 +79,7 @@ class DetectReport:
         return [line for line in lines if line]
 
 
-def _told(tags: Counter[tuple[str, int]]) -> str:
+def _describe(tags: Counter[tuple[str, int]]) -> str:
     return f"{len(tags)} tags in {tags.total()} readings"
 
 
@@ -214,7 +214,7 @@ def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[De
 
         def detect(picture: Picture) -> DetectionResult:
             if isinstance(picture, bytes):
-                width_px, height_px = claimed_size(picture)
+                width_px, height_px = size_in_header(picture)
                 if plausible_pixels(picture) is None:
                     return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
             detector = idle.get()

@@ -41,7 +41,7 @@ class SalvagedFile:
         """Whether everything that was ever written to it is there."""
         return self.target is not None and not self.losses.n_lost
 
-    def placed(self, target: Path) -> "SalvagedFile":
+    def with_target(self, target: Path) -> "SalvagedFile":
         """The same, with the place where its target came to lie."""
         return self if self.target is None else replace(self, target=target)
 
@@ -74,8 +74,8 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     names = {source: finished_name(source) if log.is_dir() else output.name for source in sources}
     with new_log(output) as folder:
         allowance = Allowance()
-        salvaged = [_salvaged(source, folder / name, head, allowance) for source, name in names.items()]
-    return [each.placed(output / names[each.source] if log.is_dir() else output) for each in salvaged]
+        salvaged = [_salvage(source, folder / name, head, allowance) for source, name in names.items()]
+    return [each.with_target(output / names[each.source] if log.is_dir() else output) for each in salvaged]
 
 
 def _losses_of(source: Path, allowance: Allowance) -> LogLosses:
@@ -88,7 +88,7 @@ def _losses_of(source: Path, allowance: Allowance) -> LogLosses:
     return losses
 
 
-def _salvaged(source: Path, target: Path, head: Mapping[str, Message], allowance: Allowance) -> SalvagedFile:
+def _salvage(source: Path, target: Path, head: Mapping[str, Message], allowance: Allowance) -> SalvagedFile:
     losses = LogLosses()
     messages = read_log(source, losses=losses, allowance=allowance)
     try:
@@ -100,7 +100,7 @@ def _salvaged(source: Path, target: Path, head: Mapping[str, Message], allowance
         return SalvagedFile(source, None, 0, losses)
     writer = LogWriter(target, head, first.log_time_ns, durable=False)
     n_messages = sum(
-        _copied(each, writer, losses) for each in chain([first], messages) if not TOPICS[each.topic].every_file
+        _copy(each, writer, losses) for each in chain([first], messages) if not TOPICS[each.topic].every_file
     )
     if not of_pictures([source]):
         now_ns = writer.last_log_time_ns
@@ -109,7 +109,7 @@ def _salvaged(source: Path, target: Path, head: Mapping[str, Message], allowance
     return SalvagedFile(source, target, n_messages, losses)
 
 
-def _copied(each: LogMessage, writer: LogWriter, losses: LogLosses) -> bool:
+def _copy(each: LogMessage, writer: LogWriter, losses: LogLosses) -> bool:
     try:
         at_ns = max(each.log_time_ns, writer.last_log_time_ns)
         return writer.write(each.topic, each.message, at_ns, each.publish_time_ns)

@@ -9,9 +9,9 @@ from groundsbot.offline.global_map import (
     SolvedComponent,
     calibration_of,
     checks_of,
+    compare_measurements,
     component_of,
-    joined_goodness,
-    judged,
+    joint_goodness_of_fit,
     metre_of,
     misfit_of,
     noise_freedom,
@@ -29,7 +29,7 @@ from groundsbot.offline.maps import (
     MeasurementResult,
     MetreResult,
     SuspectTag,
-    widened,
+    inflate_covariances,
 )
 from groundsbot.offline.measurements import Measurements
 from groundsbot.offline.sam import Solution
@@ -60,23 +60,23 @@ class Found:
         self.warnings += [f"component {index}: {sentence}" for sentence in told]
         own_maps = [maps[m] for m in members.members]
         with stages.stage("checking that it fits"):
-            together = _joined(own_maps, solution)
+            together = _joint_goodness_of_fit(own_maps, solution)
             misfit = misfit_of(own_maps, graph, solution, together)
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_freedom(own_maps))
         with stages.stage("covariances"):
-            self.components.append(widened(component_of(graph, solution, refined), misfit, scatter))
+            self.components.append(inflate_covariances(component_of(graph, solution, refined), misfit, scatter))
             last = refined.solution if refined else solution
             numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)
             self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
-            self.measured += judged(graph, last, measurements, index)
+            self.measured += compare_measurements(graph, last, measurements, index)
             self.checks += [replace(each, sigma=factor**0.5 * each.sigma) for each in checks_of(graph, solution, index)]
             self.metres.append(metre_of(graph, index))
         is_refined, poses = refined is not None, last.state.poses
         del solved, refined, last  # the factor on corners, which nothing below asks
         if not is_refined:  # else the map's sigmas are not those that advice is foretold from
             with stages.stage("advice"):
-                self.advice += [_widened(each, factor**0.5) for each in advise(graph, solution, index)]
+                self.advice += [_inflate_sigmas(each, factor**0.5) for each in advise(graph, solution, index)]
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
@@ -86,11 +86,11 @@ class Found:
         return Solved(members, graph, solution, poses)
 
 
-def _joined(maps: Sequence[LocalMap], solution: Solution) -> Goodness | None:
+def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodness | None:
     """Whether several drives fit together that do so each by itself; None where there are none."""
     if len(maps) == 1 or not all(each.goodness.fits for each in maps):
         return None
-    return joined_goodness(maps, solution)
+    return joint_goodness_of_fit(maps, solution)
 
 
 def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness | None) -> list[str]:
@@ -99,6 +99,6 @@ def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness
     return found if together is None else found + together.warnings(f"component {component}")
 
 
-def _widened(advice: AdviceResult, sigma_factor: float) -> AdviceResult:
+def _inflate_sigmas(advice: AdviceResult, sigma_factor: float) -> AdviceResult:
     """What it tells of sigmas, in those that are reported."""
     return replace(advice, sigma_m=sigma_factor * advice.sigma_m, sigma_then_m=sigma_factor * advice.sigma_then_m)

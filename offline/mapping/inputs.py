@@ -10,7 +10,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Inputs, Stages
-from groundsbot.offline.local_map import check_can_be_extended, check_sizes_in_map
+from groundsbot.offline.local_map import check_extendable, check_sizes_in_map
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import SAME_SIZE_M, RobotFile, Run, load_run
 from groundsbot.offline.self_calibration import Calibrate
@@ -48,7 +48,7 @@ def check_new(
     runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
 ) -> None:
     """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
-    check_can_be_extended(extending)
+    check_extendable(extending)
     if corners:
         raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
     if calibrate.names:

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from math import degrees
 
-from groundsbot.offline.alignment import Alignment, Group, Merge, PairAlignment, why_not_joined
+from groundsbot.offline.alignment import Alignment, Group, Merge, PairAlignment, reason_not_joined
 from groundsbot.offline.global_map import TagJoin
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import AlignmentResult, RivalResult
@@ -42,7 +42,7 @@ def merge_warnings(
         if alignment.is_sure:
             warnings += _elsewhere(maps, pair, alignment, named)
         elif component[pair.a] == component[pair.b]:
-            warnings.append(f"{_why_not_joined(maps, pair)}; other runs join them")
+            warnings.append(f"{_reason_not_joined(maps, pair)}; other runs join them")
     warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
     for i, group in enumerate(merged.groups[1:], start=1):
         warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
@@ -57,7 +57,7 @@ def reason_apart(
     if crossing:
         names = {maps[m].chain.name for m in group.members}
         nearest = max(crossing, key=_nearness)
-        why = _why_not_joined(maps, nearest, names)
+        why = _reason_not_joined(maps, nearest, names)
         if len(nearest.shared) > 1:
             return why
         if not_joined is None and all(maps[m].graph.has_corners for m in (nearest.a, nearest.b)):
@@ -84,14 +84,14 @@ def _nearness(pair: PairAlignment) -> tuple[float, int]:
     return evidence_nats, len(pair.shared)
 
 
-def _why_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
+def _reason_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
     """Why a pair is not joined; the first name is one of `told_of`."""
     a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
     if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
         a, b = b, a
     if not pair.is_searched:
         return f"{b} shares {len(pair.shared)} tags with {a}, but was not laid over it: {_TOO_LONG}"
-    return why_not_joined(a, b, pair.shared, pair.alignment)
+    return reason_not_joined(a, b, pair.shared, pair.alignment)
 
 
 def _elsewhere(

@@ -11,13 +11,13 @@ from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map import (
     SolvedComponent,
     TagJoin,
+    join_over_tags,
     join_results,
     join_warnings,
-    joined_over_tags,
-    solved_component,
-    unused,
+    solve_group,
+    unused_measurements,
 )
-from groundsbot.offline.local_map import LocalMap, kept_of, local_map_of, tags_of, tape_of
+from groundsbot.offline.local_map import LocalMap, archive_map, local_map_of, tags_of, tape_of
 from groundsbot.offline.mapping.findings import Found
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
 from groundsbot.offline.mapping.merge_report import alignment_results
@@ -32,14 +32,19 @@ from groundsbot.offline.measurements import (
     chains_of,
     parse_measurements,
 )
-from groundsbot.offline.noise import fit_and_weigh, weighed_as
-from groundsbot.offline.outliers import judged_under_own_noise, local_maps_of, told_apart, with_outliers_apart
+from groundsbot.offline.noise import fit_and_weigh, with_noise_of_map
+from groundsbot.offline.outliers import (
+    local_maps_of,
+    remove_outliers_under_own_noise,
+    split_duplicates,
+    with_outliers_apart,
+)
 from groundsbot.offline.self_calibration import (
     TIMES_MAPPED,
     Calibrate,
     Freed,
     about_the_files,
-    free_what_is_told,
+    free_parameters,
     put_right,
     start_left_open,
     verdicts,
@@ -90,23 +95,23 @@ def build_map(
     workings = workings or Workings()
     workings.runs += runs
     given = runs
-    (runs, choices, put_in, searches), chains = _calibrated(
+    (runs, choices, put_in, searches), chains = _calibrate_runs(
         runs, noise or prior_noise, stages, calibrate, corners=corners
     )
     workings.searches |= searches
     measurements = _measurements(tape, runs, chains, extending)
-    known = _known_maps(extending, stages)
+    known = _maps_to_extend(extending, stages)
     times = TIMES_MAPPED if calibrate.is_on else 1
     maps, noisy, broken = local_maps_of(chains, stages, times, noise_is_open=noise is None)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
-        maps, slipped = judged_under_own_noise(maps, noisy, stages)
+        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages)
         broken += slipped
     else:
-        maps = known + weighed_as(maps, noise, noise_fit)
-    kept = tuple(kept_of(each) for each in maps)
-    maps, merged, components, joins = _solved_together(
+        maps = known + with_noise_of_map(maps, noise, noise_fit)
+    kept = tuple(archive_map(each) for each in maps)
+    maps, merged, components, joins = _align_and_solve(
         maps, measurements, stages, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad
     )
     workings.maps += maps
@@ -114,7 +119,7 @@ def build_map(
     found = Found()
     while components:  # each is let go of where it has told its part: a factor on corners may take 100 MiB
         workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
-    found.measured += unused(measurements, found.measured)
+    found.measured += unused_measurements(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
     calibration = about_the_files(found.calibration, put_in)
@@ -139,7 +144,7 @@ def build_map(
     )
 
 
-def _calibrated(
+def _calibrate_runs(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
 ) -> tuple[Freed, list[Chain]]:
     """The runs as their robots are to be taken, and their stretches."""
@@ -148,7 +153,7 @@ def _calibrated(
     found = Freed(runs, started, put_right(started), searches)
     if calibrate.is_on:
         with stages.stage("self-calibration"):
-            freed = free_what_is_told(runs, noise, calibrate.names, corners=corners)
+            freed = free_parameters(runs, noise, calibrate.names, corners=corners)
         found = Freed(
             freed.runs, (*started, *freed.choices), found.put_in | freed.put_in, found.searches | freed.searches
         )
@@ -160,7 +165,7 @@ def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list
     chains: list[Chain] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
-            chains += [told_apart(chain) for chain in chains_of(run, noise)]
+            chains += [split_duplicates(chain) for chain in chains_of(run, noise)]
             done()
     return chains
 
@@ -175,7 +180,7 @@ def _measurements(
     return parse_measurements(tape, names, sorted(tags))
 
 
-def _known_maps(extending: MapResult | None, stages: Stages) -> list[LocalMap]:
+def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMap]:
     """The local maps of a map that is extended, under the noise that it was kept with."""
     if extending is None:
         return []
@@ -192,7 +197,7 @@ class _Together(NamedTuple):
     joins: list[TagJoin]
 
 
-def _solved_together(
+def _align_and_solve(
     maps: Sequence[LocalMap],
     measurements: Measurements,
     stages: Stages,
@@ -205,10 +210,10 @@ def _solved_together(
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
-    solve = partial(solved_component, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
+    solve = partial(solve_group, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
     components = [solve(maps, members, measurements, stages) for members in merged.groups]
     joins: list[TagJoin] = []
     if corners and len(components) > 1:
-        components, joins = joined_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
+        components, joins = join_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
         merged = replace(merged, groups=tuple(each.members for each in components))
     return _Together(maps, merged, components, joins)

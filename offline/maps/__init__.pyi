@@ -28,7 +28,7 @@ from .result import (
 )
 from .tags_table import tags_csv
 from .tum import write_tum
-from .widening import TagScatter, widened
+from .widening import TagScatter, inflate_covariances
 
 __all__ = [
     "JSON_FILE",
@@ -61,11 +61,11 @@ __all__ = [
     "TagResult",
     "TagScatter",
     "advice_as_json",
+    "inflate_covariances",
     "map_as_json",
     "nominal_row",
     "read_map",
     "tags_csv",
-    "widened",
     "write_map",
     "write_mcap",
     "write_tum",

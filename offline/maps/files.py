@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import FloatArray, written_whole
+from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
 from groundsbot.offline.maps.archive import KeptChain, arrays_of, calibration_from, chain_from
@@ -65,11 +65,11 @@ def write_map(result: MapResult, folder: Path) -> None:
         OSError: the folder is missing or not writable.
     """
     text = json.dumps(map_as_json(result), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    with written_whole(folder / JSON_FILE) as partial:
+    with atomic_write(folder / JSON_FILE) as partial:
         partial.write_text(text, encoding="utf-8")
-    with written_whole(folder / ARRAYS_FILE) as partial, partial.open("wb") as stream:
+    with atomic_write(folder / ARRAYS_FILE) as partial, partial.open("wb") as stream:
         np.savez(stream, **_arrays(result))
-    with written_whole(folder / TAGS_FILE) as partial:
+    with atomic_write(folder / TAGS_FILE) as partial:
         partial.write_text(tags_csv(result.components), encoding="utf-8")
     for run in result.runs:
         write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
@@ -95,7 +95,7 @@ def read_map(folder: Path) -> MapResult:
             if len({each["run"] for each in data["runs"]}) < len(data["runs"]):
                 raise ValueError("a run is there twice")
             components = tuple(_component(data, index, arrays, folder) for index in range(len(data["components"])))
-            kept = _kept(arrays)
+            kept = _archived_segments(arrays)
         return MapResult(
             components=components,
             alignments=tuple(alignment_from(entry) for entry in data["alignments"]),
@@ -192,7 +192,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     )
 
 
-def _kept(arrays: Mapping[str, Any]) -> tuple[KeptChain, ...]:
+def _archived_segments(arrays: Mapping[str, Any]) -> tuple[KeptChain, ...]:
     """All that there are; none in a map of an older program."""
     found: list[KeptChain] = []
     while (kept := chain_from(arrays, f"run{len(found)}_")) is not None:

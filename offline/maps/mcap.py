@@ -30,7 +30,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from groundsbot.calib.foundation import written_whole
+from groundsbot.calib.foundation import atomic_write
 from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
 from groundsbot.onboard.log import BASE_FRAME, CAMERA_FRAME, FrameTransform, timestamp
 
@@ -73,7 +73,7 @@ def write_mcap(result: MapResult, path: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    with written_whole(path) as partial, partial.open("wb") as stream:
+    with atomic_write(path) as partial, partial.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(profile="", library="groundsbot")
         channels: dict[str, int] = {}
@@ -125,7 +125,7 @@ def _transforms(run: RunResult, frame: str) -> Iterator[_Entry]:
             parent_frame_id=frame,
             child_frame_id=base,
             translation=Vector3(x=x, y=y, z=0.0),
-            rotation=_turned(theta_rad),
+            rotation=_rotation_about_z(theta_rad),
         )
         yield _Entry(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=[moved, *fixed]))
         fixed = []
@@ -166,7 +166,7 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         color=_TAG_COLOR,
     )
     text = TextPrimitive(
-        pose=Pose(position=Vector3(x=x, y=y, z=z_m + _TAG_DIAMETER_M), orientation=_turned(0.0)),
+        pose=Pose(position=Vector3(x=x, y=y, z=z_m + _TAG_DIAMETER_M), orientation=_rotation_about_z(0.0)),
         billboard=True,
         font_size=_TEXT_M,
         color=_TAG_COLOR,
@@ -195,7 +195,7 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
 def _orientation(tag: TagResult) -> Quaternion:
     """R_map_tag, z out of the face; none where the map knows none."""
     if tag.pose is None:
-        return _turned(0.0)
+        return _rotation_about_z(0.0)
     x, y, z, w = tag.pose.quaternion_xyzw.tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
 
@@ -221,10 +221,10 @@ def _entity(name: str, frame: str, stamp_ns: int, said: dict[str, str]) -> Scene
 
 
 def _pose(x_m: float, y_m: float, theta_rad: float) -> Pose:
-    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=_turned(theta_rad))
+    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=_rotation_about_z(theta_rad))
 
 
-def _turned(theta_rad: float) -> Quaternion:
+def _rotation_about_z(theta_rad: float) -> Quaternion:
     """About z."""
     half = 0.5 * theta_rad
     return Quaternion(x=0.0, y=0.0, z=float(np.sin(half)), w=float(np.cos(half)))

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray, written_whole
+from groundsbot.calib.foundation import FloatArray, IntArray, atomic_write
 from groundsbot.offline.errors import OfflineError
 
 _NS_PER_S: Final = 1_000_000_000
@@ -21,7 +21,7 @@ def write_tum(path: Path, stamps_ns: IntArray, T_map_base: FloatArray) -> None:
             stamps_ns.tolist(), *T_map_base[:, :2].T.tolist(), np.sin(half).tolist(), np.cos(half).tolist(), strict=True
         )
     ]
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("".join(lines), encoding="ascii")
 
 

@@ -24,7 +24,7 @@ class TagScatter:
     added_m2: FloatArray
 
 
-def widened(component: Component, misfit: Misfit | None, scatter: TagScatter) -> Component:
+def inflate_covariances(component: Component, misfit: Misfit | None, scatter: TagScatter) -> Component:
     """The component with all covariances times the misfit's factor, and what its passes add to each tag.
 
     That of a tag is an error of its own, so other tags' covariances and those with them stay.

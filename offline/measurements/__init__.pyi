@@ -1,10 +1,10 @@
 from .chain import Chain, chains_of
-from .coarse_chain import coarse_keyframes, coarsened, refined, telling_keyframes
+from .coarse_chain import coarse_keyframes, coarsen, refine_poses, telling_keyframes
 from .covariance_components import CovarianceParts
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, ChainOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.stretches import wheel_distances
-from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, confirmed, passes_of
+from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
 from .sensor_model.readings import Readings
@@ -52,8 +52,7 @@ __all__ = [
     "cells_of",
     "chains_of",
     "coarse_keyframes",
-    "coarsened",
-    "confirmed",
+    "coarsen",
     "growth",
     "least_shared",
     "least_shared_by_corners",
@@ -63,7 +62,8 @@ __all__ = [
     "read_detections",
     "read_positions",
     "read_robot_file",
-    "refined",
+    "refine_poses",
     "telling_keyframes",
     "wheel_distances",
+    "without_unconfirmed_tracks",
 ]

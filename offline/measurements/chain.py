@@ -14,7 +14,7 @@ from groundsbot.offline.measurements.keyframes import (
 )
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.readings import Readings, joined
+from groundsbot.offline.measurements.sensor_model.readings import Readings, concatenate_observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import (
     read_detections,
     read_positions,
@@ -81,9 +81,9 @@ class Chain:
         seen, tag = np.unique(readings.tag, return_inverse=True)
         return replace(self, tags=tuple(self.tags[i] for i in seen), readings=replace(readings, tag=tag))
 
-    def weighed(self, noise: NoiseParameters) -> "Chain":
+    def with_noise(self, noise: NoiseParameters) -> "Chain":
         """The same measurements under other noise."""
-        return replace(self, odometry=self.odometry.weighed(noise), readings=self.readings.weighed(noise))
+        return replace(self, odometry=self.odometry.with_noise(noise), readings=self.readings.with_noise(noise))
 
     def with_position_noise(self, names: tuple[str, ...]) -> "Chain":
         """The same measurements with readings of corners that err besides by some of `POSITION_NOISE`."""
@@ -142,4 +142,4 @@ def _readings(
     keyframe = keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
     imported, more_warnings = read_positions(run.robot, positions.where(kept), keyframe[kept], twist, noise)
-    return joined(from_corners, imported), warnings + more_warnings
+    return concatenate_observations(from_corners, imported), warnings + more_warnings

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import chained, se2
+from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
 
@@ -41,7 +41,7 @@ def telling_keyframes(chain: Chain) -> IntArray:
     return np.union1d(chain.readings.keyframe, np.append(enters, len(chain.stamps_ns) - 1))
 
 
-def coarsened(chain: Chain, keyframes: IntArray) -> Chain:
+def coarsen(chain: Chain, keyframes: IntArray) -> Chain:
     """The chain at some of its keyframes, the first one and the last among them; other readings are passed over.
 
     Args:
@@ -55,7 +55,7 @@ def coarsened(chain: Chain, keyframes: IntArray) -> Chain:
     return replace(
         chain,
         stamps_ns=chain.stamps_ns[keyframes],
-        odometry=_composed(chain.odometry, keyframes),
+        odometry=_compose(chain.odometry, keyframes),
         tags=tuple(chain.tags[i] for i in seen),
         readings=replace(kept, keyframe=new_index[kept.keyframe], tag=tag),
     )
@@ -67,19 +67,19 @@ def _along_m(chain: Chain) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.maximum(chain.odometry.distance_m, turned_m))])
 
 
-def refined(chain: Chain, keyframes: IntArray, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+def refine_poses(chain: Chain, keyframes: IntArray, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
     """(K, 3) poses of all keyframes from those of some (k, 3): dead reckoning on from each to the next."""
-    driven = chain.odometry.dead_reckoned(wheel_calibration)
+    driven = chain.odometry.dead_reckon(wheel_calibration)
     before = np.searchsorted(keyframes, np.arange(len(driven)), side="right") - 1
     return se2.compose(poses[before], se2.between(driven[keyframes[before]], driven))
 
 
-def _composed(odometry: ChainOdometry, keyframes: IntArray) -> ChainOdometry:
+def _compose(odometry: ChainOdometry, keyframes: IntArray) -> ChainOdometry:
     """Motions from each of some keyframes to the next; covariances and Jacobians carried to the step's end."""
     if len(keyframes) < 2:
         return odometry.part(0, 0)
     first = keyframes[:-1]
-    poses = chained(odometry.motion, np.zeros(3))
+    poses = chain_motions(odometry.motion, np.zeros(3))
     end = np.repeat(keyframes[1:], np.diff(keyframes))
     to_end = se2.adjoint(se2.between(poses[end], poses[1:]))
 

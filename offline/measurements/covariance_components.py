@@ -39,7 +39,7 @@ class CovarianceParts:
         return np.stack([own.get(name, none) for name in names]) if names else np.zeros((0, *self.rest.shape))
 
 
-def concatenated(a: CovarianceParts, b: CovarianceParts) -> CovarianceParts:
+def concatenate(a: CovarianceParts, b: CovarianceParts) -> CovarianceParts:
     """Both, one after the other, with the names of both."""
     names = tuple(dict.fromkeys(a.names + b.names))
     return CovarianceParts(names, np.concatenate([a.of(names), b.of(names)], axis=1), np.concatenate([a.rest, b.rest]))

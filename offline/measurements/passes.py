@@ -41,7 +41,7 @@ def passes_of(chain: Chain, cut: BoolArray | None = None) -> IntArray:
     return number
 
 
-def confirmed(chain: Chain) -> Chain:
+def without_unconfirmed_tracks(chain: Chain) -> Chain:
     """The chain without passes of one or two readings of tags that have passes of more.
 
     A detector that takes one tag for another does so in a picture or two; tags that pass by are read in several. Where

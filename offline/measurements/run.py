@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from groundsbot.calib.camera import CameraModel, read_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import IntArray, counted
+from groundsbot.calib.foundation import IntArray, plural
 from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
-from groundsbot.calib.tags import moved_out
+from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
@@ -78,7 +78,7 @@ class Run:
     corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
 
-    def retimed(self, late_s: float) -> "Run":
+    def shift_stamps(self, late_s: float) -> "Run":
         """The run with the stamps of pictures and imported positions taken back by so many seconds."""
         late_ns = round(late_s * 1e9)
         return replace(
@@ -184,7 +184,7 @@ def load_run(
     stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     collected.readings.check_tags(log)
-    read = collected.readings.gathered(log_bytes, inputs.n_logs)
+    read = collected.readings.collect(log_bytes, inputs.n_logs)
     warnings += _not_used(collected, read.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
@@ -200,7 +200,7 @@ def load_run(
         tags=read.tags,
         detections=replace(
             read.detections,
-            corners_px=moved_out(read.detections.corners_px, -robot.edge_shift_px),
+            corners_px=shift_edges(read.detections.corners_px, -robot.edge_shift_px),
         ),
         positions=read.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
@@ -209,7 +209,7 @@ def load_run(
         lost=losses.in_words,
         corners_refined=read.corners_refined,
         events=tuple(sorted(collected.events)),
-    ).retimed(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
+    ).shift_stamps(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
 
 
 def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:
@@ -232,7 +232,7 @@ def _not_used(collected: _Collected, every: int, log_bytes: int) -> list[str]:
             f"{every} is used"
         )
     if collected.n_other_size:
-        pictures = counted(collected.n_other_size, "picture")
+        pictures = plural(collected.n_other_size, "picture")
         told.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
     return told
 

@@ -121,7 +121,7 @@ class RunReadings:
                 "are their numbers right?"
             )
 
-    def gathered(self, log_bytes: int, n_logs: int = 1) -> Gathered:
+    def collect(self, log_bytes: int, n_logs: int = 1) -> Gathered:
         """Those of all looks, or of as many as one of so many logs is worth with this size, evenly spread."""
         tags = tuple(sorted(self._numbers))
         rank = np.empty(len(tags), dtype=np.int64)

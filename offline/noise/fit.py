@@ -10,7 +10,7 @@ from scipy.special import ndtri
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import STAMP_NOISE, Chain, CovarianceParts, coarse_keyframes, coarsened
+from groundsbot.offline.measurements import STAMP_NOISE, Chain, CovarianceParts, coarse_keyframes, coarsen
 from groundsbot.offline.noise.likelihood import Components, Part
 from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
@@ -79,9 +79,11 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoisePara
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
-        fitted = _fitted(maps, noise, start or noise, free)
+        fitted = _fit(maps, noise, start or noise, free)
         found = _sigmas(free, fitted)
-        small = {each.name: _left(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept}
+        small = {
+            each.name: _keep_prior(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept
+        }
         if not small:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
@@ -96,7 +98,7 @@ def _times_default(sigma: FittedSigma) -> float:
     return sigma.value / default
 
 
-def _left(sigma: FittedSigma, noise: NoiseParameters) -> FittedSigma:
+def _keep_prior(sigma: FittedSigma, noise: NoiseParameters) -> FittedSigma:
     why = f"it came out at {_times_default(sigma):.3g} times the default, which no robot has"
     return replace(sigma, value=getattr(noise, sigma.name), kept=why)
 
@@ -114,19 +116,19 @@ def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
     return tuple(sigmas[name] for name in NoiseParameters.model_fields if name in sigmas)
 
 
-def _fitted(
+def _fit(
     maps: Sequence[LocalMap], noise: NoiseParameters, start: NoiseParameters, names: tuple[str, ...]
 ) -> FittedVariances:
     default = NoiseParameters()
     return fit_variances(
-        [_part(each, chain, noise, names) for each, chain in zip(maps, _thinned(maps), strict=True)],
+        [_part(each, chain, noise, names) for each, chain in zip(maps, _thin(maps), strict=True)],
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
         start=np.array([getattr(start, name) for name in names]),
     )
 
 
-def _thinned(maps: Sequence[LocalMap]) -> list[Chain]:
+def _thin(maps: Sequence[LocalMap]) -> list[Chain]:
     """All of each run, at so few keyframes that all together have no more than is looked at."""
     chains = [each.chain for each in maps]
     n_all = sum(len(chain.stamps_ns) for chain in chains)
@@ -137,7 +139,7 @@ def _thinned(maps: Sequence[LocalMap]) -> list[Chain]:
     while sum(map(len, keyframes)) > _MAX_KEYFRAMES:
         share *= _NEXT_SHARE
         keyframes = [coarse_keyframes(chain, share) for chain in chains]
-    return [coarsened(*each) for each in zip(chains, keyframes, strict=True)]
+    return [coarsen(*each) for each in zip(chains, keyframes, strict=True)]
 
 
 def _part(local_map: LocalMap, chain: Chain, noise: NoiseParameters, names: tuple[str, ...]) -> Part:

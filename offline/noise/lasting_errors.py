@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import jitted
+from groundsbot.offline.foundation import njit
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class LastingErrors:
         found[self.order] = before + after - 1.0
         return found
 
-    def drawn(self, innovations: FloatArray) -> FloatArray:
+    def correlate(self, innovations: FloatArray) -> FloatArray:
         """(N, n) errors B e of independent innovations (N, n)."""
         series = innovations * np.sqrt(1.0 - self.kept**2)[:, None]
         _keep(series, self.kept)
@@ -44,14 +44,14 @@ class LastingErrors:
         errors[self.order] = series
         return errors
 
-    def projected(self, rows: FloatArray) -> FloatArray:
+    def correlate_transpose(self, rows: FloatArray) -> FloatArray:
         """B' r of rows (N, n): the sum of their squares is r' B B' r."""
         series = rows[self.order]
         _keep_backwards(series, self.kept)
         return series * np.sqrt(1.0 - self.kept**2)[:, None]
 
 
-@jitted
+@njit
 def _add_neighbours(before: FloatArray, after: FloatArray, kept: FloatArray) -> None:
     for k in range(1, len(kept)):
         before[k] += kept[k] * before[k - 1]
@@ -59,13 +59,13 @@ def _add_neighbours(before: FloatArray, after: FloatArray, kept: FloatArray) -> 
         after[k - 1] += kept[k] * after[k]
 
 
-@jitted
+@njit
 def _keep(series: FloatArray, kept: FloatArray) -> None:
     for k in range(1, len(kept)):
         series[k] += kept[k] * series[k - 1]
 
 
-@jitted
+@njit
 def _keep_backwards(series: FloatArray, kept: FloatArray) -> None:
     for k in range(len(kept) - 1, 0, -1):
         series[k - 1] += kept[k] * series[k]

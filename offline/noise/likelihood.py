@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.noise.lasting_errors import LastingErrors
-from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stacked, whitening
+from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stack, whitening
 
 _N_SIGNS: Final = 8
 # A trace over k directions is known to sqrt(2 / (32 k)): where errors that last, of which few directions tell, are set
@@ -127,7 +127,7 @@ class Looker:
     def look(self, variances: FloatArray) -> Seen:
         """Solves under (C,) variances, which are K of factors and two of each level."""
         odometry, readings = self._components.covariances(variances)
-        problem = self.solution.problem.reweighed(whitening(odometry), whitening(readings))
+        problem = self.solution.problem.reweigh(whitening(odometry), whitening(readings))
         self.solution = replace(self.solution, problem=problem)  # lets go of the factorisation of the look before
         self.solution = solve(
             problem,
@@ -141,17 +141,17 @@ class Looker:
         n, rng = rows.n_components, np.random.default_rng(_SEED)
         traces, lengths, n_signs, at_most = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
         for j in range(n):
-            drawn = rows.drawn(j, rng)
+            drawn = rows.random_errors(j, rng)
             at_most += variances[j] * rows.squares(drawn[:, :_N_SIGNS]).mean(axis=1)
-            drawn = rows.weighed(drawn)
-            left = rows.left_over(drawn)
+            drawn = rows.weigh(drawn)
+            left = rows.residuals(drawn)
             traces[:, j] = rows.squares(left).mean(axis=1)
             lengths[j], n_signs[j] = (drawn * left).sum(axis=0).mean(), drawn.shape[1]
         # Both of a pair of components tell of the same trace.
         traces = (n_signs * traces + (n_signs * traces).T) / (n_signs + n_signs[:, None])
         lasting = slice(n - self._components.n_lasting, n)
         n_groups = lengths[lasting] ** 2 / np.maximum(np.diag(traces)[lasting], 1e-300)
-        unscaled = rows.squares(rows.left_over(rows.weighed(rows.drawn_unscaled(rng)))).mean(axis=1)
+        unscaled = rows.squares(rows.residuals(rows.weigh(rows.random_unscaled_errors(rng)))).mean(axis=1)
         return Seen(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, at_most, n_groups)
 
 
@@ -165,7 +165,7 @@ class _Rows:
     def __init__(self, solution: Solution, components: Components) -> None:
         problem, state = solution.problem, solution.state
         kinds = problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
-        jacobian, residual = stacked(kinds, problem.columns.n)
+        jacobian, residual = stack(kinds, problem.columns.n)
         _, weight = losses_and_weights(solution.losses.readings, kinds[1].residual)
         self._n_odometry = kinds[0].residual.size
         self._root = np.concatenate([np.ones(self._n_odometry), np.repeat(np.sqrt(weight), 2)])
@@ -188,11 +188,11 @@ class _Rows:
             self._pictures = sparse.csr_array((np.ones(len(picture)), (picture, np.arange(len(picture)))))
         self.n_components = len(components.odometry) + components.n_lasting
 
-    def weighed(self, errors: FloatArray) -> FloatArray:
+    def weigh(self, errors: FloatArray) -> FloatArray:
         """(R, n) errors as the losses weigh them."""
         return np.asarray(self._root[:, None] * errors)
 
-    def left_over(self, errors: FloatArray) -> FloatArray:
+    def residuals(self, errors: FloatArray) -> FloatArray:
         """P e of (R, n) errors."""
         solved = self._factorisation.solve_many(np.asarray(self._jacobian.T @ errors))
         left: FloatArray = errors - self._jacobian @ solved
@@ -210,33 +210,35 @@ class _Rows:
             along = np.einsum("mi,min->mn", self._by_stamp, readings)
             own[self._common] = (np.asarray(self._pictures @ along) ** 2).sum(axis=0)
         lasting = [
-            (errors.projected(np.einsum("mi,min->mn", self._by_lasting[..., axis], readings)) ** 2).sum(axis=0)
+            (errors.correlate_transpose(np.einsum("mi,min->mn", self._by_lasting[..., axis], readings)) ** 2).sum(
+                axis=0
+            )
             for errors in self._lasting
             for axis in (0, 1)
         ]
         return np.array(own + lasting).reshape(self.n_components, rows.shape[1])
 
-    def drawn(self, component: int, rng: np.random.Generator) -> FloatArray:
+    def random_errors(self, component: int, rng: np.random.Generator) -> FloatArray:
         """(R, n) errors as component j brings with a variance of one, by random signs."""
         rows = np.zeros((len(self.residual), _N_SIGNS))
         if component == self._common:
             signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
             rows[self._n_odometry :] = (self._by_stamp[..., None] * signs[:, None, :]).reshape(-1, _N_SIGNS)
         elif component < len(self._of_motions):
-            rows = self._drawn_by(self._of_motions[component], self._of_readings[component], rng)
+            rows = self._random_errors_by(self._of_motions[component], self._of_readings[component], rng)
         else:
             kind, axis = divmod(component - len(self._of_motions), 2)
-            errors = self._lasting[kind].drawn(rng.choice([-1.0, 1.0], (len(self._by_lasting), _N_SIGNS_LASTING)))
+            errors = self._lasting[kind].correlate(rng.choice([-1.0, 1.0], (len(self._by_lasting), _N_SIGNS_LASTING)))
             readings = self._by_lasting[..., axis, None] * errors[:, None, :]
             rows = np.zeros((len(self.residual), _N_SIGNS_LASTING))
             rows[self._n_odometry :] = readings.reshape(-1, _N_SIGNS_LASTING)
         return rows
 
-    def drawn_unscaled(self, rng: np.random.Generator) -> FloatArray:
+    def random_unscaled_errors(self, rng: np.random.Generator) -> FloatArray:
         """(R, n) errors as the parts of the covariances bring that no variance scales."""
-        return self._drawn_by(*self._unscaled, rng)
+        return self._random_errors_by(*self._unscaled, rng)
 
-    def _drawn_by(
+    def _random_errors_by(
         self, of_motions: FloatArray | None, of_readings: FloatArray | None, rng: np.random.Generator
     ) -> FloatArray:
         rows = np.zeros((len(self.residual), _N_SIGNS))

@@ -20,7 +20,7 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import NOT_NEEDED, FittedNoise, FittedParameter
 from groundsbot.offline.measurements import ODOMETRY_NOISE
 from groundsbot.offline.noise.fit import FittedSigma, fit_noise
-from groundsbot.offline.noise.shared_errors import counted_for_less
+from groundsbot.offline.noise.shared_errors import with_shared_errors
 from groundsbot.offline.sam import solve, whitening
 
 _NO_RUN: Final = "no run has tag readings that fit together"
@@ -48,7 +48,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         prior: what stays where the runs tell nothing.
     """
     sound = [each for each in maps if _is_sound(each)]
-    fit = fit_noise(sound, prior, _as_shown(sound, prior))
+    fit = fit_noise(sound, prior, _inflate_prior(sound, prior))
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
     is_told = bool(fit.n_groups[0, 0] >= _LEAST_CELLS)
     shared = fit.shared if noise != prior else np.zeros((2, 2))
@@ -73,7 +73,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
     )
 
 
-def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
+def with_noise_of_map(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
     """Maps solved under the noise of a map that is kept, with what readings share as it was found there."""
     shared = np.zeros((2, 2))
     if fitted is not None:
@@ -82,7 +82,7 @@ def weighed_as(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedN
     return [replace(_under(each, noise, shared, noise), goodness=each.goodness) for each in maps]
 
 
-def _as_shown(maps: Sequence[LocalMap], prior: NoiseParameters) -> NoiseParameters:
+def _inflate_prior(maps: Sequence[LocalMap], prior: NoiseParameters) -> NoiseParameters:
     """The prior, wheels as much worse as windows of noisy drives show; from far too small sigmas nothing is told."""
     times = max([1.0, *(each.goodness.odometry_factor for each in maps if each.is_noisy)])
     return prior.model_copy(update={name: times * getattr(prior, name) for name in ODOMETRY_NOISE})
@@ -101,9 +101,9 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
     """The map solved under other noise and with readings that share errors."""
     if noise == prior and not shared.any() and not local_map.chain.readings.corner_bias_px.any():
         return local_map
-    chain = counted_for_less(local_map.chain.weighed(noise), shared, noise.sigma_corner_px)
+    chain = with_shared_errors(local_map.chain.with_noise(noise), shared, noise.sigma_corner_px)
     weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
-    graph = replace(local_map.graph, problem=local_map.graph.problem.reweighed(*weights), chains=(chain,))
+    graph = replace(local_map.graph, problem=local_map.graph.problem.reweigh(*weights), chains=(chain,))
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
@@ -111,7 +111,7 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
     graph.problem.arrowhead.without_scratch()
     whole = local_map.whole
     if whole is not None:
-        whole = counted_for_less(whole.weighed(noise), shared, noise.sigma_corner_px)
+        whole = with_shared_errors(whole.with_noise(noise), shared, noise.sigma_corner_px)
     return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness, whole=whole)
 
 

@@ -31,11 +31,11 @@ def lasting_errors(chain: Chain) -> tuple[LastingErrors, LastingErrors]:
     goes_on[1:] = np.diff(pass_of[order]) == 0
     at = chain.readings.keyframe[order]
     apart = np.zeros(len(order))
-    apart[1:] = np.abs(np.diff(_changed(chain)[at]))
+    apart[1:] = np.abs(np.diff(_view_changes(chain)[at]))
     return LastingErrors(order, goes_on * np.exp(-apart)), LastingErrors(order, goes_on)
 
 
-def _changed(chain: Chain) -> FloatArray:
+def _view_changes(chain: Chain) -> FloatArray:
     """(K,) how often the view has changed by so much that errors are others, at the keyframes."""
     turned_rad = np.append(0.0, np.cumsum(np.abs(chain.odometry.motion[:, 2])))
     return np.asarray(chain.along_m / _LASTING_M + turned_rad / _LASTING_RAD)
@@ -65,7 +65,7 @@ def spread_of_corners(chain: Chain, n_in_cell: IntArray, sigma_corner_px: float)
     return np.asarray(np.sqrt(1.0 + n_in_cell * least_shared_by_corners(chain.readings, sigma_corner_px)))
 
 
-def counted_for_less(chain: Chain, shared: FloatArray, sigma_corner_px: float) -> Chain:
+def with_shared_errors(chain: Chain, shared: FloatArray, sigma_corner_px: float) -> Chain:
     """The chain with readings that count for less by what they share.
 
     Args:

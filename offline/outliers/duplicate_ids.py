@@ -13,14 +13,14 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import chained, se2
+from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import GAP_M, Chain, Readings
 
 # Beside its covariance, how far a reading is off from what the last one made expect.
 _SLACK_M: Final = 0.01
 
 
-def told_apart(chain: Chain) -> Chain:
+def split_duplicates(chain: Chain) -> Chain:
     """The chain with as many instances of an id as were seen at once, under names that no other chain has."""
     readings, tags = chain.readings, chain.tags
     if len(chain.run.positions.tag) or not len(readings):  # imported: several readings of a keyframe may be of one tag
@@ -32,7 +32,7 @@ def told_apart(chain: Chain) -> Chain:
     keys = [tags[i] for i in readings.tag]
     for tag in several.tolist():
         own = np.flatnonzero(readings.tag == tag)
-        for reading, number in zip(own.tolist(), _followed(chain, own), strict=True):
+        for reading, number in zip(own.tolist(), _follow(chain, own), strict=True):
             keys[reading] = tags[tag]._replace(instance=f"{chain.name} {number}")
     apart = tuple(sorted(set(keys)))
     index = {tag: i for i, tag in enumerate(apart)}
@@ -40,10 +40,10 @@ def told_apart(chain: Chain) -> Chain:
     return replace(chain, tags=apart, readings=replace(readings, tag=tag_of))
 
 
-def _followed(chain: Chain, own: IntArray) -> list[int]:
+def _follow(chain: Chain, own: IntArray) -> list[int]:
     """Numbers of the tags that readings `own` of one id are of, in order of time; the wheels tell where they hang."""
     readings = chain.readings
-    poses = se2.compose(chained(chain.odometry.motion, np.zeros(3)), chain.T_base_camera)
+    poses = se2.compose(chain_motions(chain.odometry.motion, np.zeros(3)), chain.T_base_camera)
     along_m = chain.along_m
     keyframe = readings.keyframe[own]
     range_m, bearing = readings.value[own].T

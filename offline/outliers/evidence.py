@@ -29,7 +29,7 @@ from groundsbot.offline.sam import (
     Measured,
     Problem,
     State,
-    factorised,
+    factorise,
     losses_and_weights,
 )
 
@@ -81,7 +81,7 @@ class Heard:
     by_tag: FloatArray
 
 
-def heard(graph: Graph, state: State, scales: FloatArray) -> Heard:
+def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> Heard:
     """Linearises the readings of a graph.
 
     Args:
@@ -89,12 +89,12 @@ def heard(graph: Graph, state: State, scales: FloatArray) -> Heard:
         state: near an optimum.
         scales: (C, 2) of each chain's noise, see `noise_scales`.
     """
-    problem = _scaled(graph, scales)
+    problem = _scale_noise(graph, scales)
     readings = problem.readings.linearise(state, problem.columns)
     return Heard(problem, state, readings.residual, readings.blocks[1][1])
 
 
-def gathered(
+def marginalise(
     at: Heard,
     sightings: Sightings,
     unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
@@ -112,10 +112,10 @@ def gathered(
     which = np.flatnonzero(np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] > 1)
     if not len(which):
         return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
-    apart, state = _apart(_weighed(at, sightings) if weighed else at.problem, at.state, sightings)
+    apart, state = _apart(_reweigh(at, sightings) if weighed else at.problem, at.state, sightings)
     system, _ = apart.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
-    factorisation, _ = factorised(apart.arrowhead, system, 0.0)
+    factorisation, _ = factorise(apart.arrowhead, system, 0.0)
     step = factorisation.solve_in_order(system.gradient)
     by_tag = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(sightings)].reshape(-1, 2)
     information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
@@ -157,7 +157,7 @@ def to_other_tags(measured: Measured, index: IntArray) -> Measured:
     return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
 
 
-def contradicted(at: Heard, sightings: Sightings) -> BoolArray:
+def find_contradictions(at: Heard, sightings: Sightings) -> BoolArray:
     """(M,) readings before which a tag seems to have moved though it was in sight.
 
     The poses count as known, which a few metres apart they nearly are: that finds a move too many rather than one too
@@ -214,7 +214,7 @@ def _inverse(matrices: FloatArray) -> FloatArray:
     return inverse
 
 
-def _scaled(graph: Graph, scales: FloatArray) -> Problem:
+def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
     """The problem under the chains' own noise."""
     problem = graph.problem
     chain_of_pose = np.repeat(np.arange(len(graph.chains)), [len(chain.stamps_ns) for chain in graph.chains])
@@ -228,7 +228,7 @@ def _scaled(graph: Graph, scales: FloatArray) -> Problem:
     )
 
 
-def _weighed(at: Heard, sightings: Sightings) -> Problem:
+def _reweigh(at: Heard, sightings: Sightings) -> Problem:
     """The problem with readings weighed by the others of their sighting.
 
     Not by where the tag is said to be: what is off together was moved, and is to be heard in full.

@@ -46,11 +46,11 @@ def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
     counted = np.flatnonzero(tells[sightings.chain])
     for begin in range(0, len(counted), _AT_ONCE):
         some = counted[begin : begin + _AT_ONCE]
-        views.read[some], views.near[some] = _counted(graph, state, sightings, some)
+        views.read[some], views.near[some] = _count_views(graph, state, sightings, some)
     return views
 
 
-def _counted(graph: Graph, state: State, sightings: Sightings, which: IntArray) -> tuple[IntArray, IntArray]:
+def _count_views(graph: Graph, state: State, sightings: Sightings, which: IntArray) -> tuple[IntArray, IntArray]:
     """From how many poses tags were read in some sightings (s,), and how many poses have a near view (s,)."""
     readings, n = graph.problem.readings, len(which)
     number = np.full(len(sightings), -1, dtype=np.int64)

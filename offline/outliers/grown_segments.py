@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import chained, se2
+from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import Chain, TagKey
 from groundsbot.offline.sam import Effort, Parameter, build_graph, solve
 
@@ -32,7 +32,7 @@ class Grown(NamedTuple):
     freedom: int
 
 
-def grown_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]:
+def grow_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]:
     """Longer and longer parts of the chain, from one end on, as long as there is effort for them."""
     n = len(chain.stamps_ns)
     parts: list[Grown] = []
@@ -40,7 +40,7 @@ def grown_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]
         if effort.is_spent():
             break
         piece = (n - end, n) if backwards else (0, end)
-        parts.append(_solved(chain, *piece, parts[-1] if parts else None, effort))
+        parts.append(_solve_part(chain, *piece, parts[-1] if parts else None, effort))
     return parts
 
 
@@ -59,11 +59,11 @@ def limit_of(chain: Chain, parts: Sequence[Grown], factor: float, effort: Effort
     """The longest part whose readings fit together, as far as there is effort; None where all of the chain does."""
     for before, after in pairwise(parts):
         if _strains(before, after, factor, len(parts)):
-            return _refined(chain, before, after, factor, effort)
+            return _refine_end(chain, before, after, factor, effort)
     return None
 
 
-def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
+def _refine_end(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
     """Between a part that fits and a longer one that does not, keyframe by keyframe."""
     longest = known
     reading = np.unique(chain.readings.keyframe)
@@ -73,7 +73,7 @@ def _refined(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: E
     for part in parts:
         if effort.is_spent():
             break
-        grown = _solved(chain, *part, longest, effort)
+        grown = _solve_part(chain, *part, longest, effort)
         if _strains(known, grown, factor, len(parts)):
             break
         longest = grown
@@ -86,7 +86,7 @@ def _strains(before: Grown, after: Grown, factor: float, n_tests: int) -> bool:
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solved(chain: Chain, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
+def _solve_part(chain: Chain, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
     """A part of a chain, from what is known of another that has an end in common with it."""
     part = chain.part(first, end)
     graph = build_graph([part])
@@ -106,11 +106,11 @@ def _poses(chain: Chain, first: int, end: int, known: Grown | None, wheels: Floa
     odometry = chain.odometry.part(first, end - 1)
     motion = se2.compose(odometry.motion, se2.exp(odometry.jacobian @ wheels))
     if known is None:
-        return chained(motion, np.zeros(3))
+        return chain_motions(motion, np.zeros(3))
     kept = known.poses[max(0, first - known.first) : end - known.first]
     at = max(0, known.first - first)
-    after = chained(motion[at + len(kept) - 1 :], kept[-1])[1:]
-    before = chained(se2.inverse(motion[:at][::-1]), kept[0])[1:][::-1]
+    after = chain_motions(motion[at + len(kept) - 1 :], kept[-1])[1:]
+    before = chain_motions(se2.inverse(motion[:at][::-1]), kept[0])[1:][::-1]
     return np.concatenate([before, kept, after])
 
 

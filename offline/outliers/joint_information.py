@@ -37,12 +37,12 @@ class Information:
         own = self.root.of(rows)
         return self._of(np.eye(len(rows)), own.against(own))
 
-    def gathered(self, label: IntArray, n: int) -> "Gathered":
+    def gather(self, label: IntArray, n: int) -> "Gathered":
         """With sightings (K,) of one label, 0 to n - 1, in one place."""
         column = rows_of(label)
         ones = np.ones(len(column))
         gather = sparse.csc_array((ones, (np.arange(len(column)), column)), shape=(len(column), 2 * n))
-        return Gathered(self, column, self.root.summed(gather), np.bincount(label, minlength=n).repeat(2))
+        return Gathered(self, column, self.root.sum_columns(gather), np.bincount(label, minlength=n).repeat(2))
 
     def _of(self, ones: FloatArray, covariance: FloatArray) -> FloatArray:
         weight = self.slack_sigma_m**-2
@@ -75,7 +75,7 @@ class Gathered:
         ones[np.arange(len(rows)), self.column[rows]] = 1.0
         return self.single._of(ones, self.single.root.of(rows).against(self.root))
 
-    def summed(self, vectors: FloatArray) -> FloatArray:
+    def sum_by_place(self, vectors: FloatArray) -> FloatArray:
         """(2 P, n) vectors (2 K, n) of the sightings, summed up by places."""
         sums = np.zeros((len(self.count), vectors.shape[1]))
         np.add.at(sums, self.column, vectors)

@@ -76,7 +76,7 @@ def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) 
         (m,) = np.flatnonzero(readings.tag == tag).tolist()
         in_picture = readings.tag[readings.pose == readings.pose[m]]
         others = np.setdiff1d(np.flatnonzero(n_readings > 1), in_picture)
-        squares = (readings.taken_for(m, others).residual(solution.state) ** 2).sum(axis=1)
+        squares = (readings.with_other_tags(m, others).residual(solution.state) ** 2).sum(axis=1)
         if len(others) and squares.min() < _SAME_PLACE:
             found.add(graph.tags[tag])
     return found

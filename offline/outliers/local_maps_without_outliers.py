@@ -5,10 +5,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from groundsbot.offline.foundation import Stages
-from groundsbot.offline.local_map import LocalMap, judged, solve_local_map
+from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Chain
 from groundsbot.offline.outliers.false_readings import without_false_detections
-from groundsbot.offline.outliers.odometry_breaks import split_where_broken
+from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.outliers.outliers import RunsAlone
 from groundsbot.offline.outliers.slips import sentence, without_slips
 from groundsbot.offline.sam import efforts_of
@@ -34,7 +34,7 @@ def local_maps_of(
     """Each chain solved alone, parted where its wheels lost the way, with tags that do not belong apart.
 
     That is what explains a drive that contradicts itself though its wheels and readings are about as good as told. One
-    whose noise is far larger than that is left as it is: its noise comes first (`judged_under_own_noise`).
+    whose noise is far larger than that is left as it is: its noise comes first (`remove_outliers_under_own_noise`).
 
     Args:
         chains: stretches of runs.
@@ -50,9 +50,9 @@ def local_maps_of(
             done()
     alone = RunsAlone()
     with stages.stage("tags that do not belong"):
-        maps = [each if each.is_noisy else alone.explained_by_tags(each) for each in maps]
+        maps = [each if each.is_noisy else alone.explain_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
-        maps, broken = split_where_broken(maps, efforts)
+        maps, broken = split_at_breaks(maps, efforts)
     with stages.stage("tags that do not belong"):
         maps = [each if each.is_noisy else alone.split(each) for each in maps]
     noisy = frozenset(each.chain.name for each in maps if each.is_noisy)
@@ -66,7 +66,7 @@ class JudgedMaps(NamedTuple):
     warnings: list[str]
 
 
-def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages) -> JudgedMaps:
+def remove_outliers_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages) -> JudgedMaps:
     """Noisy maps without false detections and slips, judged again under the noise that was fitted.
 
     A drive that does not fit is parted where its wheels lost the way, if that explains it. Where a drive does not fit
@@ -89,11 +89,11 @@ def judged_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[str], sta
         if slips:
             warnings.append(sentence(again, slips))
         with stages.stage("checking that it fits"):
-            again = judged(again)
+            again = with_goodness_of_fit(again)
         parts = [again]
         if not again.goodness.fits:
             with stages.stage("breaks of odometry"):
-                parts, broken = split_where_broken([replace(again, is_noisy=False)])
+                parts, broken = split_at_breaks([replace(again, is_noisy=False)])
             warnings += broken
         found += [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factors() for part in parts]
     return JudgedMaps(found, warnings)

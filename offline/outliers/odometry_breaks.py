@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import chained, se2
+from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.alignment import Alignment, align, condense
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.local_map import LocalMap, solve_local_map
@@ -27,7 +27,7 @@ from groundsbot.offline.outliers.grown_segments import (
     COST_TOLERANCE,
     FALSE_ALARM,
     Grown,
-    grown_parts,
+    grow_parts,
     limit_of,
     noise_factor,
 )
@@ -100,7 +100,7 @@ class _Start(NamedTuple):
     state: State
 
 
-def split_where_broken(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
+def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
     """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own.
 
     Args:
@@ -114,7 +114,7 @@ def split_where_broken(maps: Sequence[LocalMap], efforts: Sequence[Effort] | Non
         warnings += [_sentence(whole.chain, each) for each in split.breaks]
         if not split.is_searched:
             warnings.append(_not_searched(whole.chain))
-    return Mended(_numbered(mended) if warnings else mended, warnings)
+    return Mended(_rename_segments(mended) if warnings else mended, warnings)
 
 
 def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | None:
@@ -125,7 +125,7 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
     chain, effort = local_map.chain, effort or _all_of(local_map)
     if _fits(local_map) or local_map.is_noisy:
         return None
-    grown = [grown_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
+    grown = [grow_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
     ahead, behind = (limit_of(chain, parts, factor, effort) for parts in grown)
     if ahead is None or behind is None:
@@ -141,13 +141,13 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
     ]
     if not starts:
         return None
-    apart = _solved_from(starts, local_map.graph.problem, effort)
+    apart = _solve_from(starts, local_map.graph.problem, effort)
     if effort.is_spent():
         return None
     costs = np.array([solution.cost for solution in apart])
     equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
     best = max(equal.tolist(), key=lambda i: _seconds_between(chain, starts[i].place))
-    return _judged(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
+    return _test_break(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
 
 
 def _all_of(local_map: LocalMap) -> Effort:
@@ -163,7 +163,7 @@ def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
     ends = (0, found.end), (found.begin, len(chain.stamps_ns))
     left = [_without_ends(chain.part(*each), *each, chain) for each in ends]
     for (first, _), part in zip(ends, left, strict=True):
-        own = effort.taken(_SHARE_OF_A_PART if part is left[0] else 1.0)
+        own = effort.take(_SHARE_OF_A_PART if part is left[0] else 1.0)
         inner = _split(solve_local_map(part, own), most - 1, own)
         effort.give_back(own)
         breaks = [(first + offset, each) for offset, each in inner.breaks]
@@ -245,35 +245,35 @@ def _between_readings(chain: Chain, place: _Place) -> _Place:
 
 def _ways_to_align(chain: Chain, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
     """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
-    apart = _solved_apart(chain, place, effort)
+    apart = _solve_apart(chain, place, effort)
     if apart is None:
         return []
     at_begin = behind.poses[place.begin - behind.first]
-    alignment = _aligned(*apart)
+    alignment = _align(*apart)
     ways = [] if alignment is None else [alignment, *alignment.rivals]
     return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
 
 
-def _solved_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> list[Solution]:
+def _solve_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> list[Solution]:
     """With a break, wherever it may be; not from all starts where there is no effort left."""
     found: list[Solution] = []
     for start in starts:
         if effort.is_spent():
             break
-        freed = _freed(problem, *start.place)
+        freed = _without_motions(problem, *start.place)
         found.append(solve(freed, start.state, COST_TOLERANCE, most_tries=effort.tries(freed, 1.0)))
         effort.spend(found[-1], is_built=True)
     return found
 
 
-def _solved_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
+def _solve_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
     """What comes before and what comes after, each on its own; None where one of them cannot be."""
     n = len(chain.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
         return None
     found = []
     for part in (chain.part(0, place.end), chain.part(place.begin, n)):
-        own = effort.taken(_SHARE_OF_A_SOLVE)
+        own = effort.take(_SHARE_OF_A_SOLVE)
         try:
             found.append(solve_local_map(part, own))
         except OfflineError:
@@ -282,7 +282,7 @@ def _solved_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap
     return found[0], found[1]
 
 
-def _aligned(before: LocalMap, after: LocalMap) -> Alignment | None:
+def _align(before: LocalMap, after: LocalMap) -> Alignment | None:
     shared = sorted(set(before.graph.tags) & set(after.graph.tags))
     return align(condense(before, shared), condense(after, shared)) if len(shared) > 1 else None
 
@@ -290,20 +290,22 @@ def _aligned(before: LocalMap, after: LocalMap) -> Alignment | None:
 def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_behind: FloatArray) -> _Start:
     """Starting values for the whole with a break in that place."""
     before, after = ahead.poses[: place.end], behind.poses[place.begin - behind.first :]
-    between = chained(graph.chains[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
+    between = chain_motions(graph.chains[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
     poses = np.concatenate([before, between, se2.compose(T_ahead_behind, after)])
     tags = {tag: se2.apply(T_ahead_behind, at) for tag, at in behind.tags.items()} | ahead.tags
     return _Start(place, graph.start(poses, tags, ahead.calibration))
 
 
-def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort) -> Break | None:
+def _test_break(
+    local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort
+) -> Break | None:
     """The break, if two tags agree on it and it pays to believe in it."""
     chain, problem = local_map.chain, local_map.graph.problem
-    parts = _solved_apart(chain, place, effort)
-    alignment = None if parts is None else _aligned(*parts)
+    parts = _solve_apart(chain, place, effort)
+    alignment = None if parts is None else _align(*parts)
     if parts is None or alignment is None or not alignment.is_sure:
         return None
-    freed = _freed(problem, *place)
+    freed = _without_motions(problem, *place)
     apart = solve(freed, start, most_tries=effort.tries(freed, 1.0))
     effort.spend(apart)
     together = solve(problem, apart.state, most_tries=effort.tries(problem, 1.0))
@@ -322,7 +324,7 @@ def _judged(local_map: LocalMap, place: _Place, start: State, equal: Sequence[_P
     return Break(place.end, place.begin, reach, jump, chi_square, float(bound))
 
 
-def _freed(problem: Problem, end: int, begin: int) -> Problem:
+def _without_motions(problem: Problem, end: int, begin: int) -> Problem:
     """Without the motions from keyframe end - 1 to begin."""
     inside = (problem.odometry.first >= end - 1) & (problem.odometry.first < begin)
     weak = np.where(inside[:, None, None], _FREED * problem.odometry.whitening, problem.odometry.whitening)
@@ -332,11 +334,11 @@ def _freed(problem: Problem, end: int, begin: int) -> Problem:
 def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
     """(3,) the motion that the wheels do not have."""
     odometry = graph.chains[0].odometry.part(end - 1, begin)
-    told = odometry.dead_reckoned(graph.wheel_calibration(state, 0))[-1]
+    told = odometry.dead_reckon(graph.wheel_calibration(state, 0))[-1]
     return se2.between(told, se2.between(state.poses[end - 1], state.poses[begin]))
 
 
-def _numbered(maps: Sequence[LocalMap]) -> list[LocalMap]:
+def _rename_segments(maps: Sequence[LocalMap]) -> list[LocalMap]:
     """Stretches named after their run and their place in it."""
     count: dict[str, int] = {}
     numbered = []

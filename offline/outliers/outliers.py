@@ -19,16 +19,16 @@ from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import (
     Evidence,
     Heard,
-    contradicted,
-    gathered,
-    heard,
+    find_contradictions,
+    linearise_observations,
+    marginalise,
     noise_scales,
     to_other_tags,
 )
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.kinds import SHARE_ASTRAY_WITHIN_SIGHT, cases, is_within_sight, minority
-from groundsbot.offline.outliers.places import Places, settled
-from groundsbot.offline.outliers.search import FALSE_ALARM, bound, excess, freedom_of_places, search
+from groundsbot.offline.outliers.places import Places, minimise_places
+from groundsbot.offline.outliers.search import FALSE_ALARM, cost_bound, excess, freedom_of_places, search
 from groundsbot.offline.outliers.sightings import (
     Sightings,
     instances,
@@ -96,7 +96,7 @@ class RunsAlone:
         self._seen.append((local_map, after))
         return after
 
-    def explained_by_tags(self, before: LocalMap) -> LocalMap:
+    def explain_by_tags(self, before: LocalMap) -> LocalMap:
         """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
 
         Where wheels did not tell how the robot moved, most tags seem to have been moved.
@@ -118,14 +118,14 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     found = local_map
     if not found.goodness.fits:
         factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
-        sightings = _sightings(found.graph, heard(found.graph, found.solution.state, factors))
+        sightings = _sightings(found.graph, linearise_observations(found.graph, found.solution.state, factors))
         if len(sightings) > len(sightings.ids):
-            found = _in_few_places(_relabelled(found, sightings, np.arange(len(sightings))), factors, false_alarm)
+            found = _in_few_places(_relabel(found, sightings, np.arange(len(sightings))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
     return _in_few_places(found, noise_scales([found.goodness]), false_alarm)
 
 
-def joined(local_map: LocalMap) -> LocalMap:
+def join_places(local_map: LocalMap) -> LocalMap:
     """With one place for each id again."""
     if not any(tag.instance for tag in local_map.chain.tags):
         return local_map
@@ -140,12 +140,12 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     Two tags with one id that are passed again after a long way are both off by what is not known of the way. One may
     come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
     """
-    found = _settled_alone(local_map, scales, false_alarm)
+    found = _search_alone(local_map, scales, false_alarm)
     n_places = Counter(key.whole for key in found.chain.tags)
     for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
-        seen = _looked_at(local_map.graph, local_map.solution, scales)
+        seen = _collect_tracks(local_map.graph, local_map.solution, scales)
         for place in _joins(seen, tag)[:_MOST_JOINS]:
-            other = _settled_alone(_relabelled(local_map, seen.sightings, place), scales, false_alarm)
+            other = _search_alone(_relabel(local_map, seen.sightings, place), scales, false_alarm)
             if other.goodness.fits >= found.goodness.fits and _n_places(other, tag) < _n_places(found, tag):
                 found = other
             if _n_places(found, tag) < _MANY_PLACES:
@@ -173,19 +173,19 @@ def _n_places(local_map: LocalMap, tag: TagKey) -> int:
     return sum(key.whole == tag for key in local_map.chain.tags)
 
 
-def _settled_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
+def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
     """Splits and joins until nothing changes."""
     found = local_map
     for _ in range(_MOST_SEARCHES):
-        seen = _looked_at(found.graph, found.solution, scales)
-        wanted = _wanted(seen, false_alarm)
+        seen = _collect_tracks(found.graph, found.solution, scales)
+        wanted = _best_places(seen, false_alarm)
         if wanted is None or _same(wanted, seen.place):
             break
-        found = _relabelled(found, seen.sightings, wanted)
+        found = _relabel(found, seen.sightings, wanted)
     return found
 
 
-def _relabelled(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
+def _relabel(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
     """The chain solved anew with these places, whose names no other run has."""
     tag_of = instances(sightings, place, f"{local_map.chain.name} ")
     return solve_local_map(with_instances([local_map.chain], sightings, tag_of)[0])
@@ -208,7 +208,7 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
             letter = {g: letters(first + i) for i, g in enumerate(places)}
             n_places[tag.whole] += len(places)
             names |= {(m, tag): tag._replace(instance=letter[g]) for m, g in group.items()}
-    return [renamed(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
+    return [rename_tags(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
 
 
 def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
@@ -223,34 +223,34 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
         maps: of the graph's chains.
     """
     if len(graph.problem.measured):
-        loose = replace(graph, problem=replace(graph.problem, measured=_loosened(graph.problem.measured)))
+        loose = replace(graph, problem=replace(graph.problem, measured=_loosen_priors(graph.problem.measured)))
         seen = _split(loose, solve(loose.problem, solution.state), maps)
         if seen is None:
             return None
-        problem = replace(seen.graph.problem, measured=_measured_again(graph, seen.graph))
+        problem = replace(seen.graph.problem, measured=_rename_ends(graph, seen.graph))
         return replace(seen, graph=replace(seen.graph, problem=problem), solution=solve(problem, seen.solution.state))
     return _split(graph, solution, maps)
 
 
 def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
     scales = noise_scales([each.goodness for each in maps])
-    seen = _looked_at(graph, solution, scales)
+    seen = _collect_tracks(graph, solution, scales)
     noise_is_fitted = any(each.is_noisy for each in maps)
     for _ in range(_MOST_SEARCHES):
-        wanted = _wanted(seen, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
+        wanted = _best_places(seen, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
         if wanted is None:
             return None
         if instances(seen.sightings, wanted) == seen.tags:
             break
-        seen = _looked_at(*_solved_again(seen, wanted), scales)
+        seen = _collect_tracks(*_solve_again(seen, wanted), scales)
     if noise_is_fitted:
-        joined_place = _near_ones_joined(seen)
+        joined_place = _join_near_places(seen)
         if not _same(joined_place, seen.place):
-            seen = _looked_at(*_solved_again(seen, joined_place), scales)
+            seen = _collect_tracks(*_solve_again(seen, joined_place), scales)
     return seen
 
 
-def _near_ones_joined(seen: Searched) -> IntArray:
+def _join_near_places(seen: Searched) -> IntArray:
     """(S,) the places; one for an id of near places that were never seen at once, each sighted more than now and then.
 
     Where noise was fitted, that is an error of the drives.
@@ -268,19 +268,19 @@ def _near_ones_joined(seen: Searched) -> IntArray:
 def _sightings(graph: Graph, at: Heard) -> Sightings:
     """Cut also where a tag moved in sight."""
     whole = sightings_of(graph.chains)
-    cut = contradicted(at, whole)
+    cut = find_contradictions(at, whole)
     return few_of_each_tag(graph, sightings_of(graph.chains, cut) if cut.any() else whole)
 
 
-def _looked_at(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
-    at = heard(graph, solution.state, scales)
+def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
+    at = linearise_observations(graph, solution.state, scales)
     sightings = _sightings(graph, at)
     place = places_told_apart(graph.chains, sightings)
-    evidence = gathered(at, sightings)
-    return Searched(graph, solution, sightings, place, evidence, settled(evidence, place[evidence.which]))
+    evidence = marginalise(at, sightings)
+    return Searched(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
 
 
-def _wanted(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
+def _best_places(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
     """(S,) the places that the evidence asks for.
 
     None where most ids ask for several though the noise was fitted to the same passes: then it is not the tags.
@@ -289,7 +289,7 @@ def _wanted(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = False
     found = seen.place.copy()
     if len(which):
         freedom = freedom_of_places(seen.places) if noise_is_fitted else np.inf
-        least_gain = excess(seen.places) * bound(seen.sightings, seen.evidence, false_alarm, freedom)
+        least_gain = excess(seen.places) * cost_bound(seen.sightings, seen.evidence, false_alarm, freedom)
         most_ids = max(int((np.bincount(seen.sightings.id) > 1).sum()), _FEW_AGAIN) // 2
         label = search(seen.evidence, seen.sightings, seen.places, least_gain, most_ids if noise_is_fitted else None)
         if label is None:
@@ -304,16 +304,16 @@ def _same(place: IntArray, other: IntArray) -> bool:
     return pairs == len(np.unique(place)) == len(np.unique(other))
 
 
-def _solved_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
+def _solve_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
     """The same chains with these places, from the poses as they are."""
     graph, state = seen.graph, seen.solution.state
     again = build_graph(with_instances(graph.chains, seen.sightings, instances(seen.sightings, place)))
-    again = replace(again, problem=replace(again.problem, measured=_measured_again(graph, again)))
-    start = again.start(state.poses, _unchanged(graph, again, state.tags), graph.calibration_of(state))
+    again = replace(again, problem=replace(again.problem, measured=_rename_ends(graph, again)))
+    start = again.start(state.poses, _unchanged_places(graph, again, state.tags), graph.calibration_of(state))
     return again, solve(again.problem, start)
 
 
-def _loosened(measured: Measured) -> Measured:
+def _loosen_priors(measured: Measured) -> Measured:
     """With sigmas so wide that it contradicts nothing."""
     starts, distances = measured.starts, measured.distances
     return Measured(
@@ -322,13 +322,13 @@ def _loosened(measured: Measured) -> Measured:
     )
 
 
-def _measured_again(before: Graph, after: Graph) -> Measured:
+def _rename_ends(before: Graph, after: Graph) -> Measured:
     """What was measured, now to the first instance of each tag."""
     first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
     return to_other_tags(before.problem.measured, np.array([first[tag.whole] for tag in before.tags], dtype=np.int64))
 
 
-def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
+def _unchanged_places(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
     """Places of the tags that have the readings they had."""
     n_before = dict(zip(before.tags, before.n_readings().tolist(), strict=True))
     n_after = dict(zip(after.tags, after.n_readings().tolist(), strict=True))
@@ -336,7 +336,7 @@ def _unchanged(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, 
     return {tag: places[tag] for tag, n in n_after.items() if n_before.get(tag) == n}
 
 
-def renamed(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
+def rename_tags(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
     """The same map with some of its tags under other names."""
     if not names:
         return local_map

@@ -50,7 +50,7 @@ class Stiffness:
         """(2 K, 2) what all feel of some sightings moved as one."""
         moved = np.zeros((len(self.gathered.column), 2))
         moved[rows_of(members)] = np.tile(np.eye(2), (len(members), 1))
-        way = self.covariance @ self.gathered.summed(self.information.times(moved))
+        way = self.covariance @ self.gathered.sum_by_place(self.information.times(moved))
         return self.information.times(moved - way[self.gathered.column])
 
 
@@ -71,7 +71,7 @@ class Held(NamedTuple):
         rows = np.repeat(which, 2)
         return Held(self.members[which], self.stiffness[np.ix_(rows, rows)], self.pull[which])
 
-    def freed(self, against: FloatArray, inner: FloatArray, own: FloatArray) -> "Held":
+    def release(self, against: FloatArray, inner: FloatArray, own: FloatArray) -> "Held":
         """Once what felt `against` (2 K, 2) of all with `inner` (2, 2) has followed its pull (2,)."""
         felt = against[rows_of(self.members)]
         way = np.linalg.solve(inner, felt.T)
@@ -103,7 +103,7 @@ class Places:
     stiffness: Stiffness
 
     @cached_property
-    def held(self) -> list["Held"]:
+    def tracks(self) -> list["Held"]:
         """Of each place its sightings."""
         order = np.argsort(self.place, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.place))[:-1]) if len(order) else []
@@ -125,7 +125,7 @@ class Places:
         return np.asarray(middle + self.offset[2 * p : 2 * p + 2])
 
 
-def settled(evidence: Evidence, place: IntArray) -> Places:
+def minimise_places(evidence: Evidence, place: IntArray) -> Places:
     """The least cost where sightings (K,) of one label have one place."""
     _, place = np.unique(place, return_inverse=True)
     n = int(place.max(initial=-1)) + 1
@@ -134,11 +134,11 @@ def settled(evidence: Evidence, place: IntArray) -> Places:
     np.add.at(sums, place, evidence.places_m)
     middle = sums / np.bincount(place, minlength=n)[:, None]
     information = evidence.information
-    gathered = information.gathered(place, n)
+    gathered = information.gather(place, n)
     to_middle = (middle[place] - evidence.places_m).reshape(-1, 1)
     score = evidence.score + information.times(to_middle)[:, 0]
     covariance = linalg.inv(gathered.whole() + NOWHERE * np.eye(2 * n), check_finite=False)
-    offset: FloatArray = -covariance @ gathered.summed(score[:, None])[:, 0]
+    offset: FloatArray = -covariance @ gathered.sum_by_place(score[:, None])[:, 0]
     pull = score + information.times(offset[gathered.column, None])[:, 0]
     return Places(place, offset, covariance, pull.reshape(-1, 2), Stiffness(information, gathered, covariance))
 

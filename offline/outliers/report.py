@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.offline.maps import SuspectTag
 from groundsbot.offline.outliers.false_detections import MOST_READINGS, Views, chances, views_of
 from groundsbot.offline.outliers.kinds import (
@@ -43,21 +43,21 @@ class _Report:
         """Each case once; then ids that nothing supports."""
         found: dict[int, SuspectTag] = {}
         for i, j in swapped_pairs(self._cases, self._searched.evidence, self._searched.places):
-            found[i], found[j] = self._swapped(i, j), self._swapped(j, i)
+            found[i], found[j] = self._swap(i, j), self._swap(j, i)
         wrong = wrong_runs(self._cases, self._searched.sightings)
         for i, case in enumerate(self._cases):
             if i not in found and (stand := self._phantom_stand(case)) is not None:
-                found[i] = self._contradicted_phantom(case, stand)
+                found[i] = self._false_detection(case, stand)
         for run, which in wrong.items():
             left = [i for i in which if i not in found]
             for i in left:
                 found[i] = self._inconsistent(self._cases[i], run, len(which))
         for i, case in enumerate(self._cases):
             if i not in found:
-                found[i] = self._displaced(case)
-        return sorted([*found.values(), *self._unsupported()], key=lambda each: (each.family, each.tag_id))
+                found[i] = self._displacement(case)
+        return sorted([*found.values(), *self._unsupported_tags()], key=lambda each: (each.family, each.tag_id))
 
-    def _displaced(self, case: Case) -> SuspectTag:
+    def _displacement(self, case: Case) -> SuspectTag:
         kind = case.kind()
         apart_m, sigmas = self._shift(case)
         if kind == MOVED:
@@ -66,12 +66,14 @@ class _Report:
             return self._suspect(case, kind, elsewhere, words)
         if kind == MOVING:
             during = [c for c, way in case.seen.items() if len(way) > 1]
-            words = f"by {_metres(apart_m)} ({sigmas:.0f} sigma) during {self._named(during)}: {self._where(case)}"
+            words = (
+                f"by {_metres(apart_m)} ({sigmas:.0f} sigma) during {self._list_segments(during)}: {self._where(case)}"
+            )
             return self._suspect(case, kind, during, words)
         words = f"two tags with one id, {_metres(apart_m)} ({sigmas:.0f} sigma) apart: {self._where(case)}"
         return self._suspect(case, kind, list(case.seen), words)
 
-    def _swapped(self, i: int, j: int) -> SuspectTag:
+    def _swap(self, i: int, j: int) -> SuspectTag:
         case, other = self._cases[i], self._cases[j]
         apart_m, sigmas = self._shift(case)
         first = {c for c, way in case.seen.items() if way == (0,)}
@@ -103,17 +105,17 @@ class _Report:
                 return k
         return None
 
-    def _contradicted_phantom(self, case: Case, k: int) -> SuspectTag:
+    def _false_detection(self, case: Case, k: int) -> SuspectTag:
         stand = case.stands[k]
         nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
         rest = sum(each.n_readings for each in case.stands) - stand.n_readings
         words = (
-            f"{counted(stand.n_readings, 'reading')} in {self._named(stand.chains)} {_metres(nearest[0])} "
-            f"({nearest[1]:.0f} sigma) from where {counted(rest, 'other')} have it: a false detection"
+            f"{plural(stand.n_readings, 'reading')} in {self._list_segments(stand.chains)} {_metres(nearest[0])} "
+            f"({nearest[1]:.0f} sigma) from where {plural(rest, 'other')} have it: a false detection"
         )
         return self._suspect(case, PHANTOM, list(stand.chains), words)
 
-    def _unsupported(self) -> list[SuspectTag]:
+    def _unsupported_tags(self) -> list[SuspectTag]:
         """Ids read once or a few times from where they should have been read more often."""
         searched = self._searched
         sightings = searched.sightings
@@ -124,7 +126,7 @@ class _Report:
             tag, run = sightings.ids[sightings.id[s]], self._names[sightings.chain[s]]
             n = int(sightings.n_readings[s])
             words = (
-                f"{counted(n, 'reading')} in {run} and none elsewhere, though it was in view as much the same in "
+                f"{plural(n, 'reading')} in {run} and none elsewhere, though it was in view as much the same in "
                 f"{int(self._views.near[s])} keyframes (by chance once in {1.0 / max(self._chances[s], 1e-9):.0f} "
                 "times): a false detection"
             )
@@ -143,13 +145,13 @@ class _Report:
     def _where(self, case: Case) -> str:
         """Who saw it at which instance."""
         told = [
-            f"in {self._named(stand.chains)} ({counted(stand.n_readings, 'reading')})"
+            f"in {self._list_segments(stand.chains)} ({plural(stand.n_readings, 'reading')})"
             for stand in case.stands[:_MOST_NAMED]
         ]
         more = len(case.stands) - _MOST_NAMED
         return ", then ".join([*told, f"in {more} more places"] if more > 0 else told)
 
-    def _named(self, chains: Sequence[int]) -> str:
+    def _list_segments(self, chains: Sequence[int]) -> str:
         names = [self._names[c] for c in sorted(chains)]
         return " and ".join(names[-2:]) if len(names) < 3 else f"{', '.join(names[:-1])} and {names[-1]}"
 

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
-from groundsbot.offline.outliers.places import NOWHERE, Places, settled
+from groundsbot.offline.outliers.places import NOWHERE, Places, minimise_places
 from groundsbot.offline.outliers.sightings import Sightings
 
 # One map in a hundred names a tag that is where it was.
@@ -29,7 +29,9 @@ _MOST_SPLITS: Final = 200
 _MANY: Final = 5
 
 
-def bound(sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf) -> float:
+def cost_bound(
+    sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf
+) -> float:
     """By how many squared sigmas a split must lower the cost, all that could be looked at counted.
 
     Args:
@@ -45,7 +47,7 @@ def bound(sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_A
 
 def freedom_of_places(places: Places) -> int:
     """What chi-square's degrees of freedom noise is known like that was fitted to how sightings of tags differ."""
-    return sum(2 * len(each.members) - 2 for each in places.held)
+    return sum(2 * len(each.members) - 2 for each in places.tracks)
 
 
 def excess(places: Places) -> float:
@@ -55,7 +57,7 @@ def excess(places: Places) -> float:
     that no covariance knows, and a tag must stand out from that.
     """
     ratios = []
-    for each in places.held:
+    for each in places.tracks:
         n = 2 * len(each.members) - 2  # the first follows from the others
         if n:
             inner, pull = each.stiffness[2:, 2:] + NOWHERE * np.eye(n), each.pull[1:].reshape(-1)
@@ -71,13 +73,13 @@ def search(
     Args:
         evidence: of K sightings.
         sightings: they are of these.
-        begin: see `settled`.
-        least_gain: see `bound`.
+        begin: see `minimise_places`.
+        least_gain: see `cost_bound`.
         most_ids: that are plausible; None: any number.
     """
     id_of = sightings.id[evidence.which]
     split: set[int] = set()
-    labels, held = begin.place.copy(), list(begin.held)
+    labels, held = begin.place.copy(), list(begin.tracks)
     masks = [_masks(sightings, evidence.which[each.members]) for each in held]
     gone: list[tuple[FloatArray, FloatArray]] = []  # what is free already, felt by all
     for _ in range(_MOST_SPLITS):
@@ -102,16 +104,16 @@ def search(
         inner = freed.reshape(-1, 2, 2)[members].sum(axis=0) + NOWHERE * np.eye(2)
         gone.append((freed, inner))
         held[label : label + 1] = [held[label].of(~which)]
-        held = [each.freed(freed, inner, own.pull.sum(axis=0)) for each in [*held, own]]
+        held = [each.release(freed, inner, own.pull.sum(axis=0)) for each in [*held, own]]
         masks.append(_masks(sightings, evidence.which[own.members]))
         masks[label] = _masks(sightings, evidence.which[held[label].members])
     if not gone:
-        return _simplest(evidence, sightings, _joined_again(evidence, sightings, begin, least_gain), least_gain)
-    found = _joined_again(evidence, sightings, settled(evidence, labels), least_gain)
+        return _simplest(evidence, sightings, _undo_chance_splits(evidence, sightings, begin, least_gain), least_gain)
+    found = _undo_chance_splits(evidence, sightings, minimise_places(evidence, labels), least_gain)
     return _simplest(evidence, sightings, found, least_gain)
 
 
-def _joined_again(evidence: Evidence, sightings: Sightings, found: Places, least_gain: float) -> IntArray:
+def _undo_chance_splits(evidence: Evidence, sightings: Sightings, found: Places, least_gain: float) -> IntArray:
     """Without the splits that chance explains, the least of them first."""
     own = sightings.id[evidence.which]
     while True:
@@ -129,7 +131,7 @@ def _joined_again(evidence: Evidence, sightings: Sightings, found: Places, least
                         least, pair = cost, (int(p), int(q))
         if pair is None:
             return labels
-        found = settled(evidence, np.where(labels == pair[1], pair[0], labels))
+        found = minimise_places(evidence, np.where(labels == pair[1], pair[0], labels))
 
 
 def _simplest(evidence: Evidence, sightings: Sightings, labels: IntArray, least_gain: float) -> IntArray:
@@ -143,11 +145,11 @@ def _simplest(evidence: Evidence, sightings: Sightings, labels: IntArray, least_
         members = _in_time(sightings, evidence.which, members)
         if not sightings.came_back(evidence.which[members], labels[members]):
             continue
-        most = least_gain + _cost(evidence, settled(evidence, labels))
+        most = least_gain + _cost(evidence, minimise_places(evidence, labels))
         for i in range(1, len(members)):
             moved = labels.copy()
             moved[members[:i]], moved[members[i:]] = labels.max() + 1, labels.max() + 2
-            found = settled(evidence, moved)
+            found = minimise_places(evidence, moved)
             off, covariance = found.apart(evidence, int(found.place[members[0]]), int(found.place[members[-1]]))
             cost = _cost(evidence, found)
             if cost < most and float(off @ np.linalg.solve(covariance, off)) >= least_gain:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.foundation import FloatArray, IntArray, counted
+from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Chain
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
@@ -64,7 +64,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
         if strain[worst] < _STRAINED:
             break
         tried.add(worst)
-        freed = build_graph([_freed(local_map.chain, motions[[*found, worst]])])
+        freed = build_graph([_free_motions(local_map.chain, motions[[*found, worst]])])
         other = solve(freed.problem, solution.state)
         gain = 2.0 * (solution.cost - other.cost)
         if gain > bound:
@@ -91,7 +91,7 @@ def sentence(local_map: LocalMap, slips: list[Slip]) -> str:
     )
     most = ", the largest at " if len(slips) > _MOST_NAMED else ": "
     return (
-        f"{local_map.chain.name}: in {counted(len(slips), 'place')} the robot moved as its wheels do not explain{most}"
+        f"{local_map.chain.name}: in {plural(len(slips), 'place')} the robot moved as its wheels do not explain{most}"
         f"{places}; slipped, pushed or lifted? There only tags say where the drive goes on"
     )
 
@@ -102,7 +102,7 @@ def _motions_between_readings(local_map: LocalMap) -> IntArray:
     return np.stack([reading[:-1], reading[1:]], axis=-1)
 
 
-def _freed(chain: Chain, motions: IntArray) -> Chain:
+def _free_motions(chain: Chain, motions: IntArray) -> Chain:
     covariance = chain.odometry.covariance.copy()
     for first, end in motions.tolist():
         covariance[first:end] += _FREED * np.eye(3)

@@ -119,7 +119,7 @@ def _component(
         "before": _before(solved, workings, colours, several_families=several),
         "advice": [
             {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
-            | dict(zip("xy", _rounded(np.array(each["way_m"])), strict=True))
+            | dict(zip("xy", _round_points(np.array(each["way_m"])), strict=True))
             for each in document["advice"]
             if each["component"] == index and would_help(each)
         ],
@@ -129,7 +129,7 @@ def _component(
 def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, Any]:
     """A trajectory and the heading at its start."""
     kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // _MOST_POINTS)), len(poses) - 1))
-    x, y = _rounded(poses[kept])
+    x, y = _round_points(poses[kept])
     return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
 
 
@@ -153,14 +153,14 @@ def _before(
     for T_frame_start, member in zip(solved.group.T_frame_start, solved.group.members, strict=True):
         local_map = workings.maps[member]
         places = se2.apply(T_frame_start, np.array(list(local_map.tags_m.values())).reshape(-1, 2))
-        x, y = _rounded(places)
+        x, y = _round_points(places)
         labels = [tag_label(tag._asdict(), several_families=several_families) for tag in local_map.tags_m]
         trace = _trace(local_map.chain.name, colours, se2.compose(T_frame_start, local_map.T_start_base))
         layers.append(trace | {"tags": {"label": labels, "x": x, "y": y}})
     return layers
 
 
-def _rounded(points: FloatArray) -> tuple[list[float], list[float]]:
+def _round_points(points: FloatArray) -> tuple[list[float], list[float]]:
     """Abscissae and ordinates of (N, 2 or more)."""
     x, y = np.round(points[:, :2], _DECIMALS).T.tolist() if len(points) else ([], [])
     return x, y

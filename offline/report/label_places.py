@@ -30,14 +30,14 @@ def place_labels(points_px: FloatArray, sizes_px: FloatArray, trails_px: FloatAr
         candidates = np.concatenate([point + ring * _DIRECTIONS * reach for ring in _RINGS])
         cost = np.repeat(np.arange(len(_RINGS)) * _COST_RING, len(_DIRECTIONS))
         others = np.delete(points_px, index, axis=0)
-        cost = cost + _COST_MARKER * _n_covered(candidates, size / 2 + _MARKER_PX / 2, others)
-        cost = cost + _COST_TRAIL * np.minimum(_n_covered(candidates, size / 2, trails_px), 4)
-        cost = cost + _COST_LABEL * _n_covered(candidates, (size + sizes_px[:index]) / 2, centres[:index])
+        cost = cost + _COST_MARKER * _n_points_inside(candidates, size / 2 + _MARKER_PX / 2, others)
+        cost = cost + _COST_TRAIL * np.minimum(_n_points_inside(candidates, size / 2, trails_px), 4)
+        cost = cost + _COST_LABEL * _n_points_inside(candidates, (size + sizes_px[:index]) / 2, centres[:index])
         centres[index] = candidates[int(np.argmin(cost))]
     return centres
 
 
-def _n_covered(candidates: FloatArray, half: FloatArray, points: FloatArray) -> FloatArray:
+def _n_points_inside(candidates: FloatArray, half: FloatArray, points: FloatArray) -> FloatArray:
     """How many points (M, 2) lie within the half widths (2,) or (M, 2) of each candidate (C, 2)."""
     half = np.broadcast_to(half, points.shape)
     lowest, highest = candidates.min(axis=0), candidates.max(axis=0)

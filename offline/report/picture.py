@@ -17,7 +17,7 @@ from matplotlib.path import Path as PolygonPath
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
-from groundsbot.calib.foundation import FloatArray, counted, written_whole
+from groundsbot.calib.foundation import FloatArray, atomic_write, plural
 from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
 from groundsbot.offline.report.label_places import place_labels
 
@@ -43,7 +43,7 @@ _DART: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65)
 def write_picture(result: MapResult, path: Path) -> None:
     """Draws a map as PNG, 1600 px wide: one panel a component, in metres, the same scale along both axes."""
     figure = draw_map(result)
-    with written_whole(path) as partial, partial.open("wb") as stream:
+    with atomic_write(path) as partial, partial.open("wb") as stream:
         figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": "groundsbot"})
 
 
@@ -62,7 +62,7 @@ def draw_map(result: MapResult) -> Figure:
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(result.components) > 1:
             axes.set_title(
-                f"component {index + 1}: {counted(len(component.tags), 'tag')}, from the start of {component.frame_run}"
+                f"component {index + 1}: {plural(len(component.tags), 'tag')}, from the start of {component.frame_run}"
             )
         _draw_component(axes, component, styles, factor)
         panels.append(axes)
@@ -97,7 +97,7 @@ def _title(result: MapResult) -> str:
     runs = {run.run for run in result.runs}
     n_tags = sum(len(component.tags) for component in result.components)
     driven_m = sum(run.distance_m for run in result.runs)
-    title = f"{counted(n_tags, 'tag')}, {counted(len(runs), 'run')}, {driven_m:.0f} m driven"
+    title = f"{plural(n_tags, 'tag')}, {plural(len(runs), 'run')}, {driven_m:.0f} m driven"
     pairs = [pair for component in result.components for pair in component.start_to_start]
     if len(pairs) == 1:
         title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
@@ -187,7 +187,7 @@ def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fa
         names = {part.name for part in parts}
         n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
         stretches = f", {len(parts)} stretches" if len(parts) > 1 else ""
-        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {counted(n_tags, 'tag')}{stretches}"
+        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{stretches}"
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
     handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
     shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"

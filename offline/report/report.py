@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from groundsbot.calib.foundation import counted, written_whole
+from groundsbot.calib.foundation import atomic_write, plural
 from groundsbot.offline.mapping import Workings
 from groundsbot.offline.maps import MapResult, map_as_json
 from groundsbot.offline.report.figures import figures
@@ -24,7 +24,7 @@ def write_report(result: MapResult, workings: Workings, path: Path) -> None:
     """
     document = map_as_json(result)
     n_runs = len({run.run for run in result.runs})
-    title = f"Map of {counted(n_runs, 'run')} and {counted(len(document['tags']), 'tag')}"
+    title = f"Map of {plural(n_runs, 'run')} and {plural(len(document['tags']), 'tag')}"
     text = page(
         title,
         sentences(document),
@@ -32,5 +32,5 @@ def write_report(result: MapResult, workings: Workings, path: Path) -> None:
         tables(document),
         figures(document, workings),
     )
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.maps import MAX_SIGMAS
 
 # A tag read less often has little to contradict it.
@@ -22,7 +22,7 @@ def sentences(document: dict[str, Any]) -> list[str]:
     """Three to seven sentences in plain English, the first what the model does not explain."""
     told = [
         contradiction_sentence(document),
-        _joined(document),
+        _joining_sentence(document),
         headline(document),
         _scale(document),
         *_mistrust(document),
@@ -75,7 +75,7 @@ def linking_tags(document: dict[str, Any], component: int = 0) -> list[dict[str,
     return sorted(tags, key=lambda tag: (-len(tag["runs"]), -tag["n_observations"], tag["family"], tag["tag_id"]))
 
 
-def enumerated(names: Sequence[str]) -> str:
+def enumerate_names(names: Sequence[str]) -> str:
     """`a`, `a and b`, `a, b and c`, and no more than a few of them."""
     shown = list(names[:_MOST_NAMED])
     if len(names) > _MOST_NAMED:
@@ -83,25 +83,23 @@ def enumerated(names: Sequence[str]) -> str:
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
 
 
-def _joined(document: dict[str, Any]) -> str:
+def _joining_sentence(document: dict[str, Any]) -> str:
     n_runs, components = _n_drives(document["runs"]), document["components"]
     driven_m = sum(run["distance_m"] or 0.0 for run in document["runs"])
     n_tags = len(document["tags"])
     if len(components) > 1:
         first = components[0]
         return (
-            f"{counted(n_runs, 'run')} ({driven_m:.1f} m driven, {counted(n_tags, 'tag')}) could not be joined into "
+            f"{plural(n_runs, 'run')} ({driven_m:.1f} m driven, {plural(n_tags, 'tag')}) could not be joined into "
             f"one map: they fall into {len(components)} components, each in a frame of its own, of which the largest "
-            f"holds {counted(len(first['runs']), 'run')} and {counted(len(first['tags']), 'tag')}."
+            f"holds {plural(len(first['runs']), 'run')} and {plural(len(first['tags']), 'tag')}."
         )
-    names = enumerated([*dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"])])
+    names = enumerate_names([*dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"])])
     if len(document["runs"]) == 1:
-        return (
-            f"One run, {names}, drove {driven_m:.1f} m and placed {counted(n_tags, 'tag')}; nothing was to be joined."
-        )
+        return f"One run, {names}, drove {driven_m:.1f} m and placed {plural(n_tags, 'tag')}; nothing was to be joined."
     n_links = len(linking_tags(document))
-    by = f"by {counted(n_links, 'tag')} that more than one of them read" if n_links else "by what was measured by hand"
-    runs, tags = counted(n_runs, "run"), counted(n_tags, "tag")
+    by = f"by {plural(n_links, 'tag')} that more than one of them read" if n_links else "by what was measured by hand"
+    runs, tags = plural(n_runs, "run"), plural(n_tags, "tag")
     return f"{runs} ({names}; {driven_m:.1f} m driven) became one map of {tags}, joined {by}."
 
 
@@ -174,29 +172,29 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
         )
     taped = [each for each in document["measurements"] if each["contradicts"]]
     if taped:
-        doubts.append(f"{counted(len(taped), 'measurement')} by hand {_do(taped)} not fit to the rest")
+        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do(taped)} not fit to the rest")
     suspects = document["suspect_tags"]
     if suspects:
-        names = enumerated([f"{each['tag_id']} ({each['kind']})" for each in suspects])
+        names = enumerate_names([f"{each['tag_id']} ({each['kind']})" for each in suspects])
         doubts.append(f"{_tags_do(suspects)} not belong: {names}")
     unsure = [each for each in document["alignments"] if not each["is_sure"]]
     if unsure:
-        names = enumerated([f"{each['from']} with {each['to']}" for each in unsure])
+        names = enumerate_names([f"{each['from']} with {each['to']}" for each in unsure])
         doubts.append(
-            f"{counted(len(unsure), 'alignment')} could not be told for sure and {_were(unsure)} left out: {names}"
+            f"{plural(len(unsure), 'alignment')} could not be told for sure and {_were(unsure)} left out: {names}"
         )
     weak = [each for each in document["alignments"] if each["is_sure"] and each["is_weak"]]
     if weak:
-        names = enumerated([f"{each['from']} with {each['to']}" for each in weak])
-        doubts.append(f"{counted(len(weak), 'join')} {'rests' if len(weak) == 1 else 'rest'} on one tag alone: {names}")
+        names = enumerate_names([f"{each['from']} with {each['to']}" for each in weak])
+        doubts.append(f"{plural(len(weak), 'join')} {'rests' if len(weak) == 1 else 'rest'} on one tag alone: {names}")
     few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_READINGS]
     if few:
-        names = enumerated([str(tag["tag_id"]) for tag in few])
-        doubts.append(f"{counted(len(few), 'tag')} {_were(few)} read less than {FEW_READINGS} times: {names}")
+        names = enumerate_names([str(tag["tag_id"]) for tag in few])
+        doubts.append(f"{plural(len(few), 'tag')} {_were(few)} read less than {FEW_READINGS} times: {names}")
     told = [f"Mistrust this: {'; '.join(doubts)}."] if doubts else []
     n_warnings = len(document["warnings"])
     if n_warnings:
-        told.append(f"The map comes with {counted(n_warnings, 'warning')}, below.")
+        told.append(f"The map comes with {plural(n_warnings, 'warning')}, below.")
     if contradiction_sentence(document):
         return told
     return told or ["Nothing in it contradicts anything else by more than chance allows."]
@@ -255,7 +253,7 @@ def _were(entries: Sequence[object]) -> str:
 
 
 def _tags_do(entries: Sequence[object]) -> str:
-    return f"{counted(len(entries), 'tag')} {_do(entries)}"
+    return f"{plural(len(entries), 'tag')} {_do(entries)}"
 
 
 def _metres(value_m: float) -> str:

@@ -36,16 +36,18 @@ def timeline(chain: Chain, residual_sigmas: FloatArray, events: Sequence[RunEven
     return {
         "run": chain.name,
         "t_s": np.round(seconds[first], 2).tolist(),
-        "speed_m_s": _known(driven_m, lasting_s, 3),
+        "speed_m_s": _mean_or_none(driven_m, lasting_s, 3),
         "tags": np.maximum.reduceat(n_tags, first).tolist(),
-        "rms": _known(np.add.reduceat(squares, first), readings, 4, root=True),
-        "worst": _known(np.where(readings > 0, np.maximum.reduceat(worst, first), 0.0), readings.clip(0, 1), 2),
+        "rms": _mean_or_none(np.add.reduceat(squares, first), readings, 4, root=True),
+        "worst": _mean_or_none(np.where(readings > 0, np.maximum.reduceat(worst, first), 0.0), readings.clip(0, 1), 2),
         "gaps": _gaps(chain),
-        "events": [_shown(event, chain) for event in events],
+        "events": [_event_entry(event, chain) for event in events],
     }
 
 
-def _known(total: FloatArray, count: FloatArray | IntArray, digits: int, *, root: bool = False) -> list[float | None]:
+def _mean_or_none(
+    total: FloatArray, count: FloatArray | IntArray, digits: int, *, root: bool = False
+) -> list[float | None]:
     """Total by count, None where nothing counts."""
     mean = total / np.where(count > 0, count, 1)
     values = np.round(np.sqrt(mean) if root else mean, digits).tolist()
@@ -76,7 +78,7 @@ def _gaps(chain: Chain) -> list[list[float]]:
     return gaps
 
 
-def _shown(event: RunEvent, chain: Chain) -> dict[str, Any]:
+def _event_entry(event: RunEvent, chain: Chain) -> dict[str, Any]:
     """An event at its time, or at the rim of the drive."""
     at_ns = min(max(event.stamp_ns, int(chain.stamps_ns[0])), int(chain.stamps_ns[-1])) - int(chain.stamps_ns[0])
     return {"t_s": round(at_ns * _S, 2), "loss": event.is_loss, "text": event.text}

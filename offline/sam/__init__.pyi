@@ -12,13 +12,13 @@ from .factors.odometry_and_readings import (
     OdometryFactors,
     ReadingFactors,
     State,
-    stacked,
+    stack,
     whitening,
 )
 from .factors.priors import NOTHING_MEASURED, DistanceFactors, KnownPlaces, Measured, StartFactors, ends_of
 from .factors.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .graph import Graph, build_graph, unheld
-from .linearisation.kernels import Odometry, Values, advance, go_along, multiply, series, wrapped
+from .linearisation.kernels import Odometry, Values, advance, go_along, multiply, series, wrap
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from .linearisation.readings import N_READING, reading_factor
 from .parameters import (
@@ -39,7 +39,7 @@ from .solver import (
     Losses,
     Problem,
     Solution,
-    factorised,
+    factorise,
     solve,
 )
 
@@ -84,7 +84,7 @@ __all__ = [
     "ends_of",
     "error_by_wheels",
     "error_of",
-    "factorised",
+    "factorise",
     "go_along",
     "huber",
     "loss_and_weight",
@@ -99,9 +99,9 @@ __all__ = [
     "scaled_information",
     "series",
     "solve",
-    "stacked",
+    "stack",
     "unheld",
     "wheel_correction",
     "whitening",
-    "wrapped",
+    "wrap",
 ]

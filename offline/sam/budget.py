@@ -75,12 +75,12 @@ class Effort:
             places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
         )
 
-    def parted(self, sizes: Sequence[int]) -> list["Effort"]:
+    def split(self, sizes: Sequence[int]) -> list["Effort"]:
         """Of stretches, each as much as its share of all their sizes."""
         allowed = [self.allowed * size / max(1, sum(sizes)) for size in sizes]
         return [replace(self, allowed=each, left=each, whole=self) for each in allowed]
 
-    def taken(self, share: float) -> "Effort":
+    def take(self, share: float) -> "Effort":
         """A share of what is left, for a part of a stretch that was itself found to be affordable."""
         work = share * max(self.left, 0.0)
         self.left -= work
@@ -141,7 +141,7 @@ def efforts_of(chains: Sequence[Chain], times: int = 1) -> list[Effort]:
     for chain in chains:
         of_run.setdefault(chain.run.name, []).append(chain)
     parts = {
-        name: iter(Effort.of_log(some[0].run.log_bytes, some[0].run.inputs, times).parted([size_of(c) for c in some]))
+        name: iter(Effort.of_log(some[0].run.log_bytes, some[0].run.inputs, times).split([size_of(c) for c in some]))
         for name, some in of_run.items()
     }
     return [next(parts[chain.run.name]) for chain in chains]

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.sam.factors.robust_losses import Loss, curved
+from groundsbot.offline.sam.factors.robust_losses import Loss, with_curvature
 
 # A step that brings so large a share of what the last one brought is one of many; in squared sigmas, what it may bring
 # for the end to be near.
@@ -36,7 +36,7 @@ class Curvature:
 
     def __post_init__(self) -> None:
         self.losses = self.given
-        self._own = (self.given[0], curved(self.given[1]))
+        self._own = (self.given[0], with_curvature(self.given[1]))
 
     def is_due(self, brought: float) -> bool:
         """Whether the matrix is another from here on, after a step that lowered the cost by so much."""

@@ -37,22 +37,22 @@ class Damping:
         return self._raised <= self.floor
 
     @property
-    def exhausted(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether it was raised so often in a row, without any gain, that no step will do."""
         return self._n_rejected > _MAX_REJECTED
 
-    def needed(self, share: float) -> None:
+    def require(self, share: float) -> None:
         """Only with so much H had a square root."""
         if share > self.share:
             self._raised = self.floor = share
 
-    def step_taken(self, gain: float) -> None:
+    def accept_step(self, gain: float) -> None:
         """Lowers it, or raises it where the gain, what the step brought as a share of what it promised, is poor."""
         lowered = self._raised * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
         self._raised = lowered if lowered > _LEAST else 0.0
         self._growth, self._n_rejected = 2.0, 0
 
-    def step_rejected(self) -> None:
+    def reject_step(self) -> None:
         """Raises it, faster each time in a row."""
         self._raised = max(self._raised * self._growth, _FIRST)
         self._growth *= 2.0

@@ -37,7 +37,7 @@ class Untied:
     tags: tuple[int, ...]
 
 
-def untied_parts(
+def find_unobservable(
     odometry: OdometryFactors, readings: ReadingFactors, measured: Measured, columns: Columns, state: State
 ) -> Untied:
     """Looks for motions of whole chains, and for tags, that change no residual; priors hold all calibration.
@@ -65,8 +65,8 @@ def untied_parts(
         _of_distances(measured.distances, columns, chain_of, n_chains, points, scaled),
     ]
     n = 3 * n_chains + 2 * len(points)
-    resistance = sum(row.T @ row for row in (_widened(row, n) for row in rows))
-    resisted, motions = linalg.eigh(resistance - _widened(apart, n).T @ _widened(apart, n))
+    resistance = sum(row.T @ row for row in (_pad_columns(row, n) for row in rows))
+    resisted, motions = linalg.eigh(resistance - _pad_columns(apart, n).T @ _pad_columns(apart, n))
     free = resisted <= _FREE * max(1.0, float(resisted.max(initial=0.0)))
     moves = np.linalg.norm(motions[: 3 * n_chains, free].reshape(n_chains, -1), axis=1) > _MOVES
     unread = np.bincount(readings.tag, minlength=len(columns.tags)) == 0
@@ -148,7 +148,7 @@ def _of_distances(
     return np.vstack([rows, np.eye(rows.shape[1])[3 * n_chains :][held]])
 
 
-def _widened(rows: FloatArray, n: int) -> FloatArray:
+def _pad_columns(rows: FloatArray, n: int) -> FloatArray:
     """With as many columns of zeros as are missing."""
     return np.pad(rows, ((0, 0), (0, n - rows.shape[1])))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweighed
+from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweigh
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
 from groundsbot.offline.sam.curvature import Curvature
 from groundsbot.offline.sam.damping import Damping
@@ -28,7 +28,7 @@ from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber, losses_and_weights
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 from groundsbot.offline.sam.linearisation.kernels import diagonal_square
-from groundsbot.offline.sam.observability import Untied, untied_parts
+from groundsbot.offline.sam.observability import Untied, find_unobservable
 from groundsbot.offline.sam.step import Before, take_step
 
 # Rounding that changes a covariance by a hundredth is a tenth of what the sigma of a good noise model is off.
@@ -103,16 +103,14 @@ class Problem:
         """The smaller problem for starting values."""
         return build_skeleton(self.arrowhead)
 
-    def reweighed(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
+    def reweigh(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
         """The same factors with other whitenings, (M, 3, 3) and (N, 2, 2); the order of elimination is kept."""
         other = replace(
             self,
             odometry=replace(self.odometry, whitening=odometry),
             readings=replace(self.readings, whitening=readings),
         )
-        vars(other)["arrowhead"] = reweighed(
-            self.arrowhead, other.odometry, other.readings
-        )  # where the property has it
+        vars(other)["arrowhead"] = reweigh(self.arrowhead, other.odometry, other.readings)  # where the property has it
         return other
 
     @property
@@ -120,7 +118,7 @@ class Problem:
         """How many measured numbers there are, priors apart."""
         return self.odometry.motion.size + self.readings.value.size + self.measured.n_residuals
 
-    def moved(self, state: State, step: FloatArray) -> State:
+    def retract(self, state: State, step: FloatArray) -> State:
         """The state after a step (n,) in the tangent space.
 
         A tag moves along with its anchor as on a rigid body, and by the rest of its step in the anchor's frame. To
@@ -171,28 +169,28 @@ class Solution:
         Raises:
             UnderDeterminedError: a variable is in no factor at all, or measurements are no numbers.
         """
-        return self._factorised[0]
+        return self._factorisation_and_floor[0]
 
     @property
     def floor(self) -> float:
         """Share of H's diagonal that had to be added for a square root in double precision; 0 where all is well."""
-        return self._factorised[1]
+        return self._factorisation_and_floor[1]
 
     @cached_property
-    def _factorised(self) -> tuple[Factorisation, float]:
+    def _factorisation_and_floor(self) -> tuple[Factorisation, float]:
         system, _ = self.problem.arrowhead.linearise(self.state, *self.losses)
-        return factorised(self.problem.arrowhead, system, 0.0)
+        return factorise(self.problem.arrowhead, system, 0.0)
 
     @cached_property
-    def untied(self) -> Untied:
+    def unobservable(self) -> Untied:
         """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
         problem = self.problem
-        return untied_parts(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
+        return find_unobservable(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
 
     @property
     def rank(self) -> int:
         """How many of the `problem.columns.n` directions are tied down."""
-        return self.problem.columns.n - self.untied.n_directions
+        return self.problem.columns.n - self.unobservable.n_directions
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (k, k) of k columns of the tangent vector, exact to first order; 0 where held (-1)."""
@@ -244,7 +242,7 @@ def solve(
     arrowhead = problem.arrowhead
     curvature = Curvature(losses)
     system, spare, rows = arrowhead.scratch
-    state, n_linearised = _relaxed(problem, start, relaxed_steps)
+    state, n_linearised = _solve_preintegrated(problem, start, relaxed_steps)
     _, cost = arrowhead.linearise(state, *losses, out=system)
     costs, n_linearised = [cost], n_linearised + 1
     last, n_steps, damping, rolled = n_linearised + most_tries, 0, Damping(), False
@@ -254,7 +252,7 @@ def solve(
 
     if not np.isfinite(cost):
         return ended("the cost is no number at the start", converged=False)
-    while n_steps < most_steps and n_linearised < last and not damping.exhausted:
+    while n_steps < most_steps and n_linearised < last and not damping.is_exhausted:
         n_steps += 1
         try:
             step, expected = _step(arrowhead, system, damping, rows)
@@ -270,7 +268,7 @@ def solve(
             n_linearised += 1
             continue
         if not taken.cost < cost:
-            damping.step_rejected()
+            damping.reject_step()
             continue
         expected *= taken.share * (2.0 - taken.share)
         gain = (cost - taken.cost) / expected
@@ -282,8 +280,8 @@ def solve(
             n_linearised += 1
         if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
             return ended("converged", converged=True)
-        damping.step_taken(gain)
-    reason = "no step lowers the cost" if damping.exhausted else f"stopped after {n_steps} steps"
+        damping.accept_step(gain)
+    reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
     return ended(reason, converged=False)
 
 
@@ -293,8 +291,8 @@ def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows) ->
     Raises:
         UnderDeterminedError: no damping helps.
     """
-    factorisation, used = factorised(arrowhead, system, damping.share, rows)
-    damping.needed(used)
+    factorisation, used = factorise(arrowhead, system, damping.share, rows)
+    damping.require(used)
     step = -factorisation.solve_in_order(system.gradient)
     return step, _expected_decrease(system, step, damping.share)
 
@@ -309,7 +307,7 @@ def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cos
     return relative_tolerance > _COST_ROUNDING and left <= relative_tolerance * cost
 
 
-def factorised(
+def factorise(
     arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None
 ) -> tuple[Factorisation, float]:
     """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
@@ -326,12 +324,12 @@ def factorised(
             damping = max(10.0 * damping, _LEAST_FLOOR)
 
 
-def _relaxed(problem: Problem, start: State, steps: int) -> tuple[State, int]:
+def _solve_preintegrated(problem: Problem, start: State, steps: int) -> tuple[State, int]:
     """After some relaxed steps, and how many there were: none where something is not tied down."""
     if not steps:
         return start, 0
     try:
-        return problem.skeleton.relaxed(start, problem.anchor, steps), steps
+        return problem.skeleton.solve(start, problem.anchor, steps), steps
     except UnderDeterminedError:
         return start, 0
 

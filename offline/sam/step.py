@@ -65,8 +65,8 @@ def take_step(
         nonlocal n_linearised
         n_linearised += 1
         part = share * step
-        moved = arrowhead.moved(before.state, part, anchor)
-        moved = arrowhead.rolled(before.state, part, anchor, moved) if rolled else moved
+        moved = arrowhead.retract(before.state, part, anchor)
+        moved = arrowhead.retract_relative(before.state, part, anchor, moved) if rolled else moved
         return Taken(moved, arrowhead.linearise(moved, *losses, out=out)[1], rolled, share, n_linearised)
 
     for share in _SHARES:

@@ -1,10 +1,10 @@
 from .left_open import start_left_open
 from .option import AUTO, Calibrate, parse_calibrate
-from .robot import Learnt, Owned, corrected
+from .robot import Learnt, Owned, correct_robot
 from .robot_table import verdict_lines, verdicts
-from .self_calibration import TIMES_MAPPED, Freed, about_the_files, free_what_is_told, put_right, refocused
+from .self_calibration import TIMES_MAPPED, Freed, about_the_files, free_parameters, put_right, with_focal_lengths
 from .time_offset_search import TimeOffsetSearch
-from .words import choice_words, learnt_lines, refused_lines
+from .words import choice_words, learnt_lines, refusal_lines
 
 __all__ = [
     "AUTO",
@@ -16,14 +16,14 @@ __all__ = [
     "TimeOffsetSearch",
     "about_the_files",
     "choice_words",
-    "corrected",
-    "free_what_is_told",
+    "correct_robot",
+    "free_parameters",
     "learnt_lines",
     "parse_calibrate",
     "put_right",
-    "refocused",
-    "refused_lines",
+    "refusal_lines",
     "start_left_open",
     "verdict_lines",
     "verdicts",
+    "with_focal_lengths",
 ]

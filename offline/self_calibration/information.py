@@ -17,7 +17,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
-from groundsbot.offline.local_map import WINDOW_M, LocalMap, fitted_windows
+from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
 from groundsbot.offline.noise import in_cell, spread_of_corners
 from groundsbot.offline.sam import Effort, Parameter, Solution, build_graph, solve
@@ -43,7 +43,7 @@ class _Stretch(NamedTuple):
     vector: FloatArray
 
 
-def told_by(
+def information_of(
     maps: Sequence[LocalMap],
     robots: Mapping[str, Robot],
     noise: NoiseParameters,
@@ -65,13 +65,15 @@ def told_by(
     for each, effort in zip(maps, efforts, strict=True):
         robot = robots[each.chain.run.name]
         given = build_graph([replace(each.chain, run=replace(each.chain.run, robot=robot))])
-        priors |= {parameter[:3]: _as_given(parameter, robot) for parameter in given.parameters}
+        priors |= {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters}
         chain = _under_own_noise(each, noise, effort)
         for first, end in _cuts(chain):
-            stretch = _told_by_stretch(chain, each, first, end, effort, corners=corners)
+            stretch = _information_of_segment(chain, each, first, end, effort, corners=corners)
             if stretch is not None:
                 stretches.append(stretch)
-                priors = {parameter[:3]: _as_given(parameter, robot) for parameter in stretch.parameters} | priors
+                priors = {
+                    parameter[:3]: _with_file_sigma(parameter, robot) for parameter in stretch.parameters
+                } | priors
     parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
     index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
     n = len(parameters)
@@ -82,7 +84,7 @@ def told_by(
     return Told(parameters, information, vector)
 
 
-def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
+def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     """One that a map holds unless the file leaves it open, with the sigma that it has where it is asked for."""
     given = {FOCAL_SCALE: robot.focal_scale_sigma, RANGE_OFFSET: robot.range_offset_m_sigma}
     if parameter.name not in given:
@@ -93,11 +95,11 @@ def _as_given(parameter: Parameter, robot: Robot) -> Parameter:
 def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:
     """The chain under the noise that its windows leave over, errors that neighbouring readings share included."""
     least = least_shared(local_map.chain.readings)
-    windows = fitted_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
+    windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_readings = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
-    chain = local_map.chain.weighed(own)
+    chain = local_map.chain.with_noise(own)
     if not len(chain.readings):
         return chain
     of_corners = spread_of_corners(chain, in_cell(chain), own.sigma_corner_px)
@@ -113,7 +115,7 @@ def _cuts(chain: Chain) -> list[tuple[int, int]]:
     return list(zip([0, *ends], [*ends, len(along_m)], strict=True))
 
 
-def _told_by_stretch(
+def _information_of_segment(
     chain: Chain, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
 ) -> _Stretch | None:
     """None where a stretch reads no tag or cannot be solved alone."""

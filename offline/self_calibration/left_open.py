@@ -12,7 +12,7 @@ from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
-from groundsbot.offline.self_calibration.start_values import estimated_start_values, with_start_values
+from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 
@@ -46,7 +46,7 @@ def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> Started:
         robot = runs[own[0]].robot
         if not robot.is_left_open:
             continue
-        start = estimated_start_values([runs[i] for i in own], noise)
+        start = estimate_start_values([runs[i] for i in own], noise)
         if start.searched is not None:
             searches[robot.robot_id] = start.searched
         for i in own:

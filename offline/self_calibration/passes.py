@@ -133,7 +133,7 @@ def gather_passes(runs: Sequence[Run]) -> Passes | None:
     wheels = _wheel_axis(runs)
     if wheels is None:
         return None
-    looks, group = _chosen(_looks(runs, wheels))
+    looks, group = _choose_tracks(_looks(runs, wheels))
     value, sigma, sensor = np.full((len(group), 2), np.nan), np.ones((len(group), 2)), np.zeros((len(group), 3))
     twist = wheels.twist_at(looks.time_s)
     for number, run in enumerate(runs):
@@ -193,7 +193,7 @@ def _looks(runs: Sequence[Run], wheels: WheelAxis) -> _Looks:
     return _Looks(*np.concatenate(moved, axis=1), *np.concatenate(names, axis=1))
 
 
-def _chosen(looks: _Looks) -> tuple[_Looks, IntArray]:
+def _choose_tracks(looks: _Looks) -> tuple[_Looks, IntArray]:
     """Readings of passes that tell something, by pass, and the pass of each; passes by their beginning."""
     looks = looks.where(np.lexsort((looks.time_s, looks.tag)))
     begins = np.ones(len(looks.tag), dtype=np.bool_)

@@ -59,7 +59,7 @@ class Owned(NamedTuple):
     name: str
 
 
-def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
+def open_parameters(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
     """The robot whose file leaves open what is freed, with these sigmas; its values stay."""
 
     def sigma(name: str) -> float | None:
@@ -81,7 +81,7 @@ def opened(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
             "edge_shift_px_sigma": sigma(EDGE_SHIFT) or robot.edge_shift_px_sigma,
             "range_offset_m_sigma": sigma(RANGE_OFFSET) or robot.range_offset_m_sigma,
             "focal_scale_sigma": sigma(FOCAL_SCALE) or robot.focal_scale_sigma,
-            "tags": [_opened_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
+            "tags": [_open_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
             "imported_tag_scale_sigma": next(
                 (value for each, value in freed.items() if each.owner.startswith(IMPORTED_BATCH)),
                 robot.imported_tag_scale_sigma,
@@ -94,19 +94,19 @@ def as_if_unknown(robot: Robot) -> Robot:
     """The robot as if nobody had measured what is off by far where it is off at all; the focal length is open too."""
     own = {Owned(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
     batches = [*(_of_batch(batch) for batch in robot.tags), Owned(IMPORTED_BATCH, TAG_SCALE)]
-    return opened(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
+    return open_parameters(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
 
 
-def corrected(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
+def correct_robot(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
     """The robot with what was learnt for its values and sigmas; what was not learnt stays. Its camera is not in it."""
 
     def of(name: str) -> Learnt | None:
         return learnt.get(Owned(robot.robot_id, name))
 
     changed: dict[str, object] = {
-        "wheels": _corrected_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(TRACK_SCALE)),
-        "mount": _corrected_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
-        "tags": [_corrected_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
+        "wheels": _correct_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(TRACK_SCALE)),
+        "mount": _correct_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
+        "tags": [_correct_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
     }
     if late := of(TIME_OFFSET):
         changed |= {"time_offset_s": robot.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
@@ -128,13 +128,13 @@ def _of_batch(batch: TagBatch) -> Owned:
     return Owned(f"{batch.batch} {batch.family}", TAG_SCALE)
 
 
-def _opened_batch(batch: TagBatch, sigma: float | None) -> TagBatch:
+def _open_batch(batch: TagBatch, sigma: float | None) -> TagBatch:
     if sigma is None:
         return batch
     return batch.model_copy(update={"sigma_size_m": sigma * batch.sigma_size_m / batch.relative_sigma})
 
 
-def _corrected_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None, track: Learnt | None) -> Wheels:
+def _correct_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None, track: Learnt | None) -> Wheels:
     changed: dict[str, float] = {}
     if scale and ratio:
         of_one = (scale.sigma**2 + 0.25 * ratio.sigma**2) ** 0.5  # as a share, of one radius
@@ -148,7 +148,7 @@ def _corrected_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None
     return wheels.model_copy(update=changed)
 
 
-def _corrected_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount:
+def _correct_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount:
     changed: dict[str, float] = {}
     for field, found in learnt.items():
         if found:
@@ -156,7 +156,7 @@ def _corrected_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount
     return mount.model_copy(update=changed)
 
 
-def _corrected_batch(batch: TagBatch, scale: Learnt | None) -> TagBatch:
+def _correct_batch(batch: TagBatch, scale: Learnt | None) -> TagBatch:
     if scale is None:
         return batch
     larger = 1.0 + scale.value

@@ -85,7 +85,7 @@ def choose(
         judge.open_what_contradicts()
     found = {i: judge.look(i) for i in candidates}
     doubted = [i for i in judge.open if i in by_far and found[i].off_sigmas <= judge.at_least]
-    return [_freed(each, DOUBTED if i in doubted else "") if i in judge.open else each for i, each in found.items()]
+    return [_free(each, DOUBTED if i in doubted else "") if i in judge.open else each for i, each in found.items()]
 
 
 def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
@@ -157,7 +157,7 @@ class _Judge:
         sigmas[self.open] = [OPEN_SIGMAS[told.parameters[i].name] for i in self.open]
         prior, is_asked = parameter.sigma, parameter.name in self._asked
         whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
-        gain = _held_out_gain(told, sigmas, index)
+        gain = _cross_validated_gain(told, sigmas, index)
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
         most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
         reason = ""
@@ -190,7 +190,7 @@ class _Judge:
         )
 
 
-def _freed(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
+def _free(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
     """The choice to free a number; with what it is under the sigma that it has from then on."""
     limit = OPEN_SIGMAS[choice.name]
     share = limit**2 / (limit**2 + choice.sigma**2)
@@ -206,7 +206,7 @@ def _plausible(choice: CalibrationChoice) -> float:
     return choice.off_sigmas**2 - (_ODDS_OF_WHEELS if choice.name == WHEEL_PARAMETERS[0] else 0.0)
 
 
-def _held_out_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
+def _cross_validated_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
     """Log likelihood of each stretch by what all others tell of the number, over that by robot.yaml; summed.
 
     None where no two stretches tell anything of it.

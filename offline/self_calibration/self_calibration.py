@@ -16,13 +16,20 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
-from groundsbot.offline.measurements import Run, chains_of, confirmed
+from groundsbot.offline.measurements import Run, chains_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import efforts_of
-from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.left_open import by_robot
-from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, as_if_unknown, corrected, opened
+from groundsbot.offline.self_calibration.robot import (
+    OPEN_SIGMAS,
+    Learnt,
+    Owned,
+    as_if_unknown,
+    correct_robot,
+    open_parameters,
+)
 from groundsbot.offline.self_calibration.selection import OFF_BY_ALL, choose, is_overruled
-from groundsbot.offline.self_calibration.start_values import estimated_start_values, with_start_values
+from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 # Put right before the map is made, which takes them to first order, or on the floor not at all. Wheel readings are in
@@ -51,7 +58,7 @@ class Freed(NamedTuple):
     searches: dict[str, TimeOffsetSearch]
 
 
-def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool) -> Freed:
+def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool) -> Freed:
     """Frees what the drives can tell and robot.yaml has wrong.
 
     Each robot is first estimated as if nobody had measured it; what stretches of its drives tell is then a quadratic
@@ -68,13 +75,13 @@ def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collec
     if not started:
         return Freed(list(runs), (), {}, {})
     opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
-    chains = [confirmed(chain) for run in opened_runs for chain in chains_of(run, noise)]
+    chains = [without_unconfirmed_tracks(chain) for run in opened_runs for chain in chains_of(run, noise)]
     efforts = efforts_of(chains, TIMES_MAPPED)
     maps = [
         solve_local_map(chain, effort, noise_is_open=True).without_factors()
         for chain, effort in zip(chains, efforts, strict=True)
     ]
-    told = told_by(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
+    told = information_of(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
     starts = {owned: each for _, learnt in started for owned, each in learnt.items()}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
     choices = choose(told.about({owned: each.value for owned, each in starts.items()}), names, late_s)
@@ -88,9 +95,9 @@ def free_what_is_told(runs: Sequence[Run], noise: NoiseParameters, names: Collec
             run
             if run.robot.is_left_open
             else replace(
-                run.retimed(right.get(Owned(run.robot_id, TIME_OFFSET), _NOTHING).value),
-                robot=opened(corrected(run.robot, right), freed),
-                camera=refocused(run.camera, right.get(Owned(run.robot_id, FOCAL_SCALE))),
+                run.shift_stamps(right.get(Owned(run.robot_id, TIME_OFFSET), _NOTHING).value),
+                robot=open_parameters(correct_robot(run.robot, right), freed),
+                camera=with_focal_lengths(run.camera, right.get(Owned(run.robot_id, FOCAL_SCALE))),
             )
             for run in runs
         ],
@@ -113,7 +120,7 @@ def _as_if_unknown(
         robot = runs[own[0]].robot
         if robot.is_left_open:
             continue
-        start = estimated_start_values([replace(runs[i], robot=as_if_unknown(robot)) for i in own], noise)
+        start = estimate_start_values([replace(runs[i], robot=as_if_unknown(robot)) for i in own], noise)
         if start.searched is not None:
             searches[robot.robot_id] = start.searched
         learnt = {Owned(robot.robot_id, name): each for name, each in start.learnt.items()}
@@ -121,7 +128,7 @@ def _as_if_unknown(
     return found, searches
 
 
-def refocused(camera: CameraModel | None, focal: Learnt | None) -> CameraModel | None:
+def with_focal_lengths(camera: CameraModel | None, focal: Learnt | None) -> CameraModel | None:
     """The camera with the focal lengths that were found."""
     if camera is None or focal is None:
         return camera

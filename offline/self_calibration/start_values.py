@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
-from groundsbot.offline.local_map import ShownNoise, first_solution, shown_noise
-from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsened, confirmed
+from groundsbot.offline.local_map import ShownNoise, first_solution, noise_of_windows
+from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsen, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
@@ -31,7 +31,7 @@ class StartValues(NamedTuple):
     searched: TimeOffsetSearch | None
 
 
-def estimated_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
+def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
     """Estimates both from the drives of one robot, whose file leaves them open.
 
     Args:
@@ -44,7 +44,7 @@ def estimated_start_values(runs: Sequence[Run], noise: NoiseParameters) -> Start
         found[TIME_OFFSET] = Learnt(searched.offset_s, searched.sigma_s)
     shown: dict[str, ShownNoise] = {}
     for _ in range(_MOST_ROUNDS):
-        more = _estimated([with_start_values(run, found) for run in runs], noise, shown)
+        more = _estimate([with_start_values(run, found) for run in runs], noise, shown)
         if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
             break
         found = {name: _together(name, each, more.get(name)) for name, each in found.items()}
@@ -62,10 +62,10 @@ def with_start_values(run: Run, learnt: dict[str, Learnt]) -> Run:
         }
     )
     changed = robot.model_copy(update={"time_offset_s": robot.time_offset_s + late_s, "wheels": wheels})
-    return replace(run.retimed(late_s), robot=changed)
+    return replace(run.shift_stamps(late_s), robot=changed)
 
 
-def _estimated(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, ShownNoise]) -> dict[str, Learnt]:
+def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, ShownNoise]) -> dict[str, Learnt]:
     """Time offset and track by each drive alone, the mean by their information.
 
     Args:
@@ -77,10 +77,10 @@ def _estimated(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Sho
     for run in runs:
         for chain in chains_of(run, noise):
             if chain.tags and len(chain.stamps_ns) > 1:
-                likely = confirmed(chain)
-                coarse = coarsened(likely, coarse_keyframes(likely))
+                likely = without_unconfirmed_tracks(chain)
+                coarse = coarsen(likely, coarse_keyframes(likely))
                 if chain.name not in shown:
-                    shown[chain.name] = shown_noise(coarse)
+                    shown[chain.name] = noise_of_windows(coarse)
                 solved.append(first_solution(coarse, shown[chain.name]))
     found: dict[str, Learnt] = {}
     for name in _SMALL:

@@ -76,7 +76,7 @@ class _Estimate(NamedTuple):
     tags_m: FloatArray
     scale: FloatArray
 
-    def moved_to(self, offset_s: float) -> "_Estimate":
+    def at_offset(self, offset_s: float) -> "_Estimate":
         return self._replace(parameters=np.concatenate([[offset_s], self.parameters[1:]]))
 
 
@@ -108,7 +108,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
     curve = _curve(passes)
     grid_s = np.array(sorted(curve))
     costs = np.array([curve[offset_s][1] for offset_s in grid_s.tolist()])
-    found, least = min((_iterated(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
+    found, least = min((_iterate(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
     if not (np.isfinite(costs).all() and np.isfinite(least)):
         return None
     offset_s, (sigma_s, repeats) = float(found.parameters[0]), _spread(passes, found)
@@ -126,12 +126,12 @@ def _curve(passes: Passes) -> dict[float, tuple[_Estimate, float]]:
     """By offset what is best there, and its cost; each begins where its neighbour towards zero ended."""
     zero = np.zeros(len(PARAMETERS))
     start = _Estimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
-    found = {0.0: _iterated(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
+    found = {0.0: _iterate(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
     for sign in (1.0, -1.0):
         last = found[0.0][0]
         for i in range(1, round(REACH_S / _STEP_S) + 1):
             offset_s = sign * i * _STEP_S
-            found[offset_s] = _iterated(passes, last.moved_to(offset_s), free_offset=False, most_steps=_GRID_STEPS)
+            found[offset_s] = _iterate(passes, last.at_offset(offset_s), free_offset=False, most_steps=_GRID_STEPS)
             last = found[offset_s][0]
     return found
 
@@ -144,7 +144,7 @@ def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
     return [float(each) for each in grid_s[lowest if len(lowest) else [len(costs) // 2]]]
 
 
-def _iterated(
+def _iterate(
     passes: Passes, estimate: _Estimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
 ) -> tuple[_Estimate, float]:
     """Gauss-Newton steps under weights of Student's t; the estimate, and its cost."""

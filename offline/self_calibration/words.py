@@ -27,7 +27,7 @@ DRIVES: Final[Mapping[str, str]] = MappingProxyType(
 )
 
 
-def refused_lines(result: MapResult) -> list[str]:
+def refusal_lines(result: MapResult) -> list[str]:
     """Why what was asked for by name was not freed, for a terminal."""
     return [
         f"not freed: {each.name} of {each.owner}: {choice_words(each)}"

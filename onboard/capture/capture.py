@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.foundation import counted, is_jpeg, written_whole
+from groundsbot.calib.foundation import atomic_write, is_jpeg, plural
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
 from groundsbot.onboard.capture.guide import Advice, CaptureGuide
 from groundsbot.onboard.detection import save_board
@@ -138,9 +138,9 @@ class Capture:
         is_file = isinstance(picture, bytes)
         data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1].tobytes()
         path = self._output / f"{self._next_number:04}.{'jpg' if is_file and is_jpeg(data) else 'png'}"
-        with _told(path):
+        with _errors_as_onboard_error(path):
             self._output.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 temporary.write_bytes(data)
         self._next_number += 1
 
@@ -169,7 +169,7 @@ class Capture:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _errors_as_onboard_error(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -182,7 +182,7 @@ def summary(guide: CaptureGuide, output: Path) -> list[str]:
     """How it ended, and what comes next, in words."""
     if not guide.kept:
         return [f"{output}: no picture was taken"]
-    lines = [f"{output}: {counted(guide.kept, 'picture')}"]
+    lines = [f"{output}: {plural(guide.kept, 'picture')}"]
     if guide.missing:
         lines.append(f"still missing: {'; '.join(guide.missing)}")
     elif not guide.enough:

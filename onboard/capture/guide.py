@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.board import DEFAULT_VIEWS, Board, SeenBoard, Spread, seen_board
+from groundsbot.calib.board import DEFAULT_VIEWS, Board, SeenBoard, Spread, describe_board
 from groundsbot.onboard.errors import OnboardError
 
 _NS_PER_S: Final = 1_000_000_000
@@ -109,7 +109,7 @@ class CaptureGuide:
         if ids is None:
             return None
         numbers, places = np.ravel(ids).astype(np.int64), np.asarray(pixels, np.float64).reshape(-1, 2)
-        return seen_board(numbers, places, self.board, (grey.shape[1], grey.shape[0]))
+        return describe_board(numbers, places, self.board, (grey.shape[1], grey.shape[0]))
 
     def _is_still(self, seen: SeenBoard, stamp_ns: int, width_px: int) -> bool:
         before, self._before = self._before, (seen, stamp_ns)

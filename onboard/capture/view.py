@@ -26,7 +26,7 @@ class CaptureView:
         self._told_at_s = float("-inf")
 
     @contextmanager
-    def shown(self) -> Iterator[None]:
+    def live(self) -> Iterator[None]:
         """While the block runs, in a terminal: ever anew in one place."""
         if not self._console.is_terminal:
             yield
@@ -55,7 +55,7 @@ class CaptureView:
 def _panel(advice: Advice, guide: CaptureGuide) -> Panel:
     """Pictures so far, what to do, the picture's regions (filled where covered), and all that is missing."""
     spread = guide.spread
-    regions = [" ".join(_FULL if spread.covered(row, column) else _BARE for column in range(3)) for row in range(3)]
+    regions = [" ".join(_FULL if spread.is_covered(row, column) else _BARE for column in range(3)) for row in range(3)]
     rows = [
         Text(f"{guide.kept} of {guide.wanted} pictures"),
         Text(advice.text, style="bold green" if advice.keep else "bold" if advice.seen else "bold yellow"),

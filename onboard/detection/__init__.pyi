@@ -1,5 +1,5 @@
 from .child_process import ChildDetector, DetectionResult, DetectorSettings
-from .drawing import save_board, save_drawn
+from .drawing import save_board, save_drawing
 from .messages import detections_message, tag_message
 from .tag_detector import REFINED_CORNERS, Detection, TagDetector
 
@@ -12,6 +12,6 @@ __all__ = [
     "TagDetector",
     "detections_message",
     "save_board",
-    "save_drawn",
+    "save_drawing",
     "tag_message",
 ]

@@ -58,7 +58,7 @@ _NOWHERE_PX: Final = 1e3
 _NOT_FOUND_PX: Final = 1e9  # where sides do not meet
 
 
-def refined_corners(
+def refine_corners(
     grey: NDArray[np.uint8], corners_px: FloatArray, cells: IntArray, camera: CameraModel | None = None
 ) -> tuple[FloatArray, BoolArray]:
     """Sharper corners.
@@ -75,7 +75,7 @@ def refined_corners(
     if not len(corners_px):
         return corners_px, np.zeros(0, dtype=np.bool_)
     sides = _Sides(grey, corners_px, cells, camera)
-    moved, good = sides.fitted()
+    moved, good = sides.fit()
     found = sides.corners(moved)
     good &= np.linalg.norm(found - corners_px, axis=-1).max(axis=-1) < 2.0 * _FARTHEST_PX
     return np.where(good[:, None, None], found, corners_px), good
@@ -183,7 +183,7 @@ class _Sides:
         seen &= (np.abs(distance) < band_px[:, None]) & (clear < share) & (share < 1.0 - clear)
         return summed(index, stride[:, 1]).astype(np.int64), share, distance, seen
 
-    def fitted(self) -> tuple[FloatArray, BoolArray]:
+    def fit(self) -> tuple[FloatArray, BoolArray]:
         """(S, 2) how far each side lies from the detector's at both ends; (T,) of which tags all four look right."""
         # Distance at the side's begin and at its end, logarithm of s, and by what share the light grows along it.
         p = np.zeros((len(self._begin), 4))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board import SeenBoard, Spread, region_shares
-from groundsbot.calib.foundation import written_whole
+from groundsbot.calib.foundation import atomic_write
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.log import Picture, decode, encode_jpeg
 
@@ -20,7 +20,7 @@ _FRACTION_BITS: Final = 3
 _QUALITY: Final = 90
 
 
-def save_drawn(picture: Picture, detections: Sequence[Detection], path: Path) -> None:
+def save_drawing(picture: Picture, detections: Sequence[Detection], path: Path) -> None:
     """Writes a JPEG: tags outlined, their ids in them, their first corners (top left) marked.
 
     Raises:
@@ -48,7 +48,7 @@ def save_board(picture: Picture, seen: SeenBoard | None, spread: Spread, path: P
     size_px = np.array([drawn.shape[1], drawn.shape[0]])
     for row in range(3):
         for column in range(3):
-            if not spread.covered(row, column):
+            if not spread.is_covered(row, column):
                 first, last = (np.rint(size_px * share).astype(int) for share in region_shares(row, column))
                 cv2.rectangle(drawn, (first + 4).tolist(), (last - 5).tolist(), _RED, _WIDTH_PX, cv2.LINE_AA)
     for corner in seen.pixels if seen is not None else ():
@@ -64,5 +64,5 @@ def _in_colour(picture: Picture) -> NDArray[np.uint8]:
 
 def _save(drawn: NDArray[np.uint8], path: Path) -> None:
     data = encode_jpeg(drawn, _QUALITY)
-    with written_whole(path) as temporary, temporary.open("xb") as file:  # never through a link
+    with atomic_write(path) as temporary, temporary.open("xb") as file:  # never through a link
         file.write(data)

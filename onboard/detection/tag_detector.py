@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.tags import tag_bits
-from groundsbot.onboard.detection.corner_refinement import refined_corners
+from groundsbot.onboard.detection.corner_refinement import refine_corners
 from groundsbot.onboard.errors import OnboardError
 
 # In the detector settings of pictures whose tags had their corners sharpened; ",lens" follows where the lens was known.
@@ -77,13 +77,13 @@ class TagDetector:
         unknown = [family for family in families if family not in _FAMILIES]
         if unknown or not families:
             raise OnboardError(f"recorder.families: {unknown or 'none'} cannot be detected; use {', '.join(_FAMILIES)}")
-        name = _installed(library)
+        name = _detector_class(library)
         self.library = f"{name} {importlib.metadata.version(name)}"
         corners = "corners=library" if not refine else REFINED_CORNERS if camera is None else f"{REFINED_CORNERS},lens"
         self.settings = f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads} {corners}"
         self._camera, self._refine = camera, refine
         # One for each family: given several, pupil-apriltags looks for the first only.
-        self._detectors = [(family, _kept_detector(name, family, quad_decimate, threads)) for family in families]
+        self._detectors = [(family, _cached_detector(name, family, quad_decimate, threads)) for family in families]
 
     def detect(self, grey: NDArray[np.uint8]) -> list[Detection]:
         """The tags in a grey picture [height, width], by family and id; none in one too small to hold any.
@@ -103,16 +103,16 @@ class TagDetector:
             for each in detector.detect(grey)
         ]
         if self._refine:
-            found = self._sharpened(grey, found)
+            found = self._refine_all(grey, found)
         return sorted(found, key=lambda each: (each.family, each.tag_id, *each.corners_px[0]))
 
-    def _sharpened(self, grey: NDArray[np.uint8], found: list[Detection]) -> list[Detection]:
+    def _refine_all(self, grey: NDArray[np.uint8], found: list[Detection]) -> list[Detection]:
         """Those whose sides can be told from the picture, with the corners that follow from these."""
         camera = self._camera
         if camera is not None and grey.shape != (camera.height_px, camera.width_px):
             camera = None
         cells = np.array([len(tag_bits(each.family, each.tag_id)) for each in found], dtype=np.int64)
-        corners_px, _ = refined_corners(grey, np.array([each.corners_px for each in found]), cells, camera)
+        corners_px, _ = refine_corners(grey, np.array([each.corners_px for each in found]), cells, camera)
         return [each._replace(corners_px=corners) for each, corners in zip(found, corners_px, strict=True)]
 
 
@@ -121,7 +121,7 @@ def _our_corners(corners: FloatArray) -> FloatArray:
     return np.array(corners[::-1], dtype=np.float64) - _PIXEL_CENTRE_PX
 
 
-def _installed(wanted: str) -> str:
+def _detector_class(wanted: str) -> str:
     if wanted not in _MODULES:
         raise OnboardError(f"recorder.detector: {wanted!r} is unknown; use {' or '.join(_MODULES)}")
     for name in (wanted, *_MODULES):
@@ -133,7 +133,7 @@ def _installed(wanted: str) -> str:
     raise OnboardError(f"no tag detector is installed: pip install {wanted} (pyapriltags on ARM)")
 
 
-def _kept_detector(name: str, family: str, quad_decimate: float, threads: int) -> Any:  # noqa: ANN401 - untyped library
+def _cached_detector(name: str, family: str, quad_decimate: float, threads: int) -> Any:  # noqa: ANN401 - untyped library
     key = (name, family, quad_decimate, threads)
     if key not in _KEPT:
         module = importlib.import_module(_MODULES[name])

@@ -58,7 +58,7 @@ class LogLosses:
         """Notes a message that fits nothing."""
         self.n_undecodable += 1
 
-    def add_unfinished(self, path: Path, _offset: int) -> None:
+    def add_missing_end(self, path: Path, _offset: int) -> None:
         """Notes a file that ends without its end mark."""
         self.unfinished.append(path)
 
@@ -66,7 +66,7 @@ class LogLosses:
         """Notes how many chunks of its index a file does not hold."""
         self.n_chunks += max(0, n_chunks)
 
-    def add_nothing_found(self, path: Path) -> None:
+    def add_empty_file(self, path: Path) -> None:
         """Notes a file without a single whole chunk."""
         self.unusable[path] = "holds not one whole chunk"
 
@@ -115,7 +115,7 @@ class NoLosses(LogLosses):
         """Raises LogError."""
         raise LogError(f"{path}: {reason}")
 
-    def add_unfinished(self, path: Path, offset: int) -> None:
+    def add_missing_end(self, path: Path, offset: int) -> None:
         """Raises LogError."""
         raise LogError(f"{path}: ends at byte {offset} before its end mark: cut short or never finished; salvage it")
 
@@ -124,6 +124,6 @@ class NoLosses(LogLosses):
         if n_chunks > 0:
             raise LogError(f"{path}: {n_chunks} chunks that its index names are lost; salvage it first")
 
-    def add_nothing_found(self, path: Path) -> None:
+    def add_empty_file(self, path: Path) -> None:
         """Raises LogError."""
         raise LogError(f"{path}: holds no /run, so it is not a groundsbot log; import it or choose another")

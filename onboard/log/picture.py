@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.foundation import JPEG_END, MOST_PIXELS, claimed_size, is_complete
+from groundsbot.calib.foundation import JPEG_END, MOST_PIXELS, is_complete, size_in_header
 from groundsbot.onboard.errors import OnboardError
 
 Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
@@ -31,7 +31,7 @@ def decode(encoded: bytes) -> NDArray[np.uint8]:
 def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
     if not is_complete(encoded):
         raise OnboardError(f"picture of {len(encoded)} bytes is cut short or neither PNG nor JPEG")
-    width_px, height_px = claimed_size(encoded)
+    width_px, height_px = size_in_header(encoded)
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise OnboardError(f"picture claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all")
     picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), mode)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
-from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_drawn
+from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_drawing
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import TOPICS
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
-from groundsbot.onboard.process import RunClock, wall_clock_synchronised
+from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import RobotFiles
 from groundsbot.onboard.wheels import EncoderParser, EncoderPort, PortLostError
 
@@ -133,13 +133,13 @@ def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Foun
     else:
         yield CheckResult("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
     tags = ", ".join(f"{each.family} {each.tag_id}" for each in result.detections)
-    saved = _saved(look.frame, result, picture)
+    saved = _save(look.frame, result, picture)
     yield CheckResult("detection", True, f"tags in view: {tags or 'none; hold one up to see it found'}; {saved}")
 
 
-def _saved(frame: Frame, result: DetectionResult, path: Path) -> str:
+def _save(frame: Frame, result: DetectionResult, path: Path) -> str:
     try:
-        save_drawn(frame.picture, result.detections, path)
+        save_drawing(frame.picture, result.detections, path)
     except OSError as error:
         return f"picture not saved to {path}: {error.strerror or error}"
     return f"picture: {path}"
@@ -199,7 +199,7 @@ def _check_clock(clock: RunClock) -> CheckResult:
     now_ns = clock.now_ns()
     if now_ns < _OLDEST_WALL_CLOCK_NS:
         return CheckResult("clock", False, "the wall clock lies before 2025; set it, or run names and times mislead")
-    if not wall_clock_synchronised():
+    if not is_wall_clock_synchronised():
         return CheckResult("clock", True, "not synchronised: fine for a map, but times of day may be off")
     return CheckResult("clock", True, "synchronised")
 

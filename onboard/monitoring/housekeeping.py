@@ -15,7 +15,7 @@ from typing import Final, Literal
 from groundsbot.onboard.log import Event, Severity
 from groundsbot.onboard.monitoring.disk_hours import hours_until_full
 from groundsbot.onboard.monitoring.status import DiskStatus, Look, Rates, Status, write_status
-from groundsbot.onboard.process import Notifier, wall_clock_synchronised
+from groundsbot.onboard.process import Notifier, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import LiveRecorder, LogStatus
 
 _NS_PER_S: Final = 1_000_000_000
@@ -118,7 +118,7 @@ class Housekeeper(threading.Thread):
         if self._log_stalled_s() < self._stalled_s:
             self._notifier.alive(text)
         else:
-            self._notifier.troubled(text)
+            self._notifier.notify_trouble(text)
 
     def _log_stalled_s(self) -> float:
         return max(self._recorder.stalled_s, self._recorder.log.stalled_s)
@@ -146,7 +146,7 @@ class Housekeeper(threading.Thread):
         return Status(
             robot_id=recorder.files.robot.robot_id,
             run_id=core.folder.name,
-            folder=_shown(core.folder),
+            folder=_path_text(core.folder),
             pid=os.getpid(),
             state=state,
             updated_ns=time.time_ns(),
@@ -157,7 +157,7 @@ class Housekeeper(threading.Thread):
             counts=counts,
             losses=dict(core.losses),
             disk=self._disk(log),
-            clock_synchronised=wall_clock_synchronised(),
+            clock_synchronised=is_wall_clock_synchronised(),
             stalled_s=round(stalled_s, 2),
             problems=problems if state == "recording" else [],
             last_events=list(self._events),
@@ -180,7 +180,7 @@ class Housekeeper(threading.Thread):
         )
 
 
-def _shown(path: Path) -> str:
+def _path_text(path: Path) -> str:
     """As text; a name need not be UTF-8, but JSON is."""
     return os.fsencode(path).decode(errors="backslashreplace")
 

@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from groundsbot.calib.foundation import written_whole
+from groundsbot.calib.foundation import atomic_write
 from groundsbot.onboard.errors import OnboardError
 
 STATUS_SUFFIX: Final = ".status.json"
@@ -114,7 +114,7 @@ class Rates:
 def write_status(status: Status, path: Path) -> str | None:
     """Puts the file in place as a whole; returns why the disk will not have it, None where it has."""
     try:
-        with written_whole(path, durable=False) as temporary, temporary.open("x", encoding="utf-8") as file:
+        with atomic_write(path, durable=False) as temporary, temporary.open("x", encoding="utf-8") as file:
             file.write(status.model_dump_json(indent=1))  # "x": never through a link
     except OSError as error:
         return error.strerror or str(error)

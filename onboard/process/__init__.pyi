@@ -1,6 +1,6 @@
-from .clock import DeviceClockFilter, RunClock, read_clocks, wall_clock_synchronised
+from .clock import DeviceClockFilter, RunClock, is_wall_clock_synchronised, read_clocks
 from .console_lines import ConsoleLines
-from .ending import ENDING_SIGNALS, told_to_end
+from .ending import ENDING_SIGNALS, stop_event
 from .memory import keep_memory
 from .systemd import Notifier
 
@@ -10,8 +10,8 @@ __all__ = [
     "DeviceClockFilter",
     "Notifier",
     "RunClock",
+    "is_wall_clock_synchronised",
     "keep_memory",
     "read_clocks",
-    "told_to_end",
-    "wall_clock_synchronised",
+    "stop_event",
 ]

@@ -86,7 +86,7 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None)
 
 
-def wall_clock_synchronised() -> bool:
+def is_wall_clock_synchronised() -> bool:
     """Whether the kernel says that something disciplines its wall clock; False where it does not say."""
     try:
         state: int = _libc().adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: read only
@@ -131,9 +131,9 @@ class DeviceClockFilter:
             self._fastest.append(self._bucket_best)
             self._fit()
             self._bucket, self._bucket_best = bucket, (device_ns, host_ns)
-        elif host_ns - self._mapped(device_ns) < self._bucket_best[1] - self._mapped(self._bucket_best[0]):
+        elif host_ns - self._map(device_ns) < self._bucket_best[1] - self._map(self._bucket_best[0]):
             self._bucket_best = (device_ns, host_ns)
-        early_ns = self._mapped(device_ns) - host_ns
+        early_ns = self._map(device_ns) - host_ns
         if early_ns > 0:  # faster than any before
             self._offset_ns -= early_ns
 
@@ -142,9 +142,9 @@ class DeviceClockFilter:
 
         A better mapping may lie a little lower than the one before it, so stamps of successive calls may step back.
         """
-        return self._mapped(device_time_us * _NS_PER_US)
+        return self._map(device_time_us * _NS_PER_US)
 
-    def _mapped(self, device_ns: int) -> int:
+    def _map(self, device_ns: int) -> int:
         return device_ns + self._offset_ns + round(self._rate_error * (device_ns - self._origin_ns))
 
     def _fit(self) -> None:

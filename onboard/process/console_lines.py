@@ -52,12 +52,12 @@ class ConsoleLines:
         while (text := self._lines.get()) is not None:
             self._write(text)
             if self._lines.empty():
-                self._tell_dropped()
-        self._tell_dropped()
+                self._report_drops()
+        self._report_drops()
         if self._file is not None:
             os.close(self._file)
 
-    def _tell_dropped(self) -> None:
+    def _report_drops(self) -> None:
         n_dropped, self._n_dropped = self._n_dropped, 0
         if n_dropped:
             self._write(f"{n_dropped} lines were left out here: nobody read them in time")

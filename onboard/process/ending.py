@@ -8,7 +8,7 @@ from typing import Final
 ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def told_to_end() -> threading.Event:
+def stop_event() -> threading.Event:
     """An event that SIGINT, SIGTERM and SIGHUP set for the rest of the process, but for those it was started to ignore.
 
     A handler in Python runs in the main thread between any two of its instructions, also while that thread holds the

@@ -30,7 +30,7 @@ class Notifier:
         """The service is well; `text` is shown by `systemctl status`."""
         self._say(f"WATCHDOG=1\nSTATUS={text}")
 
-    def troubled(self, text: str) -> None:
+    def notify_trouble(self, text: str) -> None:
         """The service is not well: no sign of life."""
         self._say(f"STATUS={text}")
 

@@ -51,7 +51,7 @@ class DeviceThread(threading.Thread, ABC):
     def run(self) -> None:
         """Opens the device, reads it, and does so again when it was lost."""
         while not self._stop_event.is_set():
-            if not self._opened():
+            if not self._open():
                 self._stop_event.wait(_RETRY_S)
                 continue
             begun_s = time.monotonic()
@@ -59,20 +59,20 @@ class DeviceThread(threading.Thread, ABC):
                 self._read()
                 return
             except CameraEndedError as error:
-                self._lost(str(error), at_its_end=True)
+                self._on_loss(str(error), at_its_end=True)
                 return
             except OnboardError as error:
-                self._lost(str(error), at_its_end=False)
+                self._on_loss(str(error), at_its_end=False)
             except Exception as error:  # a fault of ours or of a library's must not end the recording of a device
-                self._lost(f"{self.name}: {error!r}", at_its_end=False)
+                self._on_loss(f"{self.name}: {error!r}", at_its_end=False)
             finally:
                 self._close()
             if time.monotonic() - begun_s < _RETRY_S:  # a loose contact
                 self._stop_event.wait(_RETRY_S)
 
-    def _opened(self) -> bool:
+    def _open(self) -> bool:
         try:
-            self._open()
+            self._connect()
         except Exception as error:
             self._close()
             if not self._told:
@@ -84,7 +84,7 @@ class DeviceThread(threading.Thread, ABC):
         return True
 
     @abstractmethod
-    def _open(self) -> None:
+    def _connect(self) -> None:
         """Opens the device and says so."""
 
     @abstractmethod
@@ -92,7 +92,7 @@ class DeviceThread(threading.Thread, ABC):
         """Reads until told to stop and nothing is left."""
 
     @abstractmethod
-    def _lost(self, reason: str, *, at_its_end: bool) -> None:
+    def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
         """Says that the device is gone."""
 
     @abstractmethod
@@ -116,7 +116,7 @@ class WheelThread(DeviceThread):
         self._port = port
         self._core = core
 
-    def _open(self) -> None:
+    def _connect(self) -> None:
         self._port.open()
         self._put(partial(self._core.on_port_connected, self._port.path))
 
@@ -128,7 +128,7 @@ class WheelThread(DeviceThread):
         while self._pass_on(self._port.read(_QUIET_S)) and time.monotonic_ns() < end_ns:
             pass
 
-    def _lost(self, reason: str, *, at_its_end: bool) -> None:
+    def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
         del at_its_end  # a port has none
         self._put(partial(self._core.on_port_lost, reason))
 
@@ -182,7 +182,7 @@ class CameraThread(DeviceThread):
         self._drop = drop
         self._camera: Camera | None = None  # kept over reconnects: it knows what it has given already
 
-    def _open(self) -> None:
+    def _connect(self) -> None:
         self._camera = self._camera or camera_for(self._settings, self._clock, self._since_ns)
         refused = self._camera.open()
         self._put(partial(self._core.on_camera_connected, self._settings.device, refused))
@@ -209,7 +209,7 @@ class CameraThread(DeviceThread):
         else:
             self._put(partial(self._drop, frame))
 
-    def _lost(self, reason: str, *, at_its_end: bool) -> None:
+    def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
         self._put(partial(self._core.on_camera_lost, reason, at_its_end=at_its_end))
 
     def _close(self) -> None:

@@ -21,7 +21,7 @@ from groundsbot.calib.foundation import is_complete, is_jpeg
 from groundsbot.onboard.camera import Frame
 from groundsbot.onboard.detection import ChildDetector, DetectionResult
 from groundsbot.onboard.log import Disk, Event, EventKind, segment_limits
-from groundsbot.onboard.process import RunClock, read_clocks, wall_clock_synchronised
+from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised, read_clocks
 from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
@@ -111,7 +111,7 @@ class LiveRecorder:
         """
         files = self.files
         if files.camera_settings is not None:
-            self._detector = ChildDetector(files.detector_settings, self._detector_restarted)
+            self._detector = ChildDetector(files.detector_settings, self._on_detector_restart)
         self.start_ns = self._clock.now_ns()  # only now: what came before, nobody listened to
         try:
             run = Run(
@@ -168,7 +168,7 @@ class LiveRecorder:
             self._work.get()()
         for frame, is_wanted in self._under_way.items():
             reason = f"pictures: detection had not ended {_END_LIMIT_NS / _NS_PER_S:g} s after the stop"
-            self._undetected(frame, is_wanted, reason, self._clock.now_ns())
+            self._keep_picture(frame, is_wanted, reason, self._clock.now_ns())
 
     def _device_threads(self) -> list[DeviceThread]:
         files, devices = self.files, self.files.robot.devices
@@ -203,7 +203,7 @@ class LiveRecorder:
                 next_tick_ns = now_ns + _TICK_NS
                 clocks = read_clocks()
                 now_ns = self._clock.from_monotonic(clocks.monotonic_ns)
-                self.core.tick(now_ns, clocks.realtime_ns, wall_clock_synchronised())
+                self.core.tick(now_ns, clocks.realtime_ns, is_wall_clock_synchronised())
 
     # --- in the thread of the core
 
@@ -212,20 +212,20 @@ class LiveRecorder:
             return
         self._under_way[frame] = want_jpeg = self.core.wants_picture(frame.stamp_ns)
         self._detector.submit(
-            frame.picture, want_jpeg, lambda result: self._put(partial(self._detected, frame, result))
+            frame.picture, want_jpeg, lambda result: self._put(partial(self._take_detections, frame, result))
         )
 
     def _drop(self, frame: Frame, now_ns: int) -> None:
-        self._undetected(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
+        self._keep_picture(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
 
-    def _undetected(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
+    def _keep_picture(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
         """Keeps the picture alone, where it is one to keep: its tags can be found later."""
         picture = frame.picture
         if is_wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
             self.core.on_picture(picture, frame.stamp_ns, frame.receive_ns)
         self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, now_ns)
 
-    def _detected(self, frame: Frame, result: DetectionResult, now_ns: int) -> None:
+    def _take_detections(self, frame: Frame, result: DetectionResult, now_ns: int) -> None:
         self._under_way.pop(frame)
         self._slots.release()
         if self._detector is None:
@@ -248,7 +248,7 @@ class LiveRecorder:
 
     # --- for all threads
 
-    def _detector_restarted(self, reason: str) -> None:
+    def _on_detector_restart(self, reason: str) -> None:
         self._put(partial(self.core.on_detector_restarted, reason))
 
     def _put(self, act: Act) -> None:

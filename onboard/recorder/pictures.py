@@ -26,7 +26,7 @@ class PictureChecks:
             "set the camera to that size or calibrate at this one"
         )
 
-    def lost_its_stamps(self, source: "StampSource | int") -> bool:
+    def is_first_without_stamp(self, source: "StampSource | int") -> bool:
         """Whether this picture is the first of those that their arrival has to date."""
         before, self._source = self._source, source
         return source != before and source == StampSource.STAMP_SOURCE_ARRIVAL

@@ -145,13 +145,13 @@ class RecorderCore:
         self._missing.note_reading(each, self._waiting.newest_wheels_ns)
         self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)
-        self._watches.wheels.heard(each.host_ns)
+        self._watches.wheels.reset(each.host_ns)
 
     # --- camera
 
     def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
         """The camera is open, for the first time or again; `refused` says what it would not be set to."""
-        self._watches.camera.heard(host_ns)
+        self._watches.camera.reset(host_ns)
         self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
         if refused:
             text = f"{name} would not be set: {'; '.join(refused)}"
@@ -159,7 +159,7 @@ class RecorderCore:
 
     def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
         """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
-        self._watches.camera.gone(at_its_end=at_its_end)
+        self._watches.camera.pause(at_its_end=at_its_end)
         severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
         self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
 
@@ -211,11 +211,11 @@ class RecorderCore:
         detector_settings: str = "",
     ) -> None:
         """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
-        self._watches.camera.heard(receive_ns)
+        self._watches.camera.reset(receive_ns)
         odd_size = self._checks.odd_size(size_px)
         if odd_size is not None:
             self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, odd_size, receive_ns)
-        if self._checks.lost_its_stamps(source):
+        if self._checks.is_first_without_stamp(source):
             self._missing.note_stamp()
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
         try:
@@ -238,7 +238,7 @@ class RecorderCore:
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
         """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
-        self._watches.camera.heard(host_ns)
+        self._watches.camera.reset(host_ns)
         self._missing.note_pictures(kind, count, reason)
 
     def _write_waiting(self, now_ns: int) -> None:

@@ -44,13 +44,13 @@ class WaitingDetections:
 
     def take_ready(self, now_ns: int) -> Iterator[ReadyDetections]:
         """Gives those whose wheel readings are there, the sequence filled in, or that have waited long enough."""
-        return self._taken(lambda receive_ns: now_ns - receive_ns >= self._wait_ns)
+        return self._take(lambda receive_ns: now_ns - receive_ns >= self._wait_ns)
 
     def take_all(self) -> Iterator[ReadyDetections]:
         """Gives all, at the end."""
-        return self._taken(lambda _: True)
+        return self._take(lambda _: True)
 
-    def _taken(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:
+    def _take(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:
         newest_ns = self.newest_wheels_ns
         while self._waiting:
             message, receive_ns = self._waiting[0]

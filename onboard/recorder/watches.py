@@ -28,11 +28,11 @@ class SilenceWatch:
         """Whether what is expected does not come: the device is gone, or silent for too long."""
         return self._is_gone or self.is_silent
 
-    def heard(self, now_ns: int) -> None:
+    def reset(self, now_ns: int) -> None:
         """The device spoke, or is there again."""
         self._since_ns, self.is_silent, self._is_gone = now_ns, False, False
 
-    def gone(self, *, at_its_end: bool = False) -> None:
+    def pause(self, *, at_its_end: bool = False) -> None:
         """No word is expected for now; `at_its_end`: nor missed."""
         self._since_ns, self.is_silent, self._is_gone = None, False, not at_its_end
 
@@ -86,7 +86,7 @@ class Watches:
         """
         self.wheels = SilenceWatch(_WHEEL_SILENCE_NS, wheels_since_ns)
         self.camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
-        self.camera.gone(at_its_end=not expect_camera)
+        self.camera.pause(at_its_end=not expect_camera)
         self._wall_clock = ClockWatch()
         self._run_epoch_ns = run_epoch_ns
 

@@ -50,7 +50,7 @@ class WheelIntake:
             if self._holding:
                 self._held.append((reading, host_ns))
             else:
-                ready.append(self._stamped(reading, host_ns))
+                ready.append(self._stamp(reading, host_ns))
         return ready + self.release_due(host_ns)
 
     def release_due(self, now_ns: int) -> list[StampedReading]:
@@ -64,12 +64,12 @@ class WheelIntake:
         return self._release()
 
     def _release(self) -> list[StampedReading]:
-        ready = [self._stamped(reading, host_ns) for reading, host_ns in self._held]
+        ready = [self._stamp(reading, host_ns) for reading, host_ns in self._held]
         self._held.clear()
         self._holding = False
         return ready
 
-    def _stamped(self, reading: WheelReading, host_ns: int) -> StampedReading:
+    def _stamp(self, reading: WheelReading, host_ns: int) -> StampedReading:
         stamp_ns = max(self._filter.stamp_ns(reading.device_time_us), self._last_stamp_ns + 1)
         self._last_stamp_ns = stamp_ns
         return StampedReading(reading, stamp_ns, host_ns)

@@ -65,7 +65,7 @@ def format_line(line: WheelLine) -> bytes:
     """The bytes of one line, counters taken modulo 2^32 (ticks into [-2^31, 2^31), flags modulo 2^16)."""
     body = (
         f"GBW,{PROTOCOL_VERSION},{line.boot_id % _U32},{line.sequence % _U32},{line.t_us % _U32},"
-        f"{_signed(line.ticks_left)},{_signed(line.ticks_right)},{line.flags % _U16}"
+        f"{_to_signed(line.ticks_left)},{_to_signed(line.ticks_right)},{line.flags % _U16}"
     ).encode("ascii")
     return b"$%s*%04X\r\n" % (body, crc16(body))
 
@@ -175,7 +175,7 @@ class WheelUnwrapper:
         if sequence > last.sequence and device_time_us <= last.device_time_us - _RESTART_US:
             return self._new_epoch(line, host_ns, lives=self._lives + 1)  # its clock went back, its count did not
         if sequence <= last.sequence:
-            if self._restarted(line, last, device_time_us):
+            if self._has_restarted(line, last, device_time_us):
                 return self._new_epoch(line, host_ns, lives=self._lives + 1)
             if sequence in self._recent:
                 self.repeated += 1
@@ -192,7 +192,7 @@ class WheelUnwrapper:
             new_epoch=False,
             lost=sequence - last.sequence - 1,
         )
-        return self._taken(reading, host_ns)
+        return self._take(reading, host_ns)
 
     def _new_epoch(self, line: WheelLine, host_ns: int, lives: int) -> WheelReading:
         self.epochs += 1
@@ -200,15 +200,15 @@ class WheelUnwrapper:
         self._wire_boot_id = line.boot_id
         self._recent.clear()
         boot_id = (line.boot_id + lives * _NEXT_LIFE) % _U32
-        return self._taken(WheelReading(boot_id, *line[1:], new_epoch=True, lost=0), host_ns)
+        return self._take(WheelReading(boot_id, *line[1:], new_epoch=True, lost=0), host_ns)
 
-    def _taken(self, reading: WheelReading, host_ns: int) -> WheelReading:
+    def _take(self, reading: WheelReading, host_ns: int) -> WheelReading:
         self._last, self._last_host_ns = reading, host_ns
         self._recent.append(reading.sequence)
         self._old, self._old_in_a_row = None, 0
         return reading
 
-    def _restarted(self, line: WheelLine, last: WheelReading, device_time_us: int) -> bool:
+    def _has_restarted(self, line: WheelLine, last: WheelReading, device_time_us: int) -> bool:
         """Whether old lines keep coming in good order, as from a controller that began anew."""
         follows = self._old is not None and self._old.sequence < line.sequence and self._old.t_us < line.t_us
         self._old_in_a_row = self._old_in_a_row + 1 if follows else 1
@@ -221,5 +221,5 @@ def _nearest(wrapped: int, expected: int) -> int:
     return expected + (wrapped - expected + _I32) % _U32 - _I32
 
 
-def _signed(value: int) -> int:
+def _to_signed(value: int) -> int:
     return (value + _I32) % _U32 - _I32

@@ -288,7 +288,7 @@ def test_a_file_that_says_nothing_of_its_errors_may_be_off_by_what_does_not_matt
 
 
 def test_check_refuses_pictures_of_another_size(good: Good, calib: Run, tmp_path: Path) -> None:
-    write_camera_yaml(WIDE.scaled(2.0), tmp_path / "large.yaml")
+    write_camera_yaml(WIDE.resize(2.0), tmp_path / "large.yaml")
     outcome = calib("check", tmp_path / "large.yaml", good.folder)
     assert outcome.code == 1
     assert "640x480" in outcome.err

@@ -157,7 +157,7 @@ def test_images_grow_outwards_up_to_the_limit() -> None:
 @every_camera
 @pytest.mark.parametrize("factor", [0.5, 2.0, 0.37])
 def test_scaled_keeps_the_pictures_edges(camera: CameraModel, factor: float) -> None:
-    scaled = camera.scaled(factor)
+    scaled = camera.resize(factor)
     rays = camera.unproject(picture_grid(camera))
     edges = picture_grid(scaled)
     # The same share of the way across the picture, counted from its edge, is the same ray.
@@ -169,7 +169,7 @@ def test_scaled_moves_the_centre_as_opencv_resizes() -> None:
     picture[200:220, 300:340] = 1.0  # its centre: (319.5, 209.5)
     small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     rows, columns = np.nonzero(small)
-    centred = replace(UNDISTORTED, cx_px=319.5, cy_px=209.5).scaled(0.5)
+    centred = replace(UNDISTORTED, cx_px=319.5, cy_px=209.5).resize(0.5)
     assert (centred.cx_px, centred.cy_px) == (columns.mean(), rows.mean())
 
 

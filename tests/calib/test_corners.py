@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
-from groundsbot.calib.board.corner_fit import fitted_corners
+from groundsbot.calib.board.corner_fit import fit_corners
 from groundsbot.calib.board.corner_surroundings import RADIUS_PX, Surroundings, bends
 from groundsbot.calib.board.finder import BoardFinder
 from groundsbot.calib.board.finder import View as FoundView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.intrinsics.model_choice import calibrated
+from groundsbot.calib.intrinsics.model_choice import calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import rms_px
 from groundsbot.fixtures.pictures.board_picture import BoardPainter, corners_of, drawn_views
 from groundsbot.fixtures.worlds.world import Pictures
@@ -55,7 +55,7 @@ def test_edges_are_followed_that_bend_more_and_more() -> None:
             pixels=true[None] + 0.2, squares_px=40.0 * np.eye(2)[None], growth_px=np.zeros((1, 2, 3)),
             white_diagonal=np.array([False]), bend=given[None], blur_px=np.array([0.6]), clear=0.5, radius_px=RADIUS_PX,
         )  # fmt: skip
-        found = fitted_corners(picture, np.array([0]), around)
+        found = fit_corners(picture, np.array([0]), around)
         errors.append(np.linalg.norm(found.pixels[0] - true))
     assert errors[0] < 0.005
     assert errors[1] > 0.02
@@ -88,7 +88,7 @@ def test_corners_are_looked_at_again_where_a_first_camera_bends_edges_otherwise(
 
     monkeypatch.setattr(BoardFinder, "find_again", counted)
     views = taken_views(camera, 1000, 8)
-    lens = calibrated(views, FINDER, camera.name, [camera.distortion_model]).lens
+    lens = calibrate_camera(views, FINDER, camera.name, [camera.distortion_model]).lens
     assert count[0] >= looks * len(views)
     assert looks > 1 or count[0] == len(views)
     off = parameters_of(lens.fit.model) - parameters_of(camera)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation.files import folder_written_whole, written_whole
+from groundsbot.calib.foundation.files import atomic_write, folder_written_whole
 
 
 def spoilt(file: Path) -> None:
@@ -21,10 +21,10 @@ def all_below(folder: Path) -> list[Path]:
 
 def test_a_file_appears_whole_or_stays_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "file"
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("first")
         assert not path.exists()
-    with pytest.raises(ZeroDivisionError), written_whole(path) as partial:
+    with pytest.raises(ZeroDivisionError), atomic_write(path) as partial:
         spoilt(partial)
     assert path.read_text() == "first"
     assert all_below(tmp_path) == [path]
@@ -126,7 +126,7 @@ def test_a_mount_point_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.Mo
 def test_what_a_killed_process_of_the_same_number_left_is_in_nobodys_way(tmp_path: Path) -> None:
     file, folder = tmp_path / "file", tmp_path / "folder"
     file.with_name(f".file.{os.getpid()}.partial").write_text("half")
-    with written_whole(file) as partial, partial.open("x") as opened:
+    with atomic_write(file) as partial, partial.open("x") as opened:
         opened.write("whole")
     for word in ("partial", "replaced"):  # killed while the folder had no name
         (tmp_path / f".folder.{os.getpid()}.{word}").mkdir()
@@ -145,10 +145,10 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
         fsync(file)
 
     monkeypatch.setattr(os, "fsync", synced)
-    with written_whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("whole")
     assert sizes == [5]
-    with written_whole(path, durable=False) as partial:
+    with atomic_write(path, durable=False) as partial:
         partial.write_text("of now")
     assert sizes == [5]
 

@@ -11,7 +11,7 @@ from groundsbot.calib.board.finder import View as FoundView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
 from groundsbot.calib.camera.planar_pose import board_pose
-from groundsbot.calib.intrinsics.bundle import Observations, Poses, adjusted
+from groundsbot.calib.intrinsics.bundle import Observations, Poses, adjust_bundle
 from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
@@ -20,7 +20,7 @@ from groundsbot.calib.intrinsics.projection_uncertainty import (
     projection_covariance,
     rms_px,
 )
-from groundsbot.calib.intrinsics.robust_fit import first_guess, fitted_lens
+from groundsbot.calib.intrinsics.robust_fit import first_guess, fit_lens
 from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of, drawn_views
 from tests.support.board_cases import CASES, FISHEYE, NARROW, WIDE
 from tests.support.board_views import PLAIN
@@ -125,7 +125,7 @@ def test_a_fit_finds_the_camera_to_within_its_covariance(camera: CameraModel) ->
     for seed in range(2):
         seen, views = made_corners(camera, seed)
         size_px = (camera.width_px, camera.height_px)
-        lens = fitted_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
+        lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
         off = parameters_of(lens.fit.model) - parameters_of(camera)
         squares.append(float(off @ np.linalg.solve(lens.covariance(), off)))
         assert lens.extra_sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
@@ -142,7 +142,7 @@ def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
     seen.pixels[wrong] += [0.9, -0.7]
     moved = seen.view == 3
     seen.pixels[moved] += np.random.default_rng(1).normal(0.0, 0.6, (int(moved.sum()), 2))
-    lens = fitted_lens(seen, len(views), first_guess(seen, len(views), (640, 480), "plumb_bob", "c"))
+    lens = fit_lens(seen, len(views), first_guess(seen, len(views), (640, 480), "plumb_bob", "c"))
     assert list(np.nonzero(~lens.views)[0]) == [3]
     assert not lens.corners[wrong].any()
     assert lens.corners[~wrong & ~moved].mean() > 0.995
@@ -162,7 +162,7 @@ def test_a_turned_camera_is_no_other_camera() -> None:
 def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera: CameraModel) -> None:
     seen, views = made_corners(camera, 2)
     start = first_guess(seen, len(views), (640, 480), camera.distortion_model, "c")
-    lens = fitted_lens(seen, len(views), start)
+    lens = fit_lens(seen, len(views), start)
     covariance, grid = 0.01 * lens.covariance(), PictureGrid.of(lens.fit.model, 12)
     predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid))
     root = np.linalg.cholesky(covariance + 1e-18 * np.diag(np.diag(covariance)))
@@ -185,7 +185,8 @@ def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: C
     poses = Poses(T_camera_board[:, :3, :3], T_camera_board[:, :3, 3])
     counts = (seen.view > 0) | (np.cumsum(seen.view == 0) <= n_corners)
     fit, others = (
-        adjusted(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2)) for each in (counts, seen.view > 0)
+        adjust_bundle(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2))
+        for each in (counts, seen.view > 0)
     )
     np.testing.assert_allclose(fit.information, others.information, rtol=1e-3, atol=1e-6 * others.information.max())
 

@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation.yaml_file import parse_mapping, validated
+from groundsbot.calib.foundation.yaml_file import parse_mapping, validate
 from groundsbot.calib.robot.robot_yaml import (
     Devices,
     Mount,
@@ -215,7 +215,7 @@ def test_of_a_bad_value_only_what_is_shown_is_written_out() -> None:
     data = parse_mapping(f"a0: &a0 [{'x,' * 1000}]\n{lists}".replace("a4: &a4", "robot_id:"), "robot.yaml")
     tracemalloc.start()
     with pytest.raises(CalibError, match=r"robot_id is .*\.\.\. but must be"):
-        validated(Robot, {"robot_id": data["robot_id"]}, "robot.yaml")
+        validate(Robot, {"robot_id": data["robot_id"]}, "robot.yaml")
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak_bytes < 300_000

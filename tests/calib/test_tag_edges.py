@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from groundsbot.calib.tags.edges import moved_out, outward
+from groundsbot.calib.tags.edges import outward, shift_edges
 
 SQUARE = np.array([[10.0, 20.0], [50.0, 20.0], [50.0, 60.0], [10.0, 60.0]])
 SLANTED = np.array([[10.0, 20.0], [42.0, 27.0], [45.0, 51.0], [12.0, 66.0]])
@@ -16,7 +16,7 @@ def test_a_square_grows_by_as_much_to_all_sides() -> None:
 @pytest.mark.parametrize("by_px", [0.3, -0.3])
 def test_sides_stay_parallel_and_lie_as_far_out_as_asked(by_px: float) -> None:
     many = np.stack([SQUARE, SLANTED, np.roll(SLANTED, 1, axis=0)])
-    moved = moved_out(many, by_px)
+    moved = shift_edges(many, by_px)
     side, new_side = (np.roll(each, -1, axis=1) - each for each in (many, moved))
     normal = np.stack([side[..., 1], -side[..., 0]], axis=-1) / np.linalg.norm(side, axis=-1, keepdims=True)
     middle = many.mean(axis=1, keepdims=True)
@@ -27,6 +27,6 @@ def test_sides_stay_parallel_and_lie_as_far_out_as_asked(by_px: float) -> None:
 
 
 def test_corners_that_coincide_spoil_nobody_else() -> None:
-    moved = moved_out(np.stack([np.full((4, 2), 7.0), SQUARE]), 0.1)
+    moved = shift_edges(np.stack([np.full((4, 2), 7.0), SQUARE]), 0.1)
     assert np.isnan(moved[0]).all()
     np.testing.assert_allclose(moved[1], SQUARE + 0.1 * outward(SQUARE))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
-from groundsbot.calib.board.view_spread import SeenBoard, Spread, seen_board
+from groundsbot.calib.board.view_spread import SeenBoard, Spread, describe_board
 from groundsbot.fixtures.pictures.board_picture import View
 from tests.support.board_views import PLAIN, held, projected
 
@@ -14,7 +14,7 @@ SIZE_PX = (PLAIN.width_px, PLAIN.height_px)
 def seen(view: View) -> SeenBoard:
     pixels = projected(view)
     inside = ((pixels > -0.5) & (pixels < np.array(SIZE_PX) - 0.5)).all(axis=1)
-    found = seen_board(np.flatnonzero(inside), pixels[inside], DEFAULT_BOARD, SIZE_PX)
+    found = describe_board(np.flatnonzero(inside), pixels[inside], DEFAULT_BOARD, SIZE_PX)
     assert found is not None
     return found
 
@@ -36,8 +36,8 @@ def test_corners_that_tell_nothing() -> None:
     pixels = projected(held())
     row, column = np.arange(6), np.arange(0, 48, 6)
     for ids in (np.arange(0), np.array([0, 1, 6, 7, 8]), row, column):
-        assert seen_board(ids, pixels[ids], DEFAULT_BOARD, SIZE_PX) is None
-    assert seen_board(np.array([0, 1, 2, 6, 7, 8]), pixels[[0, 1, 2, 6, 7, 8]], DEFAULT_BOARD, SIZE_PX) is not None
+        assert describe_board(ids, pixels[ids], DEFAULT_BOARD, SIZE_PX) is None
+    assert describe_board(np.array([0, 1, 2, 6, 7, 8]), pixels[[0, 1, 2, 6, 7, 8]], DEFAULT_BOARD, SIZE_PX) is not None
 
 
 def test_regions_are_those_that_corners_lie_in() -> None:

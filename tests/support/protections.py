@@ -197,8 +197,8 @@ PROTECTIONS: Final = (
         "21",
         "a lost device is opened again",
         "onboard/recorder/device_threads.py",
-        "            except OnboardError as error:\n                self._lost(str(error), at_its_end=False)\n",
-        "            except OnboardError as error:\n                self._lost(str(error), at_its_end=False)\n"
+        "            except OnboardError as error:\n                self._on_loss(str(error), at_its_end=False)\n",
+        "            except OnboardError as error:\n                self._on_loss(str(error), at_its_end=False)\n"
         "                return\n",
         test="replugs",
     ),
@@ -303,7 +303,7 @@ PROTECTIONS: Final = (
         "31",
         "the fastest of a burst's lines counts",
         "onboard/process/clock.py",
-        "return self._mapped(device_time_us * _NS_PER_US)",
+        "return self._map(device_time_us * _NS_PER_US)",
         "return self._bucket_best[1] if self._bucket_best else 0",
     ),
     Protection(

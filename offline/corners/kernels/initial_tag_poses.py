@@ -5,12 +5,12 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.corners.kernels.lens import CENTRE, distorted_at
+from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.planar_pose import ray_through, square_poses
 from groundsbot.offline.corners.kernels.step import turn_by
-from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, face, gone_back
+from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, base_before, face
 from groundsbot.offline.corners.kernels.view_selection import ByTag
-from groundsbot.offline.foundation import borrowed, inlined, inner, jitted
+from groundsbot.offline.foundation import borrowed, inline, inner, njit
 from groundsbot.offline.sam import Loss, eliminate_columns, loss_and_weight, multiply
 
 # Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
@@ -26,7 +26,7 @@ _SETTLED: Final = 0.01  # of the loss, promised by the next step: where the cand
 _ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fill vectors
 
 
-@jitted
+@njit
 def rays_of(looks: LookArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
     """Sets unit rays (C, 4, 3) to the corners of some looks; NaN where none was found."""
     looks = borrowed(looks)
@@ -35,8 +35,8 @@ def rays_of(looks: LookArrays, lenses: FloatArray, which: IntArray, out: FloatAr
             ray_through(lenses[looks.camera[which[i]]], looks.corners_px[which[i], k], out[i, k])
 
 
-@jitted
-def allowed(
+@njit
+def candidate_poses(
     looks: LookArrays, values: SpatialValues, which: IntArray, rays: FloatArray, places: FloatArray, turns: FloatArray
 ) -> None:
     """Sets places (C, 4, 3) and turns (C, 4, 3, 3) in map of the tags that looks with rays (C, 4, 3) may have seen.
@@ -89,7 +89,7 @@ def _camera_at(eye: Eye, x: float, y: float, heading: float, W: FloatArray, plac
     place[2] = mount[2]
 
 
-@jitted
+@njit
 def fit(
     looks: LookArrays,
     lenses: FloatArray,
@@ -178,7 +178,7 @@ def _eyes(looks: LookArrays, values: SpatialValues, which: IntArray) -> tuple[Fl
     return axes, places
 
 
-@inlined
+@inline
 def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: FloatArray, places: FloatArray) -> None:
     """Sets R_camera_map (4, 3, 3) and the camera's places (4, 3) when each corner's row of one look was read out.
 
@@ -187,7 +187,7 @@ def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: Fl
     face(looks, m, values.calibration, eye)
     late = values.calibration[looks.time_parameter[m]]
     omega = looks.twist[m, 2]
-    back_x, back_y, _, _ = gone_back(looks.twist[m, 0], looks.twist[m, 1], omega, late)
+    back_x, back_y, _, _ = base_before(looks.twist[m, 0], looks.twist[m, 1], omega, late)
     pose = values.poses[looks.pose[m]]
     cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
     for k in range(4):
@@ -233,7 +233,7 @@ def _add_look(
         z = p[2] + R[2, 0] * u + R[2, 1] * v - eyes[k, 2]
         W = axes[k]
         c2 = W[2, 0] * x + W[2, 1] * y + W[2, 2] * z
-        px, py, d00, d01, d11, nx, ny = distorted_at(
+        px, py, d00, d01, d11, nx, ny = distort(
             lens, W[0, 0] * x + W[0, 1] * y + W[0, 2] * z, W[1, 0] * x + W[1, 1] * y + W[1, 2] * z, c2
         )
         for axis in range(2):

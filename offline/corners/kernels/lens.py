@@ -31,9 +31,7 @@ def lenses_of(cameras: tuple[CameraModel, ...]) -> FloatArray:
 
 
 @inner
-def distorted_at(
-    lens: FloatArray, x: float, y: float, z: float
-) -> tuple[float, float, float, float, float, float, float]:
+def distort(lens: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float, float, float, float, float]:
     """Distorted coordinates, their derivatives (symmetric), and the undistorted ones; NaN where there is no image."""
     if not z > 0.0:
         return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan

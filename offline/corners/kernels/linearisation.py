@@ -7,7 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, face, look_factor
 from groundsbot.offline.corners.multifrontal.kernels import Kind, System, add_matrix, add_vector
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam import (
     Loss,
     Odometry,
@@ -26,7 +26,7 @@ N_MOTION: Final = 9
 _WIDTH: Final = 20  # of a look's rows, with a zero at the end: columns go in pairs
 
 
-@jitted
+@njit
 def add_looks(
     looks: LookArrays,
     lenses: FloatArray,
@@ -101,7 +101,7 @@ def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
             other[b] += (g0 * j0 + g1 * j1 + g2 * j2 + g3 * j3) + (g4 * j4 + g5 * j5 + g6 * j6 + g7 * j7)
 
 
-@jitted
+@njit
 def add_wobble(
     looks: LookArrays,
     lenses: FloatArray,
@@ -140,7 +140,7 @@ def add_wobble(
                     own[picture[m], k, j] += w * B[i, k] * B[i, j]
 
 
-@jitted
+@njit
 def add_motions(odometry: Odometry, loss: Loss, values: Values, kind: Kind, system: System) -> float:
     """Adds J^T W J and J^T W r of all motions, by both poses and the wheels; returns the sum of their losses.
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.corners.kernels.lens import CENTRE, distorted_at
+from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.foundation import inner
 
 _LEAST_COSINE: Final = 0.05  # of a ray against the tag's direction
@@ -25,7 +25,7 @@ def ray_through(lens: FloatArray, pixel: FloatArray, out: FloatArray) -> None:
     target_x, target_y = (pixel[0] - lens[CENTRE]) / lens[0], (pixel[1] - lens[CENTRE + 1]) / lens[1]
     x, y, is_found = target_x, target_y, False
     for _ in range(_NEWTON_STEPS):
-        image_x, image_y, d00, d01, d11, _, _ = distorted_at(lens, x, y, 1.0)
+        image_x, image_y, d00, d01, d11, _, _ = distort(lens, x, y, 1.0)
         off_x, off_y = image_x - target_x, image_y - target_y
         if abs(off_x) + abs(off_y) < _RESIDUAL * (1.0 + abs(target_x) + abs(target_y)):
             is_found = True
@@ -76,7 +76,7 @@ def square_poses(rays: FloatArray, side_m: float, turns: FloatArray, places: Flo
             R[i, 0], R[i, 1] = u * r00 + v * r10 + w * c0, u * r01 + v * r11 + w * c1
             R[i, 2] = u * (r10 * c1 - c0 * r11) + v * (c0 * r01 - r00 * c1) + w * (r00 * r11 - r10 * r01)
         _shift(turned, R, 0.5 * side_m, places[s])
-        _turned_back(ahead, R, places[s])
+        _rotate_back(ahead, R, places[s])
     return True
 
 
@@ -128,7 +128,7 @@ def _shift(rays: FloatArray, R: FloatArray, half_m: float, out: FloatArray) -> N
 
 
 @inner
-def _turned_back(ahead: FloatArray, R: FloatArray, place: FloatArray) -> None:
+def _rotate_back(ahead: FloatArray, R: FloatArray, place: FloatArray) -> None:
     """From the camera that looks towards the tag to the one that saw it."""
     for j in range(3):
         x, y, z = R[0, j], R[1, j], R[2, j]

@@ -4,11 +4,11 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.kernels.view import SpatialValues
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam import advance, go_along, multiply, series
 
 
-@jitted
+@njit
 def move(
     values: SpatialValues,
     step: FloatArray,

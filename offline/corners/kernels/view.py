@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.corners.kernels.lens import CENTRE, distorted_at
-from groundsbot.offline.foundation import inlined, inner
+from groundsbot.offline.corners.kernels.lens import CENTRE, distort
+from groundsbot.offline.foundation import inline, inner
 from groundsbot.offline.sam import series
 
 
@@ -104,7 +104,7 @@ def look_factor(
     cos_h, sin_h = np.cos(heading), np.sin(heading)
     T, R, mount = values.turns[tag], eye.rotation, eye.mount
     v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
-    back_x, back_y, cos_l, sin_l = gone_back(v0, v1, omega, late)
+    back_x, back_y, cos_l, sin_l = base_before(v0, v1, omega, late)
     cos_m, sin_m, cos_t, sin_t, last = 1.0, 0.0, cos_l, sin_l, 0.0
     by_pixel, by_scale = 1.0 / looks.sigma_px[m], 1.0 / scale
     for k in range(4):
@@ -124,7 +124,7 @@ def look_factor(
         base_x, base_y = cos_t * rest_x + sin_t * rest_y, cos_t * rest_y - sin_t * rest_x
         x, y, z = base_x - mount[0], base_y - mount[1], up - mount[2]
         depth = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-        px, py, d00, d01, d11, nx, ny = distorted_at(
+        px, py, d00, d01, d11, nx, ny = distort(
             lens,
             R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
             R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
@@ -147,8 +147,8 @@ def look_factor(
             B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2
 
 
-@inlined
-def gone_back(v0: float, v1: float, omega: float, late: float) -> tuple[float, float, float, float]:
+@inline
+def base_before(v0: float, v1: float, omega: float, late: float) -> tuple[float, float, float, float]:
     """Where a base that drives so was a moment before, in its axes now: x, y, cosine and sine of its heading."""
     along, even, _ = series(-late * omega)
     across = -late * omega * even
@@ -160,7 +160,7 @@ def gone_back(v0: float, v1: float, omega: float, late: float) -> tuple[float, f
     )
 
 
-@inlined
+@inline
 def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tuple[float, float, float]:
     """By where a corner is in base, from the derivative by where it is across the picture, times its depth."""
     j2 = -(j0 * nx + j1 * ny)
@@ -171,7 +171,7 @@ def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tupl
     )
 
 
-@inlined
+@inline
 def _by_tag(
     row: FloatArray, m0: float, m1: float, m2: float, T: FloatArray, u: float, v: float, by_scale: float
 ) -> None:
@@ -184,7 +184,7 @@ def _by_tag(
     row[16] = (t0 * u + t1 * v) * by_scale
 
 
-@inlined
+@inline
 def _by_mount(row: FloatArray, b0: float, b1: float, b2: float, x: float, y: float, z: float, axes: FloatArray) -> None:
     """By the mount's place and turn, from the derivative by where a corner is in base, off the mount by (x, y, z)."""
     row[9], row[10], row[11] = -b0, -b1, -b2

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 
 POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
 _JUDGING_LOOKS: Final = 8  # of each tag
@@ -34,8 +34,8 @@ def judges(by_tag: ByTag) -> ByTag:
     return ByTag(by_tag.order[kept], np.concatenate([[0], np.cumsum(kept)])[by_tag.begin])
 
 
-@jitted
-def posed(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
+@njit
+def select_views(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
     """Sets (T, 2) of each tag the largest look, and of those half as large the one whose shape differs most.
 
     -1 where a tag has no look, or no second one.

@@ -126,11 +126,11 @@ class FrontFactor:
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """H^-1 vector (n,)."""
-        x: FloatArray = self.whitened(vector[None])[0]
+        x: FloatArray = self.whiten(vector[None])[0]
         substitute_down(self.order.nodes, self.entries, x)
         return x
 
-    def whitened(self, vectors: FloatArray) -> FloatArray:
+    def whiten(self, vectors: FloatArray) -> FloatArray:
         """R^-T of each of some vectors (k, n): their products with each other are those by H^-1 of the vectors."""
         Z = vectors.copy()
         substitute_up(self.order.nodes, self.entries, Z)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam import eliminate_columns
 
 Unsigned = NDArray[np.uint64]
@@ -68,7 +68,7 @@ class System(NamedTuple):
     gradient: FloatArray
 
 
-@jitted
+@njit
 def settle(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -> tuple[IntArray, IntArray]:
     """The columns of all fronts, and where they are in their parents'; sets the nodes' starts and the factors' places.
 
@@ -120,7 +120,7 @@ def _take(
     return end + 1
 
 
-@jitted
+@njit
 def assemble(kind: Kind, normal: FloatArray, system: System) -> None:
     """Adds normal matrices (M, k, k) of a kind of factor."""
     kind, system = borrowed(kind), borrowed(system)
@@ -178,7 +178,7 @@ def _front(nodes: Nodes, i: int, entries: FloatArray) -> FloatArray:
     return entries[nodes.offset[i] : nodes.offset[i + 1]].reshape(size, size)
 
 
-@jitted
+@njit
 def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
     """Adds (M, k) of a kind of factor to (n,), but for what is held."""
     kind = borrowed(kind)
@@ -186,7 +186,7 @@ def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
         add_vector(kind, m, vectors[m], out)
 
 
-@jitted
+@njit
 def factorise(nodes: Nodes, entries: FloatArray) -> int:
     """Fronts become rows of R; -1, or the column that has no positive pivot."""
     nodes = borrowed(nodes)
@@ -206,7 +206,7 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
     return -1
 
 
-@jitted
+@njit
 def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
     """Each row of X (k, n) <- R^-T row. All go through a front while it is at hand."""
     nodes = borrowed(nodes)
@@ -225,7 +225,7 @@ def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
                 X[c, columns[k]] = own[k]
 
 
-@jitted
+@njit
 def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
     """X (n,) <- R^-1 x."""
     nodes = borrowed(nodes)
@@ -262,7 +262,7 @@ def _product(a: FloatArray, b: FloatArray) -> float:
     return (s0 + s1) + (s2 + s3)
 
 
-@jitted
+@njit
 def whiten(nodes: Nodes, entries: FloatArray, path: IntArray, row: IntArray, Z: FloatArray) -> None:
     """Z (m, k) <- R^-T Z.
 

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment import FALSE_ALARM, quarter_turned
+from groundsbot.offline.alignment import FALSE_ALARM, rotate_quarter
 from groundsbot.offline.corners import CornerSolution, SpatialState
 from groundsbot.offline.measurements import REACH_M, UNMODELLED_SIGMA_M
 
@@ -98,7 +98,7 @@ class TagFit:
         return float(off @ np.linalg.solve(self.covariance, off)) < _COVERED
 
 
-def hung_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float) -> HungTags:
+def placed_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float) -> HungTags:
     """Some tags of a converged solution about a pose.
 
     Args:
@@ -120,7 +120,7 @@ def hung_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_fa
         own[:3, 6 * k + 3 : 6 * k + 6] = back
         own[3:, 6 * k + 6 : 6 * k + 9] = turn[k]
         by[k, :2, :2] = -np.eye(2)
-        by[k, :2, 2] = -quarter_turned(place[k, :2])
+        by[k, :2, 2] = -rotate_quarter(place[k, :2])
         by[k, 5, 2] = -1.0
     rows = by.reshape(-1, 3 + six.size)
     straight = _straightness(solution, int(tags[0]), anchor)
@@ -141,11 +141,11 @@ def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
     def cost_at(state: SpatialState) -> float:
         return solution.problem.system(state, is_whole=False)[1]
 
-    rises = [cost_at(solution.problem.moved(state, step)) - cost_at(state) for step in (way, -way)]
+    rises = [cost_at(solution.problem.retract(state, step)) - cost_at(state) for step in (way, -way)]
     return min(rises) / (0.5 * _STRAIGHT_SIGMAS**2)
 
 
-def fitted(a: HungTags, b: HungTags) -> TagFit:
+def fit_transform_of_tags(a: HungTags, b: HungTags) -> TagFit:
     """The transform that brings the tags of b onto those of a."""
     k = len(a.place_m)
     relative = a.turn @ b.turn.swapaxes(-1, -2)
@@ -155,11 +155,11 @@ def fitted(a: HungTags, b: HungTags) -> TagFit:
     T = np.array([0.0, 0.0, theta])
     T[:2] = (a.place_m[:, :2] - se2.apply(T, b.place_m[:, :2])).mean(axis=0)
     for _ in range(_STEPS):
-        residual, by_transform, S = _linearised(a, b, T)
+        residual, by_transform, S = _linearise(a, b, T)
         pulled = np.linalg.solve(S, by_transform).T
         T = T - np.linalg.solve(pulled @ by_transform, pulled @ residual)
         T[2] = se2.wrap_angle(T[2])
-    residual, by_transform, S = _linearised(a, b, T)
+    residual, by_transform, S = _linearise(a, b, T)
     information = by_transform.T @ np.linalg.solve(S, by_transform)
     rise = float(residual @ np.linalg.solve(S, residual))
     # The likelihood of all poses of the tags and of all transforms, each as likely as any other (Laplace).
@@ -168,7 +168,7 @@ def fitted(a: HungTags, b: HungTags) -> TagFit:
     return TagFit(a, b, T, np.linalg.inv(information), rise, 6 * k - 3, nats)
 
 
-def _linearised(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _linearise(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
     k = len(a.place_m)
     turned = Rotation.from_euler("z", T[2]).as_matrix()
@@ -177,7 +177,7 @@ def _linearised(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, Fl
     tilted = Rotation.from_matrix(a.turn @ (turned @ b.turn).swapaxes(-1, -2)).as_rotvec()
     by_transform = np.zeros((k, 6, 3))
     by_transform[:, :2, :2] = -np.eye(2)
-    by_transform[:, :2, 2] = -quarter_turned(in_a[:, :2])
+    by_transform[:, :2, 2] = -rotate_quarter(in_a[:, :2])
     by_transform[:, 5, 2] = -1.0
     both = np.kron(np.eye(2 * k), turned)
     S = a.covariance + both @ b.covariance @ both.T + np.diag(_unmodelled(a, b) ** 2)

@@ -53,13 +53,13 @@ class TagJoin:
         """Nothing would show that the tag was moved in between."""
         return len(self.tags) == 1
 
-    def refused(self, why: str) -> "TagJoin":
+    def refuse(self, why: str) -> "TagJoin":
         """Not made after all."""
         ids = ", ".join(str(tag.tag_id) for tag in self.tags)
         return replace(self, reason=f"{self.b} shares only tag{'s' * (not self.is_weak)} {ids} with {self.a}: {why}")
 
 
-def joined_over_tags(
+def join_over_tags(
     maps: Sequence[LocalMap],
     merged: Merge,
     solved: Sequence[SolvedComponent],
@@ -82,7 +82,7 @@ def joined_over_tags(
     """
     joiner = _Joiner(maps, merged, measurements, upright_sigma_rad)
     with stages.stage("joining over single tags"):
-        components = joiner.joined(list(solved))
+        components = joiner.join(list(solved))
     components.sort(key=lambda each: size_rank(maps, each.members))
     return components, [*joiner.made.values(), *joiner.refused.values()]
 
@@ -109,13 +109,13 @@ class _Joiner:
         self.made: dict[_Key, TagJoin] = {}
         self.refused: dict[_Key, TagJoin] = {}
 
-    def joined(self, solved: list[SolvedComponent]) -> list[SolvedComponent]:
+    def join(self, solved: list[SolvedComponent]) -> list[SolvedComponent]:
         """The surest first, until none is left; where several contradict each other, none of them is made."""
         components, self.made = solved, {}
         while True:
             tries = [each for a, b in combinations(components, 2) if (each := self._try(a, b)) is not None]
-            if self._taken_back(tries):
-                return self.joined(solved)
+            if self._undo_weak_joins(tries):
+                return self.join(solved)
             good = [each for each in tries if not each.join.reason]
             if not good:
                 self.refused |= {_key(a, b): join for a, b, join in tries}
@@ -123,19 +123,19 @@ class _Joiner:
             a, b, join = min(good, key=lambda each: each.join.verdict.best.heading_sigma_rad)
             whole = self._together(a, b, join.verdict.best.T_a_b)
             if whole.refined is None:
-                self.refused[_key(a, b)] = join.refused("; ".join(whole.told) or "both together have no solution")
+                self.refused[_key(a, b)] = join.refuse("; ".join(whole.told) or "both together have no solution")
             else:
                 self.made[_key(a, b)] = join
                 components = [whole, *(each for each in components if each is not a and each is not b)]
 
-    def _taken_back(self, tries: Sequence[_Try]) -> bool:
+    def _undo_weak_joins(self, tries: Sequence[_Try]) -> bool:
         """Takes weak joins back on which components rest whose shared tags contradict each other; whether any were."""
         wrong = {
             m for a, b, join in tries if join.reason and not join.is_weak for m in (*_key(a, b)[0], *_key(a, b)[1])
         }
         back = {key: join for key, join in self.made.items() if join.is_weak and wrong.issuperset((*key[0], *key[1]))}
         for key, join in back.items():
-            self.refused[key] = join.refused("other tags that their runs share contradict that it stayed where it was")
+            self.refused[key] = join.refuse("other tags that their runs share contradict that it stayed where it was")
         return bool(back)
 
     def _try(self, a: SolvedComponent, b: SolvedComponent) -> _Try | None:
@@ -181,7 +181,7 @@ class _Joiner:
             tags |= {tag: se2.apply(T, place) for tag, place in each.graph.tags_of(_state(each)).items()}
             calibration |= each.graph.calibration_of(each.solution.state)
         start = graph.start(np.concatenate([poses[m][1] for m in members]), tags, calibration)
-        solution = solve(_held(graph, start).problem, start)
+        solution = solve(_with_heading_priors(graph, start).problem, start)
         T_frame_start = solution.state.poses[graph.first_pose]
         refined, told = refine(graph, solution, self._upright_sigma_rad)
         return SolvedComponent(
@@ -189,7 +189,7 @@ class _Joiner:
         )
 
 
-def _held(graph: Graph, start: State) -> Graph:
+def _with_heading_priors(graph: Graph, start: State) -> Graph:
     """The graph with the headings of all chains held softly where they start."""
     poses = graph.first_pose[1:]
     measured = graph.problem.measured

@@ -11,9 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.alignment import MARGIN_NATS, variance_factor
-from groundsbot.offline.corners import CornerSolution, NotPositiveError, Refined, hung_otherwise, solve_corners
+from groundsbot.offline.corners import CornerSolution, NotPositiveError, Refined, alternative_states, solve_corners
 from groundsbot.offline.global_map.solve_component import SolvedComponent
-from groundsbot.offline.global_map.tag_joins.fit import HungTags, TagFit, fitted, hung_tags, radial_sigmas
+from groundsbot.offline.global_map.tag_joins.fit import (
+    HungTags,
+    TagFit,
+    fit_transform_of_tags,
+    placed_tags,
+    radial_sigmas,
+)
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 
@@ -80,7 +86,7 @@ def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, ta
     sides = [_ways(maps, each, tags) for each in (a, b)]
     if not all(sides):
         return None
-    fits = sorted((fitted(one, other) for one, other in product(*sides)), key=lambda fit: fit.nats)
+    fits = sorted((fit_transform_of_tags(one, other) for one, other in product(*sides)), key=lambda fit: fit.nats)
     best = fits[0]
     rivals: list[TagFit] = []
     for fit in fits[1:]:
@@ -102,14 +108,14 @@ def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[T
     anchor = int(component.graph.problem.anchor[which[0]])
     own = refined.solution
     solves = [own, *(_other_solves(own, int(which[0])) if len(which) == 1 else ())]
-    ways = [hung_tags(each, which, anchor, factor, (each.cost - own.cost) / factor) for each in solves]
+    ways = [placed_tags(each, which, anchor, factor, (each.cost - own.cost) / factor) for each in solves]
     return [each for each in ways if each.is_known]
 
 
 def _other_solves(own: CornerSolution, tag: int) -> list[CornerSolution]:
     """Other optima of the whole component, found from the other ways in which its looks allow a tag to hang."""
     found: list[CornerSolution] = []
-    for start in hung_otherwise(own.problem, own.state, tag):
+    for start in alternative_states(own.problem, own.state, tag):
         try:
             other = solve_corners(own.problem, start)
         except NotPositiveError:  # run off to where no look says anything

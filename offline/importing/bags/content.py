@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.bags.frames import FixedFrames
 from groundsbot.offline.importing.bags.reader import Bag, BagMessage, BagTopic
-from groundsbot.offline.importing.bags.tags import Look, read_look, told_left_out
+from groundsbot.offline.importing.bags.tags import Look, left_out_lines, read_look
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     CAMERA_INFO,
@@ -91,13 +91,13 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
     content.looks, n_looks = _each_time_once(content.looks, [(look.stamp_ns,) for look in content.looks])
     if not chosen.has_pictures and not any(look.sightings for look in content.looks):
         told = "; ".join(
-            [f"no tag was seen in {counted(len(content.looks), 'picture')}", *told_left_out(content.left_out)]
+            [f"no tag was seen in {plural(len(content.looks), 'picture')}", *left_out_lines(content.left_out)]
         )
         raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
     content.remarks = clock.remarks()
     for n, topic in ((n_odometry, chosen.odometry), (n_looks, chosen.tags)):
         if n:
-            content.remarks.append(f"{topic.name}: {counted(n, 'message')} left out: their times were there already")
+            content.remarks.append(f"{topic.name}: {plural(n, 'message')} left out: their times were there already")
     return content
 
 
@@ -129,7 +129,7 @@ class BagClock:
         for topic in topics:
             if not self._stamped[topic.name]:
                 raise OfflineError(
-                    f"{self._path}: {topic.name}: the header stamps of {counted(self._without[topic.name], 'message')} "
+                    f"{self._path}: {topic.name}: the header stamps of {plural(self._without[topic.name], 'message')} "
                     "are 0; give --receive-times for the less exact times at which they were received"
                 )
 
@@ -137,8 +137,7 @@ class BagClock:
         """For a person."""
         said = ["times are those at which the bag received the messages"] if self._by_receiving else []
         return said + [
-            f"{topic}: {counted(n, 'message')} left out: their header stamps are 0"
-            for topic, n in self._without.items()
+            f"{topic}: {plural(n, 'message')} left out: their header stamps are 0" for topic, n in self._without.items()
         ]
 
 

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 
 from groundsbot.calib.camera import CameraModel
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
@@ -59,7 +59,7 @@ def detect_in_bag(
     clock.check([topic])
     if not found:
         raise OfflineError(f"{bag.path}: {topic.name}: no picture is of use: {unusable[0]}; name another topic")
-    told = [f"{counted(len(unusable), 'picture')} of no use, the first since: {unusable[0]}"] if unusable else []
+    told = [f"{plural(len(unusable), 'picture')} of no use, the first since: {unusable[0]}"] if unusable else []
     return [found[stamp] for stamp in sorted(found)], [*clock.remarks(), *told]
 
 

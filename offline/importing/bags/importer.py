@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
 from groundsbot.offline.importing.bags.content import BagContent, read_content
@@ -48,7 +48,7 @@ def import_bag(
     check_output(output, output / run_id)
     with open_bag(path) as bag:
         chosen = choose_topics(path, bag.topics, bag_options)
-        _refuse_unused(path, chosen, options, bag_options)
+        _check_options_used(path, chosen, options, bag_options)
         content = read_content(bag, chosen, bag_options, options.tag_family)
         camera = find_camera(path, chosen, content, options.robot)
         frames = {camera.frame} if camera is not None and chosen.has_pictures else content.camera_frames
@@ -69,8 +69,8 @@ def import_bag(
         n_odometry=len(readings),
         duration_s=(readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9,
         distance_m=distance_m,
-        n_observations=len(tags.seen),
-        n_tags=len(set(tags.seen)),
+        n_observations=len(tags.tags),
+        n_tags=len(set(tags.tags)),
         remarks=(used, *tags.remarks, *content.remarks, *outside, *mount.remarks, *robot_remarks),
     )
 
@@ -112,10 +112,10 @@ def _check_times(path: Path, readings: list[PlanarOdometry], tags: list[Entry]) 
             f"{tags[0][0] * 1e-9:.3f} to {tags[-1][0] * 1e-9:.3f} s; were they stamped by different clocks? "
             "--receive-times takes the bag's own"
         )
-    return [f"{counted(n_outside, 'picture')} outside the odometry's time: of no use to a map"] if n_outside else []
+    return [f"{plural(n_outside, 'picture')} outside the odometry's time: of no use to a map"] if n_outside else []
 
 
-def _refuse_unused(path: Path, chosen: ChosenTopics, options: ImportOptions, bag_options: BagOptions) -> None:
+def _check_options_used(path: Path, chosen: ChosenTopics, options: ImportOptions, bag_options: BagOptions) -> None:
     """Complains of options that would be of no use.
 
     Raises:

@@ -72,7 +72,7 @@ class BagLimits:
         finally:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
-    def counted(self, messages: Iterable[_Message]) -> Iterator[_Message]:
+    def count(self, messages: Iterable[_Message]) -> Iterator[_Message]:
         """The same messages.
 
         Raises:

@@ -54,7 +54,7 @@ def odometry_readings(
         for reading, step in zip(readings, steps, strict=True):
             reading.covariance.extend(step.ravel().tolist())
     said = f"covariances of the odometry {told}{'' if steps is not None else '; ignored, the noise model tells'}"
-    return readings, _driven_m(left_m, right_m), said
+    return readings, _distance_m(left_m, right_m), said
 
 
 def joint_readings(
@@ -82,7 +82,7 @@ def joint_readings(
         PlanarOdometry(stamp_ns=stamp_ns, wheels=PlanarOdometry.WheelDistances(left_m=left, right_m=right))
         for stamp_ns, left, right in zip(stamps_ns.tolist(), left_m.tolist(), right_m.tolist(), strict=True)
     ]
-    return readings, _driven_m(left_m, right_m)
+    return readings, _distance_m(left_m, right_m)
 
 
 def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str) -> tuple[IntArray, FloatArray]:
@@ -173,5 +173,5 @@ def _position(where: str, message: Any, joint: str) -> float:  # noqa: ANN401 - 
     return float(message.position[index])
 
 
-def _driven_m(left_m: FloatArray, right_m: FloatArray) -> float:
+def _distance_m(left_m: FloatArray, right_m: FloatArray) -> float:
     return float(np.abs(np.diff(0.5 * (left_m + right_m))).sum())

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.offline.importing.bags.tags import Look, Sighting
 from groundsbot.offline.importing.run_writer import Entry
 from groundsbot.onboard.log import TagObservation, TagObservations
@@ -39,7 +39,7 @@ def position_entries(looks: Sequence[Look], R_planar_frame: Rotation, frame: str
         if observations:
             message = TagObservations(stamp_ns=look.stamp_ns, frame=frame, observations=observations)
             entries.append((look.stamp_ns, "/tags/observations", message))
-    return entries, _told(n, n_sane, n_zero)
+    return entries, _covariance_sentence(n, n_sane, n_zero)
 
 
 def planar_covariance(sighting: Sighting, R_planar_frame: Rotation) -> FloatArray | None:
@@ -74,11 +74,11 @@ def _observation(
     return message
 
 
-def _told(n: int, n_sane: int, n_zero: int) -> list[str]:
+def _covariance_sentence(n: int, n_sane: int, n_zero: int) -> list[str]:
     """Of covariances."""
     if n_sane == n:
         return ["covariances: as in the messages"]
     why = (
         "are zeros" if n_zero == n - n_sane else "are none (zeros, not symmetric, not positive definite, or too large)"
     )
-    return [f"covariances: those of {counted(n - n_sane, 'reading')} of {n} {why}; the noise model is used instead"]
+    return [f"covariances: those of {plural(n - n_sane, 'reading')} of {n} {why}; the noise model is used instead"]

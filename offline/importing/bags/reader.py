@@ -112,11 +112,11 @@ class Bag:
         connections = [each for each in self._reader.connections if (each.topic, each.msgtype) in wanted]
         if not connections:
             return
-        with _told(self.path):
+        with _library_errors(self.path):
             stores = {each.msgtype: self._store(each) for each in connections}
             # The two readers take the same arguments; their common type does not.
             messages = self._reader.messages(connections=connections)
-            for connection, received_ns, data in self._limits.counted(messages):
+            for connection, received_ns, data in self._limits.count(messages):
                 store = stores[connection.msgtype]
                 deserialise = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
                 content = deserialise(data, connection.msgtype)
@@ -159,15 +159,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise OfflineError(f"{path}: does not exist; give a .bag file, a folder of ROS 2, or an .mcap or .db3 file")
     if path.is_dir() and not (path / METADATA).exists():
         raise OfflineError(f"{path}: has no {METADATA}, so its recording was cut short; run `ros2 bag reindex` on it")
-    with _told(path):
+    with _library_errors(path):
         limits = BagLimits(path)
         with limits.memory():
             reader = Reader1(path) if path.suffix == ".bag" and path.is_file() else Reader2(path)
             reader.open()
     try:
-        with _told(path):
+        with _library_errors(path):
             bag = Bag(path, reader, limits)
-        with _content_told(path):
+        with _content_errors(path):
             yield bag
     finally:
         reader.close()
@@ -185,7 +185,7 @@ def _types_of(definition: MessageDefinition, msgtype: str) -> dict[str, Any]:
 
 
 @contextmanager
-def _content_told(path: Path) -> Iterator[None]:
+def _content_errors(path: Path) -> Iterator[None]:
     """A message is what the bag's own definition makes of it: it may lack what its type should have."""
     try:
         yield
@@ -197,7 +197,7 @@ def _content_told(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _library_errors(path: Path) -> Iterator[None]:
     """Whatever the library stumbles over in somebody's bytes (it asserts, too) is one line for a person."""
     try:
         yield

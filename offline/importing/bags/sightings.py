@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
@@ -18,7 +18,7 @@ from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.pictures import camera_of
 from groundsbot.offline.importing.bags.positions import position_entries
 from groundsbot.offline.importing.bags.reader import Bag, BagTopic
-from groundsbot.offline.importing.bags.tags import Look, told_left_out, with_tf_positions
+from groundsbot.offline.importing.bags.tags import Look, left_out_lines, with_tf_positions
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     APRILTAG_ROS,
@@ -56,7 +56,7 @@ class TagEntries:
     remarks: list[str]
 
     @property
-    def seen(self) -> list[tuple[str, int]]:
+    def tags(self) -> list[tuple[str, int]]:
         """(family, id) of every reading."""
         seen: list[tuple[str, int]] = []
         for _, _, message in self.entries:
@@ -131,13 +131,13 @@ def tag_entries(
         raise OfflineError(f"{where}: to place tags by their corners needs {missing}")
     else:
         found = _positions(where, chosen, content, robot, in_camera)
-    if not found.seen:
+    if not found.tags:
         raise OfflineError(
             f"{where}: no tag of {', '.join(robot.recorder.families)} was seen in "
-            f"{counted(len(found.entries), 'picture')}; is it the right family? see --tag-family"
+            f"{plural(len(found.entries), 'picture')}; is it the right family? see --tag-family"
         )
     _check_sizes(where, robot, found)
-    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *told_left_out(content.left_out)]
+    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *left_out_lines(content.left_out)]
     return TagEntries(found.entries, found.camera, [*said, *found.remarks])
 
 
@@ -185,7 +185,7 @@ def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Rob
         )
     entries, remarks = position_entries(looks, turned, frame)
     if n_placed < n:
-        remarks.append(f"{counted(n - n_placed, 'detection')} left out: tf does not place them")
+        remarks.append(f"{plural(n - n_placed, 'detection')} left out: tf does not place them")
     hint = (
         "" if chosen.tags.msgtype == APRILTAG_ROS else "; their corners would do better: give --tag-size-m or --robot"
     )
@@ -200,7 +200,7 @@ def _check_sizes(where: str, robot: Robot, found: TagEntries) -> None:
     """
     if found.camera is None:
         return
-    for family, tag_id in sorted(set(found.seen)):
+    for family, tag_id in sorted(set(found.tags)):
         try:
             robot.tag_size_m(family, tag_id)
         except CalibError as error:

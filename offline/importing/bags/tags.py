@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, counted
+from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, APRILTAG_ROS
@@ -99,9 +99,9 @@ def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[L
     return Look(stamp_ns, frame, tuple(found)), left_out
 
 
-def told_left_out(left_out: Mapping[str, int]) -> list[str]:
+def left_out_lines(left_out: Mapping[str, int]) -> list[str]:
     """For a person."""
-    return [f"{counted(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
+    return [f"{plural(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
 
 
 def with_tf_positions(looks: Sequence[Look], transforms: Iterable[tuple[int, Any]]) -> list[Look]:

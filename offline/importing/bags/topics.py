@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.bags.reader import BagTopic
 
@@ -79,21 +79,21 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
     Raises:
         OfflineError: nothing fits, several do, or what was named does not.
     """
-    odometry = _named(path, topics, "--odometry-topic", options.odometry_topic, (ODOMETRY, JOINTS))
+    odometry = _topic_of_flag(path, topics, "--odometry-topic", options.odometry_topic, (ODOMETRY, JOINTS))
     odometry = odometry or _only(path, topics, "--odometry-topic", (ODOMETRY,))
     odometry = odometry or _only(path, topics, "--odometry-topic", (JOINTS,))
     if odometry is None:
         raise OfflineError(
-            f"{path}: no odometry: no messages of {_types((ODOMETRY, JOINTS))}; it holds {_listed(topics)}; record the "
-            "robot's odometry or its wheel joints"
+            f"{path}: no odometry: no messages of {_types((ODOMETRY, JOINTS))}; it holds {_list_topics(topics)}; "
+            "record the robot's odometry or its wheel joints"
         )
-    tags = _named(path, topics, "--tags-topic", options.tags_topic, TAGS)
-    tags = tags or _named(path, topics, "--image-topic", options.image_topic, IMAGES)
+    tags = _topic_of_flag(path, topics, "--tags-topic", options.tags_topic, TAGS)
+    tags = tags or _topic_of_flag(path, topics, "--image-topic", options.image_topic, IMAGES)
     tags = tags or _only(path, topics, "--tags-topic", TAGS)
     tags = tags or _only(path, topics, "--image-topic", IMAGES)
     if tags is None:
         raise OfflineError(
-            f"{path}: no tags: no messages of {_types((*TAGS, *IMAGES))}; it holds {_listed(topics)}; record "
+            f"{path}: no tags: no messages of {_types((*TAGS, *IMAGES))}; it holds {_list_topics(topics)}; record "
             "detections or pictures"
         )
     transforms = tuple(each for each in topics if each.msgtype in TRANSFORMS)
@@ -102,7 +102,7 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
 
 def _camera_infos(path: Path, topics: Sequence[BagTopic], options: BagOptions, tags: BagTopic) -> tuple[BagTopic, ...]:
     """The camera_info named; else, of several, those that share most of their name with the pictures or detections."""
-    named = _named(path, topics, "--camera-info-topic", options.camera_info_topic, (CAMERA_INFO,))
+    named = _topic_of_flag(path, topics, "--camera-info-topic", options.camera_info_topic, (CAMERA_INFO,))
     if named is not None:
         return (named,)
     found = [each for each in topics if each.msgtype == CAMERA_INFO]
@@ -126,7 +126,7 @@ def _n_shared(a: list[str], b: list[str]) -> int:
     return n
 
 
-def _named(
+def _topic_of_flag(
     path: Path, topics: Sequence[BagTopic], flag: str, name: str | None, types: tuple[str, ...]
 ) -> BagTopic | None:
     if name is None:
@@ -137,13 +137,15 @@ def _named(
             return each
     if known:
         raise OfflineError(f"{path}: {flag} {name} is of type {known[0].short_type}, must be of {_types(types)}")
-    raise OfflineError(f"{path}: {flag} {name} has no messages in this bag; it holds {_listed(topics)}; name another")
+    raise OfflineError(
+        f"{path}: {flag} {name} has no messages in this bag; it holds {_list_topics(topics)}; name another"
+    )
 
 
 def _only(path: Path, topics: Sequence[BagTopic], flag: str, types: tuple[str, ...]) -> BagTopic | None:
     found = [each for each in topics if each.msgtype in types]
     if len(found) > 1:
-        raise OfflineError(f"{path}: {len(found)} topics fit: {_listed(found)}; choose one with {flag}")
+        raise OfflineError(f"{path}: {len(found)} topics fit: {_list_topics(found)}; choose one with {flag}")
     return found[0] if found else None
 
 
@@ -151,7 +153,7 @@ def _types(types: Sequence[str]) -> str:
     return " or ".join(each.replace("/msg/", "/") for each in types)
 
 
-def _listed(topics: Sequence[BagTopic]) -> str:
-    told = [f"{each.name} ({each.short_type}, {counted(each.n_messages, 'message')})" for each in topics[:_MOST_NAMED]]
+def _list_topics(topics: Sequence[BagTopic]) -> str:
+    told = [f"{each.name} ({each.short_type}, {plural(each.n_messages, 'message')})" for each in topics[:_MOST_NAMED]]
     more = [f"{len(topics) - _MOST_NAMED} more"] if len(topics) > _MOST_NAMED else []
     return ", ".join([*told, *more]) or "no messages at all"

@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.foundation import counted
+from groundsbot.calib.foundation import plural
 from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.forms import (
@@ -104,11 +104,11 @@ def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
     outside = _n_outside(drive)
     if outside and outside == len(drive.observations):
         raise OfflineError(
-            f"{folder}: none of {counted(outside, 'observation')} lies within the odometry's time; "
+            f"{folder}: none of {plural(outside, 'observation')} lies within the odometry's time; "
             "are both files on one clock?"
         )
     if outside:
-        drive.remarks.append(f"{counted(outside, 'observation')} outside the odometry's time: a map cannot place them")
+        drive.remarks.append(f"{plural(outside, 'observation')} outside the odometry's time: a map cannot place them")
     return drive
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
-from groundsbot.offline.local_map import measured_chain, run_without_log
+from groundsbot.offline.local_map import run_without_log, segment_from_arrays
 from groundsbot.offline.localization.online.kernels import Motions, Sights
 from groundsbot.offline.measurements import Chain, TagKey
 from groundsbot.offline.sam import (
@@ -156,7 +156,7 @@ class Drive:
         place = np.empty(len(tags), dtype=np.int64)
         place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
         motions, readings = self._motions, self._readings
-        return measured_chain(
+        return segment_from_arrays(
             run_without_log(_NAME, self._robot, ordered),
             np.arange(self._poses.n),
             (motions["motion"][:, :3], motions["covariance"], motions["jacobian"]),

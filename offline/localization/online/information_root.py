@@ -16,9 +16,23 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online.drive import Drive
 from groundsbot.offline.localization.online.kernels import BY_POINTS, Border, Motions, Sights, sweep
-from groundsbot.offline.localization.online.moving_frame import Known, pose_among, relaxed, turned, twist_of
-from groundsbot.offline.localization.online.prior import OnlinePrior, padded
-from groundsbot.offline.localization.online.queries import carried, foretold, move, moved_on, snooped, through, weighed
+from groundsbot.offline.localization.online.moving_frame import (
+    Known,
+    minimise_on_arcs,
+    pose_among,
+    rotate_step,
+    twist_of,
+)
+from groundsbot.offline.localization.online.prior import OnlinePrior, pad
+from groundsbot.offline.localization.online.queries import (
+    carry_rows,
+    huber_weight,
+    leave_one_out_test,
+    move,
+    predict,
+    propagate,
+    through,
+)
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.sam import HUBER_THRESHOLD, Values
 
@@ -88,19 +102,19 @@ class OnlineRoot:
             if self.prior.held:
                 z[: len(self._relaxed)] = self._relaxed
                 most = min(max(SLICE // (6 * n**2 + 1), _LEAST_COSTS), _MOST_COSTS)
-                self._relaxed = z = relaxed(self._border, self._known, z, most)
+                self._relaxed = z = minimise_on_arcs(self._border, self._prior, z, most)
             self._step = self.through(np.concatenate([self._pose[:, 3], self._right[:n] + z]))
         return self._step
 
     @property
-    def moved(self) -> FloatArray:
+    def offsets(self) -> FloatArray:
         """(n,) of the border, from its points in the map."""
-        return turned(self._known, self.step[3:], self.prior.first_tag)
+        return rotate_step(self._prior, self.step[3:], self.prior.first_tag)
 
     @property
     def twist(self) -> FloatArray:
         """(5,) of the tags' mean motion in the step: turn, motion, and their middle."""
-        return twist_of(self._known, self.step[3:], self.prior.first_tag)
+        return twist_of(self._prior, self.step[3:], self.prior.first_tag)
 
     @property
     def is_determined(self) -> bool:
@@ -124,7 +138,7 @@ class OnlineRoot:
     @property
     def places_m(self) -> FloatArray:
         """(T, 2) of the tags."""
-        return self.prior.places_m + self.moved[self.prior.first_tag :].reshape(-1, 2)
+        return self.prior.places_m + self.offsets[self.prior.first_tag :].reshape(-1, 2)
 
     def pose_covariance(self) -> FloatArray:
         """(3, 3) perturbed on the right."""
@@ -136,12 +150,12 @@ class OnlineRoot:
 
     def variance_of(self, rows: FloatArray) -> FloatArray:
         """(m, m) of rows (m, 3 + n) times pose and border."""
-        root = self.carried(rows)
+        root = self.carry(rows)
         return root @ root.T
 
-    def carried(self, rows: FloatArray) -> FloatArray:
+    def carry(self, rows: FloatArray) -> FloatArray:
         """(m, 3 + n) whose square is that."""
-        return carried(self._border, self._pose, rows, self.prior.n)
+        return carry_rows(self._border, self._pose, rows, self.prior.n)
 
     def through(self, right: FloatArray) -> FloatArray:
         """(3 + n,) by pose and border, of a right-hand side."""
@@ -152,7 +166,7 @@ class OnlineRoot:
         return Border(self._root, self._right, self.prior.columns, self._at_tags)
 
     @property
-    def _known(self) -> Known:
+    def _prior(self) -> Known:
         prior = self.prior
         return Known(*prior.whole)
 
@@ -164,8 +178,8 @@ class OnlineRoot:
         rows = self.prior.add(place_m, of_map)
         room = self.prior.room
         if room > len(self._root):
-            self._root, self._right = padded(self._root, (room, room)), padded(self._right, (room,))
-            self._pose = padded(self._pose, (3, 4 + room))
+            self._root, self._right = pad(self._root, (room, room)), pad(self._right, (room,))
+            self._pose = pad(self._pose, (3, 4 + room))
         self._root[n : n + 2, : n + 2], self._right[n : n + 2] = rows, rows @ self.prior.off
         self._pose[:, 4 + n : 6 + n] = 0.0
         self._step = None
@@ -176,21 +190,21 @@ class OnlineRoot:
         self._relaxed = self._relaxed[: self.prior.n]
         self._step = None
 
-    def held_squares(self, tag: int) -> float:
+    def squared_distance(self, tag: int) -> float:
         """Squared sigmas of a tag that holds the robot against all else, 1 cm in each coordinate allowed for."""
         prior, at = self.prior, self.prior.first_tag + 2 * tag
-        off = self.moved - prior.off
-        return snooped(self._border, self._pose, self._known.root, off, prior.n, at, UNMODELLED_SIGMA_M**2)
+        off = self.offsets - prior.off
+        return leave_one_out_test(self._border, self._pose, self._prior.root, off, prior.n, at, UNMODELLED_SIGMA_M**2)
 
-    def lifted(self, tag: int) -> Lifted:
+    def leave_one_out(self, tag: int) -> Lifted:
         """What comes of all if one tag that holds the robot did not: its shift is one more unknown."""
         prior, at = self.prior, self.prior.first_tag + 2 * tag
         ways = prior.root[:, at : at + 2].T @ prior.root  # of the prior's information
-        taken = self.carried(np.concatenate([np.zeros((2, 3)), ways], axis=1))
+        taken = self.carry(np.concatenate([np.zeros((2, 3)), ways], axis=1))
         checked = ways[:, at : at + 2] - taken @ taken.T
         covariance = np.asarray(np.linalg.pinv(checked, rcond=1e-9, hermitian=True), dtype=np.float64)
         by_shift = np.column_stack([self.through(each.copy()) for each in taken])
-        return Lifted(at, by_shift, covariance @ ways @ (self.moved - prior.off), covariance)
+        return Lifted(at, by_shift, covariance @ ways @ (self.offsets - prior.off), covariance)
 
     def free_squares(self, free: Sequence[tuple[int, TagKey]], lifted: Lifted | None = None) -> float:
         """Likewise of tags that do not hold the robot, against where the map has them; as if another did not."""
@@ -201,9 +215,9 @@ class OnlineRoot:
         at = 3 + prior.first_tag + (2 * np.array(tags)[:, None] + np.arange(2)).reshape(-1)
         ways[np.arange(len(by)), at] += 1.0
         spread = self.variance_of(ways) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(len(by))
-        moved = self.moved
+        moved = self.offsets
         off_m = (prior.places_m.reshape(-1) + moved[prior.first_tag :])[at - 3 - prior.first_tag]
-        off_m -= prior.foretold_m(by, moved, *of_map)
+        off_m -= prior.predict_m(by, moved, *of_map)
         if lifted is not None:
             by_shift = ways @ lifted.by_shift + by[:, lifted.at : lifted.at + 2]
             off_m = off_m + by_shift @ lifted.shift_m
@@ -232,18 +246,18 @@ class OnlineRoot:
         end, until = len(drive.poses) - 1, len(drive.keyframe)
         points = self.point[None]
         if end > self.keyframe:
-            points = np.stack([self.point, self._led_to(drive.motions(self.keyframe, end))])
+            points = np.stack([self.point, self._next_point(drive.motions(self.keyframe, end))])
         sights = drive.sights(self.n_readings, until, self.keyframe)
         self._take(drive, points, sights, np.array([self._weight(sights)] if until > self.n_readings else []))
 
-    def _led_to(self, motion: Motions) -> FloatArray:
+    def _next_point(self, motion: Motions) -> FloatArray:
         """(3,) the point of the next pose: among its points as the estimate lies among its own."""
-        pose = moved_on(self.pose, motion, 0, self.calibration)
+        pose = propagate(self.pose, motion, 0, self.calibration)
         return pose_among(self.prior.places_m, self.places_m, pose)
 
     def surprise(self, sights: Sights, unmodelled_m: float) -> float:
         """Squared sigmas of the first reading from what is foretold, its tag being off by as much besides."""
-        residual, rows, by_tag = self._foretold(sights)
+        residual, rows, by_tag = self._predict(sights)
         spread = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
         return float(residual @ np.linalg.solve(spread, residual))
 
@@ -251,11 +265,11 @@ class OnlineRoot:
         at = self.prior.first_tag + 2 * int(sights.tag[0])
         if not (self.is_determined and self._root[at, at] > 0.0 and self._root[at + 1, at + 1] > 0.0):
             return 1.0  # nothing tells of its tag yet
-        residual, rows, _ = self._foretold(sights)
-        return weighed(residual, self.variance_of(rows), HUBER_THRESHOLD)
+        residual, rows, _ = self._predict(sights)
+        return huber_weight(residual, self.variance_of(rows), HUBER_THRESHOLD)
 
-    def _foretold(self, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return foretold(self._border, self.prior.n, sights, self._values(self.point[None]), self.step)
+    def _predict(self, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return predict(self._border, self.prior.n, sights, self._values(self.point[None]), self.step)
 
     def _values(self, poses: FloatArray) -> Values:
         return Values(poses, self.prior.places_m, self.prior.calibration)
@@ -270,7 +284,7 @@ class OnlineRoot:
         self.point = points[-1].copy()
         self.keyframe, self.n_readings, self._step = end, self.n_readings + len(weights), None
 
-    def left_behind(self) -> list[tuple[int, FloatArray, FloatArray]]:
+    def eliminated_slices(self) -> list[tuple[int, FloatArray, FloatArray]]:
         """Poses that were left, in slices from the last to the first: first index, rows and points of `substituted`."""
         found, first = [], self.keyframe
         for rows, points in reversed(self._left):

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam import (
     N_READING,
     Values,
@@ -20,7 +20,7 @@ from groundsbot.offline.sam import (
     motion_at,
     reading_factor,
     wheel_correction,
-    wrapped,
+    wrap,
 )
 
 BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
@@ -69,7 +69,7 @@ class Border(NamedTuple):
     first_tag: IntArray
 
 
-@jitted
+@njit
 def sweep(
     border: Border,
     pose: FloatArray,
@@ -191,7 +191,7 @@ def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, 
     cos, sin = np.cos(first[2]), np.sin(first[2])
     dx, dy = second[0] - first[0], second[1] - first[1]
     x, y = cos * dx + sin * dy, cos * dy - sin * dx
-    turn = wrapped(second[2] - first[2])
+    turn = wrap(second[2] - first[2])
     t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # they have what that reads
     e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type] # likewise
     s = 1.0 / (1.0 + values.calibration[motions.parameters[m, 0]])

@@ -14,12 +14,12 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
-from groundsbot.offline.alignment import GROUP_MARGIN, why_not_joined
+from groundsbot.offline.alignment import GROUP_MARGIN, reason_not_joined
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.localization.map_prior import KnownMap, known_map
+from groundsbot.offline.localization.map_prior import KnownMap, prior_from_map
 from groundsbot.offline.localization.online.drive import TagReading
 from groundsbot.offline.localization.online.prior import Numbers
-from groundsbot.offline.localization.online.settle import judged, solved_anew
+from groundsbot.offline.localization.online.settle import localize_drive, solve_again
 from groundsbot.offline.localization.online.smoother import Smoother
 from groundsbot.offline.localization.online.start_search import SeenTags, StartSearch
 from groundsbot.offline.localization.placement import Located
@@ -63,7 +63,7 @@ class OnlineLocalizer:
         """
         if not 0 <= component < len(known.components):
             raise OfflineError(f"component {component}: the map has {len(known.components)}")
-        self._known = known_map(known.components[component], "the map")
+        self._known = prior_from_map(known.components[component], "the map")
         self._robot = robot
         self._parameters = _parameters(robot, self._known)
         self._scales = {parameter: i for i, parameter in enumerate(self._parameters)}
@@ -142,21 +142,21 @@ class OnlineLocalizer:
         if smoother.is_placed and not self._doubt and not self._contradicting():
             self._settle(None)
         if not smoother.is_placed or self._doubt or self._contradicting():
-            placed = judged(smoother, self._index, self._known)
+            placed = localize_drive(smoother, self._index, self._known)
             if placed is not None and placed.is_sure:
                 self._settle(placed)
             elif smoother.is_placed and placed is not None:
-                self._doubt = why_not_joined("the map", "the drive", placed.shared, placed.alignment)
+                self._doubt = reason_not_joined("the map", "the drive", placed.shared, placed.alignment)
         return self.pose
 
     def _settle(self, placed: Located | None) -> None:
-        solved_anew(self._smoother, self._index, self._parameters, self._known, placed)
+        solve_again(self._smoother, self._index, self._parameters, self._known, placed)
         self._doubt = ""
         self._judged = frozenset(self._contradicting())
 
     def _contradicting(self) -> list[TagKey]:
         """Tags seen that may be the map's, and do not lie where it has them."""
-        held = self._smoother.held
+        held = self._smoother.map_tags
         return [tag for tag, index in self._index.items() if tag in self._known.instances and index not in held]
 
     def _is_in_doubt(self) -> bool:
@@ -165,7 +165,7 @@ class OnlineLocalizer:
         As of two groups of tags in `alignment.pairwise`, one that moved as one and one that stayed.
         """
         others = len(set(self._contradicting()) - self._judged)
-        return others > 1 and len(self._smoother.held) < GROUP_MARGIN * others
+        return others > 1 and len(self._smoother.map_tags) < GROUP_MARGIN * others
 
     def _look(self) -> None:
         """Looks for the start."""

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.localization.online.kernels import Border
-from groundsbot.offline.sam import series, wrapped
+from groundsbot.offline.sam import series, wrap
 
 # A step whose slope is less than so many sigmas is where the cost is least.
 _FLAT_SIGMAS: Final = 1e-4
@@ -36,15 +36,15 @@ class Known(NamedTuple):
     places_m: FloatArray
 
 
-@jitted
-def turned(known: Known, step: FloatArray, first: int) -> FloatArray:
+@njit
+def rotate_step(known: Known, step: FloatArray, first: int) -> FloatArray:
     """(n,) how far a step (n,) of the border, tags from column `first` on, moves it, when its tags turn along arcs."""
     moved = step.copy()
     _turn(known, step, first, moved)
     return moved
 
 
-@jitted
+@njit
 def twist_of(known: Known, step: FloatArray, first: int) -> FloatArray:
     """(5,) what is common to the steps of all tags: a twist (turn and motion, as of a pose), and their middle."""
     return _twist(known, step, first)[0]
@@ -131,7 +131,7 @@ def _cost(border: Border, known: Known, z: FloatArray, slope: FloatArray) -> flo
     for i in range(n):
         for j in range(i + 1):
             slope[j] -= root[i, j] * straight[i]
-    _substitute_transposed(border, slope)
+    _substitute_transpose(border, slope)
     slope += z
     return value
 
@@ -147,7 +147,7 @@ def _substitute(border: Border, z: FloatArray, step: FloatArray) -> None:
 
 
 @inner
-def _substitute_transposed(border: Border, slope: FloatArray) -> None:
+def _substitute_transpose(border: Border, slope: FloatArray) -> None:
     """Slope by z from that by S^-1 (d + z)."""
     for i in range(len(slope) - 1, -1, -1):
         slope[i] = slope[i] / border.root[i, i] if border.root[i, i] > 0.0 else 0.0
@@ -155,8 +155,8 @@ def _substitute_transposed(border: Border, slope: FloatArray) -> None:
             slope[j] -= border.root[i, j] * slope[i]
 
 
-@jitted
-def relaxed(border: Border, known: Known, begin: FloatArray, most: int) -> FloatArray:
+@njit
+def minimise_on_arcs(border: Border, known: Known, begin: FloatArray, most: int) -> FloatArray:
     """(n,) z with the cost of S^-1 (d + z) least, tags turning along arcs.
 
     Limited-memory quasi-Newton (Nocedal and Wright, "Numerical Optimization", 2006, 7.2) in the coordinates in which
@@ -203,7 +203,7 @@ def _downhill(slope: FloatArray, steps: FloatArray, yields: FloatArray, kept: in
     return way
 
 
-@jitted
+@njit
 def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray) -> FloatArray:
     """(3,) where a pose (3,) was before places (T, 2) moved, if it moved along with those near it.
 
@@ -230,4 +230,4 @@ def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray) -> F
     turn = np.arctan2(odd, even) if even * even + odd * odd > 0.0 else 0.0
     cos, sin = np.cos(turn), np.sin(turn)
     x, y = pose[0] - mean[2], pose[1] - mean[3]
-    return np.array([mean[0] + cos * x + sin * y, mean[1] + cos * y - sin * x, wrapped(pose[2] - turn)])
+    return np.array([mean[0] + cos * x + sin * y, mean[1] + cos * y - sin * x, wrap(pose[2] - turn)])

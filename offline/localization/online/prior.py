@@ -135,7 +135,7 @@ class OnlinePrior:
         whitened = self.root @ across
         return whitened.T @ self.root, self._known.covariance[np.ix_(rows, rows)] - whitened.T @ whitened
 
-    def foretold_m(self, by: FloatArray, moved: FloatArray, *of_map: TagKey) -> FloatArray:
+    def predict_m(self, by: FloatArray, moved: FloatArray, *of_map: TagKey) -> FloatArray:
         """(2 m,) where the map has tags, by their `by_others` and how far all else is from its points (n,)."""
         places_m = self._known.places_m[[self._known.index[tag] for tag in of_map]]
         return np.asarray(places_m.reshape(-1) + by @ (moved - self.off))
@@ -144,11 +144,11 @@ class OnlinePrior:
         if n <= self.room:
             return
         self.room = max(n, 2 * self.room)
-        self._root, self._off = padded(self._root, (self.room, self.room)), padded(self._off, (self.room,))
-        self._in_map, self._places = padded(self._in_map, (self.room,)), padded(self._places, (self.room, 2))
+        self._root, self._off = pad(self._root, (self.room, self.room)), pad(self._off, (self.room,))
+        self._in_map, self._places = pad(self._in_map, (self.room,)), pad(self._places, (self.room, 2))
 
 
-def padded(array: Any, shape: tuple[int, ...]) -> Any:  # noqa: ANN401 (of any kind of number)
+def pad(array: Any, shape: tuple[int, ...]) -> Any:  # noqa: ANN401 (of any kind of number)
     """The array at the beginning of a larger one, which is zero else."""
     larger = np.zeros(shape, dtype=array.dtype)
     larger[tuple(slice(n) for n in array.shape)] = array

@@ -5,15 +5,15 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import jitted
+from groundsbot.offline.foundation import njit
 from groundsbot.offline.localization.online.kernels import Border, Motions, Sights, spread_out
-from groundsbot.offline.sam import N_READING, Values, motion_at, reading_factor, series, wheel_correction, wrapped
+from groundsbot.offline.sam import N_READING, Values, motion_at, reading_factor, series, wheel_correction, wrap
 
 # Of what is checked of a tag, below which rounding is all there is.
 _LEAST_SHARE: Final = 1e-9
 
 
-@jitted
+@njit
 def through(border: Border, pose: FloatArray, right: FloatArray, n: int) -> FloatArray:
     """(3 + n,) x of (pose and S) x = right (3 + n,), by pose and border; zero for what nothing tells of."""
     x = np.zeros(3 + n)
@@ -34,8 +34,8 @@ def through(border: Border, pose: FloatArray, right: FloatArray, n: int) -> Floa
     return x
 
 
-@jitted
-def carried(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> FloatArray:
+@njit
+def carry_rows(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> FloatArray:
     """(m, 3 + n) Y with Y times (pose and S) = rows (m, 3 + n) by pose and border: they vary by Y Y^T."""
     found = rows.copy()
     for k in range(len(found)):
@@ -57,8 +57,8 @@ def carried(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> Float
     return found
 
 
-@jitted
-def snooped(
+@njit
+def leave_one_out_test(
     border: Border, pose: FloatArray, prior: FloatArray, off: FloatArray, n: int, at: int, unmodelled: float
 ) -> float:
     """Squared sigmas of a tag that holds against all else, as of `solve_in_map`.
@@ -80,7 +80,7 @@ def snooped(
                 ways[k, 3 + j] += w * prior[i, j]
         for j in range(n):
             pull[k] += ways[k, 3 + j] * off[j]
-    taken = carried(border, pose, ways, n)
+    taken = carry_rows(border, pose, ways, n)
     for i in range(2):
         for k in range(2):
             checked[i, k] = ways[i, 3 + at + k] - (taken[i] * taken[k]).sum()
@@ -98,8 +98,8 @@ def snooped(
     return squares
 
 
-@jitted
-def foretold(
+@njit
+def predict(
     border: Border, n: int, sights: Sights, values: Values, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What the first reading leaves over as of now (2,), its derivatives (2, 3 + n), and those by its tag (2, 2)."""
@@ -113,8 +113,8 @@ def foretold(
     return r, rows, J[:, 3:5].copy()
 
 
-@jitted
-def weighed(residual: FloatArray, spread: FloatArray, threshold: float) -> float:
+@njit
+def huber_weight(residual: FloatArray, spread: FloatArray, threshold: float) -> float:
     """Huber's weight of a reading (2,) by what it leaves over, which depends on its weight."""
     weight = 1.0
     for _ in range(4):
@@ -128,8 +128,8 @@ def weighed(residual: FloatArray, spread: FloatArray, threshold: float) -> float
     return weight
 
 
-@jitted
-def substituted(
+@njit
+def back_substitute(
     left: FloatArray, points: FloatArray, after: FloatArray, border: FloatArray, twist: FloatArray, out: FloatArray
 ) -> FloatArray:
     """Poses from the rows that they left.
@@ -163,7 +163,7 @@ def substituted(
     return following
 
 
-@jitted
+@njit
 def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray) -> None:
     """Sets a pose (3,) to where a step (3,) takes it of which a twist (5,) is common to all, see `moving_frame`."""
     turn, dx, dy, cx, cy = twist[0], twist[1], twist[2], twist[3], twist[4]
@@ -178,13 +178,13 @@ def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray
     cos, sin = np.cos(turn), np.sin(turn)
     out[0] = cx + along * dx - turn * even * dy + cos * x - sin * y
     out[1] = cy + turn * even * dx + along * dy + sin * x + cos * y
-    out[2] = wrapped(point[2] + step[2])
+    out[2] = wrap(point[2] + step[2])
 
 
-@jitted
-def moved_on(pose: FloatArray, motions: Motions, m: int, calibration: FloatArray) -> FloatArray:
+@njit
+def propagate(pose: FloatArray, motions: Motions, m: int, calibration: FloatArray) -> FloatArray:
     """(3,) where a motion leads to."""
     t = wheel_correction(motions, m, calibration)  # type: ignore[arg-type] # they have what that reads
     x, y, turn, _, _ = motion_at(motions, m, t)  # type: ignore[arg-type] # likewise
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrapped(pose[2] + turn)])
+    return np.array([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrap(pose[2] + turn)])

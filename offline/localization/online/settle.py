@@ -10,7 +10,7 @@ from groundsbot.offline.local_map import Goodness, LocalMap, solve_local_map
 from groundsbot.offline.localization.map_prior import KnownMap
 from groundsbot.offline.localization.online.smoother import Smoother
 from groundsbot.offline.localization.placement import Located, locate
-from groundsbot.offline.localization.solve_in_map import solve_held
+from groundsbot.offline.localization.solve_in_map import solve_in_map
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import Parameter, Solution, build_graph
 
@@ -18,7 +18,7 @@ _COMPONENT: Final = 0  # there is one only
 _UNJUDGED: Final = Goodness(0.0, 0, 0.0, 1.0, 1.0)
 
 
-def judged(smoother: Smoother, tags: Mapping[TagKey, int], known: KnownMap) -> Located | None:
+def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: KnownMap) -> Located | None:
     """Where a drive lies in the map as `localize` would say, whatever holds it; None without tags of the map.
 
     Args:
@@ -31,7 +31,7 @@ def judged(smoother: Smoother, tags: Mapping[TagKey, int], known: KnownMap) -> L
     return locate(solve_local_map(smoother.drive.chain(tags)), known, _COMPONENT)
 
 
-def solved_anew(
+def solve_again(
     smoother: Smoother,
     tags: Mapping[TagKey, int],
     parameters: Sequence[Parameter],
@@ -45,17 +45,17 @@ def solved_anew(
         tags: index of each tag seen.
         parameters: of calibration.
         known: the map.
-        placed: where the drive lies by `judged`, which the solve then starts from; else from where the smoother is.
+        placed: where the drive lies by `localize_drive`: the start of the solve, which else is the smoother's state.
     """
     by_index = dict(zip(tags.values(), tags, strict=True))
-    held = {by_index[index]: of_map for index, of_map in smoother.held.items()}
+    held = {by_index[index]: of_map for index, of_map in smoother.map_tags.items()}
     loose: dict[TagKey, TagKey] = {}
     if placed is None or placed.alignment is None:
-        start, member = smoother.drive.poses[0].copy(), _as_smoothed(smoother, tags, parameters)
+        start, member = smoother.drive.poses[0].copy(), _local_map(smoother, tags, parameters)
     else:
         start, member = placed.alignment.T_a_b, placed.local_map
         held, loose = placed.names(), placed.others()
-    found = solve_held([member], start[None], [held], [loose], known)
+    found = solve_in_map([member], start[None], [held], [loose], known)
     state, called = found.solution.state, found.called[0]
     own = {parameter: i for i, parameter in enumerate(found.graph.parameters)}
     values = [
@@ -67,7 +67,7 @@ def solved_anew(
     smoother.set_to(state.poses, places, np.array(values), holding)
 
 
-def _as_smoothed(smoother: Smoother, tags: Mapping[TagKey, int], parameters: Sequence[Parameter]) -> LocalMap:
+def _local_map(smoother: Smoother, tags: Mapping[TagKey, int], parameters: Sequence[Parameter]) -> LocalMap:
     """In the frame of its start."""
     chain = smoother.drive.chain(tags)
     graph = build_graph([chain])

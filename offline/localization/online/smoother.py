@@ -22,7 +22,7 @@ from groundsbot.offline.localization.online.information_root import SLICE, Onlin
 from groundsbot.offline.localization.online.kernels import Sights
 from groundsbot.offline.localization.online.moving_frame import pose_among
 from groundsbot.offline.localization.online.prior import Numbers, OnlinePrior
-from groundsbot.offline.localization.online.queries import move, moved_on, substituted
+from groundsbot.offline.localization.online.queries import back_substitute, move, propagate
 from groundsbot.offline.localization.online.tag_test import CALLED, TagJudge
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.sam import Parameter
@@ -45,7 +45,7 @@ class Smoother:
         self._work = self._rounds()
 
     @property
-    def held(self) -> dict[int, TagKey]:
+    def map_tags(self) -> dict[int, TagKey]:
         """The map's tag of each that holds the robot, by index."""
         return self._judge.held
 
@@ -64,7 +64,7 @@ class Smoother:
         drive = self.drive
         drive.add_motion(motion, covariance, by_wheels)
         n = len(drive.poses)
-        drive.poses[-1] = moved_on(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
+        drive.poses[-1] = propagate(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
         self._take_last()
 
     def add_reading(self, tag: int, reading: TagReading, scale: int, instances: tuple[TagKey, ...]) -> None:
@@ -98,7 +98,7 @@ class Smoother:
             for of_map in instances:
                 front.add_tag(_place_m(sights, front.point, front.prior.calibration), of_map)
                 if front.surprise(sights, UNMODELLED_SIGMA_M) < TAG_GATE:
-                    self.held[tag] = of_map
+                    self.map_tags[tag] = of_map
                     return
                 front.drop_last_tag()
         self._judge.maybe[tag] = instances
@@ -115,7 +115,7 @@ class Smoother:
     def set_to(self, poses: FloatArray, places_m: FloatArray, calibration: FloatArray, held: dict[int, TagKey]) -> None:
         """All as a solver has it, and one whole round from there."""
         self.drive.poses[:], self._places, self._calibration = poses, list(places_m), calibration
-        others = self._judge.maybe | {tag: (each,) for tag, each in self.held.items()}
+        others = self._judge.maybe | {tag: (each,) for tag, each in self.map_tags.items()}
         self._judge = TagJudge(held, {tag: each for tag, each in others.items() if tag not in held})
         self.is_placed = True
         for _ in self._round(None):
@@ -137,7 +137,7 @@ class Smoother:
         while True:
             spent = 0
             while root.prior.n_tags < len(self._places) and spent < SLICE:
-                root.add_tag(self._places[root.prior.n_tags], self.held.get(root.prior.n_tags))
+                root.add_tag(self._places[root.prior.n_tags], self.map_tags.get(root.prior.n_tags))
                 spent += 4 * root.prior.n**2 + CALLED
             if root.prior.n_tags == len(self._places):
                 root.advance(self.drive)
@@ -152,7 +152,7 @@ class Smoother:
         """At the start; what is known beforehand as in the last one, where the same tags hold."""
         prior = OnlinePrior(self._known, self._numbers, self._calibration)
         if last is not None and last.prior.held == {
-            tag: each for tag, each in self.held.items() if tag < last.prior.n_tags
+            tag: each for tag, each in self.map_tags.items() if tag < last.prior.n_tags
         }:
             prior = last.prior.about(self._calibration, self.places_m)
         return OnlineRoot(prior, self.drive.poses[0], held=not self.is_placed)
@@ -163,9 +163,9 @@ class Smoother:
         self._calibration, self._places[: root.prior.n_tags] = root.calibration, list(root.places_m)
         move(root.point, following, twist, self.drive.poses[root.keyframe])
         n = 0
-        for first, rows, points in root.left_behind():
+        for first, rows, points in root.eliminated_slices():
             poses = self.drive.poses[first : first + len(rows)]
-            following, n = substituted(rows, points, following, border, twist, poses), n + len(rows)
+            following, n = back_substitute(rows, points, following, border, twist, poses), n + len(rows)
             if n >= _POSES_A_SLICE:
                 n = 0
                 yield

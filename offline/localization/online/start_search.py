@@ -23,7 +23,7 @@ from groundsbot.offline.alignment import (
     hold,
     ill_fitting,
     is_same_distance,
-    quarter_turned,
+    rotate_quarter,
     through,
 )
 from groundsbot.offline.localization.map_prior import KnownMap
@@ -85,7 +85,7 @@ class StartSearch:
         if pairs != self._pairs or self._left is None:  # all of it anew: by now the places are better known
             self._pairs, self._found, self._left = pairs, [], fit.same_distances()
         else:
-            found = fit.grown(*self._left.pop(0))
+            found = fit.grow(*self._left.pop(0))
             if found is not None:
                 self._found.append(found)
                 known = np.flatnonzero(found.members).tolist()
@@ -136,7 +136,7 @@ class _RigidFit:
         fits &= self._own[first] != self._own[second]
         return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
 
-    def grown(self, i: int, j: int) -> Explanation | None:
+    def grow(self, i: int, j: int) -> Explanation | None:
         """What fits with two pairs; None where they do not themselves."""
         members = np.zeros(self.n, dtype=np.bool_)
         members[[i, j]] = True
@@ -161,7 +161,7 @@ class _RigidFit:
         centre = in_a.mean(axis=0)
         by_transform = np.zeros((n, 2, 3))
         by_transform[:, :, :2] = -np.eye(2)
-        by_transform[:, :, 2] = -quarter_turned(in_a - centre)
+        by_transform[:, :, 2] = -rotate_quarter(in_a - centre)
         covariance = self._covariance_a + turned
         covariance[np.diag_indices(2 * n)] += UNMODELLED_SIGMA_M**2
         unbent = Bend(T, _NONE, _NONE)

@@ -36,13 +36,13 @@ class TagJudge:
         Or lets go of one that two others contradict, which would both fit if it did not hold: in a short drive a tag
         that was moved may be believed, and those that stayed be doubted one by one.
         """
-        bound = _bound(root.prior.n_tags, 1)
+        bound = _chi_square_bound(root.prior.n_tags, 1)
         settled = {tag for tag, at in self._changed.items() if n_readings < at + _LEAST_MORE}
         others = self._others(root, settled)
         squares: dict[int, float] = {}
         for tag in [tag for tag in root.prior.held if tag not in settled]:
-            squares[tag] = root.held_squares(tag)
-            yield from self._spent(6 * root.prior.n**2)
+            squares[tag] = root.squared_distance(tag)
+            yield from self._count_work(6 * root.prior.n**2)
         worst = max(squares, key=lambda tag: squares[tag], default=-1)
         if squares.get(worst, 0.0) > bound:
             self._let_go(worst, n_readings)
@@ -50,25 +50,25 @@ class TagJudge:
         best: list[tuple[float, int, TagKey]] = []
         for tag, of_map in others:
             best.append((root.free_squares([(tag, of_map)]), tag, of_map))
-            yield from self._spent(6 * root.prior.n**2 + CALLED)
+            yield from self._count_work(6 * root.prior.n**2 + CALLED)
         least, tag, of_map = min(best, default=(bound, -1, TagKey("", 0)))
         if least < bound:
             self._hold(tag, of_map, n_readings)
         elif len(self._others(root, set())) >= _OUTVOTE:
-            yield from self._outvoted(root, squares, bound, n_readings)
+            yield from self._release_outvoted(root, squares, bound, n_readings)
 
-    def _outvoted(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
+    def _release_outvoted(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
         """Lets go of the tag without which most others fit, each and all together."""
         most, outvoted = _OUTVOTE - 1, -1
         for tag in held:
-            lifted, fitting = root.lifted(tag), dict[int, TagKey]()
+            lifted, fitting = root.leave_one_out(tag), dict[int, TagKey]()
             for other, of_map in self._others(root, set()):
                 if len(lifted.by_shift) != len(root.step):  # a tag was seen meanwhile
-                    lifted = root.lifted(tag)
+                    lifted = root.leave_one_out(tag)
                 if root.free_squares([(other, of_map)], lifted) < bound:
                     fitting.setdefault(other, of_map)
-                yield from self._spent(6 * root.prior.n**2 + CALLED)
-            if len(fitting) > most and self._fit(root, fitting, root.lifted(tag)):
+                yield from self._count_work(6 * root.prior.n**2 + CALLED)
+            if len(fitting) > most and self._fit(root, fitting, root.leave_one_out(tag)):
                 most, outvoted = len(fitting), tag
         if outvoted >= 0:
             self._changed = {}  # by a tag that did not stay
@@ -76,7 +76,7 @@ class TagJudge:
 
     def _fit(self, root: OnlineRoot, tags: dict[int, TagKey], lifted: Lifted) -> bool:
         squares = root.free_squares(list(tags.items()), lifted)
-        return squares < _bound(root.prior.n_tags, len(tags))
+        return squares < _chi_square_bound(root.prior.n_tags, len(tags))
 
     def _let_go(self, tag: int, n_readings: int) -> None:
         if tag in self.held and len(self.held) >= _LEAST_HELD:
@@ -88,7 +88,7 @@ class TagJudge:
         del self.maybe[tag]
         self._changed[tag] = n_readings
 
-    def _spent(self, multiplications: int) -> Iterator[None]:
+    def _count_work(self, multiplications: int) -> Iterator[None]:
         """Ends the slice when it is full."""
         self._in_slice += multiplications
         if self._in_slice > SLICE:
@@ -107,6 +107,6 @@ class TagJudge:
 
 
 @lru_cache
-def _bound(n_tags: int, n_together: int) -> float:
+def _chi_square_bound(n_tags: int, n_together: int) -> float:
     """Squared sigmas that tags reach together, where they hang as in the map, once in a hundred drives."""
     return float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2 * n_together))

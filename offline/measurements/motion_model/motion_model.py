@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import chained, se2, wheels
+from groundsbot.calib.geometry import chain_motions, se2, wheels
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 
@@ -105,16 +105,16 @@ class ChainOdometry:
             self.distance_m[steps],
         )
 
-    def weighed(self, noise: NoiseParameters) -> "ChainOdometry":
+    def with_noise(self, noise: NoiseParameters) -> "ChainOdometry":
         """The same motions under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
-    def dead_reckoned(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
+    def dead_reckon(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
         """(K, 3) poses that follow from the motions alone, from `start` (3,) on, with wheel parameters (3,)."""
         motion = self.motion
         if calibration is not None:
             motion = se2.compose(motion, se2.exp(self.jacobian @ calibration))
-        return chained(motion, np.zeros(3) if start is None else start)
+        return chain_motions(motion, np.zeros(3) if start is None else start)
 
 
 def compose_odometry(
@@ -137,7 +137,7 @@ def compose_odometry(
     left_m, right_m = track.at(grid_ns)
     left_m, right_m = np.diff(left_m), np.diff(right_m)
     pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
-    poses = chained(pieces, np.zeros(3))
+    poses = chain_motions(pieces, np.zeros(3))
 
     ends = np.searchsorted(grid_ns, keyframe_stamps_ns)
     step_of_piece = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
@@ -149,14 +149,14 @@ def compose_odometry(
     net_forward_m = _net(0.5 * (left_m + right_m), duration_s, while_of_piece)
     net_turn_rad = np.abs(_net(right_m - left_m, duration_s, while_of_piece)) / track_m
     unit, in_gap = _piece_covariances(net_forward_m, net_turn_rad, duration_s)
-    known = _given(track, grid_ns)
+    known = _logged_covariances(track, grid_ns)
     is_given = np.isfinite(known).all((-1, -2))
     unit[:, is_given] = 0.0
     known[~is_given] = 0.0
     parts = CovarianceParts(
         ODOMETRY_NOISE,
-        np.stack([_summed(_carried(to_step_end, each), ends) for each in unit]),
-        _summed(_carried(to_step_end, in_gap + known), ends)
+        np.stack([_sum_by_step(_carry(to_step_end, each), ends) for each in unit]),
+        _sum_by_step(_carry(to_step_end, in_gap + known), ends)
         + np.diag(_quantisation_variance(track.quantum_m, track_m)),
     )
     tangent = se2.right_tangent_from_coordinates(pieces)
@@ -165,17 +165,17 @@ def compose_odometry(
         motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
         covariance=parts.under(noise),
         parts=parts,
-        jacobian=_summed(to_step_end @ jacobian, ends),
-        distance_m=_summed(np.abs(0.5 * (left_m + right_m)), ends),
+        jacobian=_sum_by_step(to_step_end @ jacobian, ends),
+        distance_m=_sum_by_step(np.abs(0.5 * (left_m + right_m)), ends),
     )
 
 
-def _carried(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
+def _carry(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
     carried: FloatArray = to_step_end @ covariance @ to_step_end.swapaxes(-1, -2)
     return carried
 
 
-def _given(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
+def _logged_covariances(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
     """(N, 3, 3) covariances of pieces as the readings have them, shared out by duration; NaN where they have none."""
     if track.covariance is None:
         return np.full((len(grid_ns) - 1, 3, 3), np.nan)
@@ -241,7 +241,7 @@ def _quantisation_variance(quantum_m: float, track_m: float) -> FloatArray:
     return np.array([wheel / 2.0, wheel / 2.0, 2.0 * wheel / track_m**2])
 
 
-def _summed(values: FloatArray, ends: IntArray) -> FloatArray:
+def _sum_by_step(values: FloatArray, ends: IntArray) -> FloatArray:
     """Sums (N, ...) over the pieces of each step."""
     summed: FloatArray = np.add.reduceat(values, ends[:-1], axis=0)
     return summed

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray, counted
+from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
@@ -41,7 +41,7 @@ def stretches_of(
     if wheels:
         return _encoder_stretches(wheels, robot, log, log_bytes)
     if odometry:
-        return _imported_stretch(odometry, robot, log)
+        return _imported_segment(odometry, robot, log)
     raise OfflineError(
         f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
         "was the encoder port connected? `groundsbot-onboard check` tells"
@@ -67,7 +67,7 @@ def _encoder_stretches(
     for part in np.split(table, cuts):
         ordered, dropped = _strictly_later(part)
         if dropped:
-            warnings.append(f"{counted(dropped, 'wheel reading')} not later than the one before; left out")
+            warnings.append(f"{plural(dropped, 'wheel reading')} not later than the one before; left out")
         # As floats first: counts far enough apart would wrap round in whole numbers.
         ticks = np.asarray(ordered[:, 2:], dtype=np.float64)
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
@@ -76,13 +76,13 @@ def _encoder_stretches(
         stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
     if len(stretches) > 1:
         warnings.append(
-            f"the wheel controller restarted {counted(len(stretches) - 1, 'time')}; the motion in between is unknown, "
+            f"the wheel controller restarted {plural(len(stretches) - 1, 'time')}; the motion in between is unknown, "
             f"so the run has {len(stretches)} stretches that only tags can join"
         )
     return stretches, warnings
 
 
-def _imported_stretch(
+def _imported_segment(
     readings: Sequence[PlanarOdometry], robot: Robot, log: Path
 ) -> tuple[list[WheelTrack], list[str]]:
     warnings: list[str] = []
@@ -103,12 +103,12 @@ def _imported_stretch(
             )
     table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
     if dropped:
-        warnings.append(f"{counted(dropped, 'odometry reading')} not later than the one before; left out")
+        warnings.append(f"{plural(dropped, 'odometry reading')} not later than the one before; left out")
     keep = table[:, 1]
     check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
     covariance, n_bad = given_covariances(readings)
     if n_bad:
-        warnings.append(f"{counted(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
+        warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
     given = covariance[keep] if covariance is not None else None
     return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
 

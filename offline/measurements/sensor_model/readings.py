@@ -9,7 +9,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
-from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenated
+from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenate
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Readings:
         by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= share**2
         return replace(self, by_camera=by_camera)
 
-    def weighed(self, noise: NoiseParameters) -> "Readings":
+    def with_noise(self, noise: NoiseParameters) -> "Readings":
         """The same readings under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
@@ -111,14 +111,14 @@ class Readings:
         )
 
 
-def joined(a: Readings, b: Readings) -> Readings:
+def concatenate_observations(a: Readings, b: Readings) -> Readings:
     """Both, ordered by keyframe."""
     both = Readings(
         np.concatenate([a.keyframe, b.keyframe]),
         np.concatenate([a.tag, b.tag]),
         np.concatenate([a.value, b.value]),
         np.concatenate([a.covariance, b.covariance]),
-        concatenated(a.parts, b.parts),
+        concatenate(a.parts, b.parts),
         np.concatenate([a.by_camera, b.by_camera]),
         np.concatenate([a.polar, b.polar]),
         np.concatenate([a.in_camera, b.in_camera]),

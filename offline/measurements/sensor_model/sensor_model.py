@@ -15,13 +15,13 @@ from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bia
 from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
 from groundsbot.offline.measurements.sensor_model.readings import Readings, no_readings
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
-from groundsbot.offline.measurements.sensor_model.stationary_corners import averaged
+from groundsbot.offline.measurements.sensor_model.stationary_corners import average_corners
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
 from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     FALSE_ALARM,
     UPRIGHT_DOF,
+    are_tilted,
     askew,
-    doubted,
     level_of,
     with_common_turn,
 )
@@ -69,7 +69,7 @@ def read_detections(
         return no_readings(), []
     # A corner that is no number would spoil the mean of its standing pose.
     known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
-    keyframe, tag, corners_px = averaged(
+    keyframe, tag, corners_px = average_corners(
         keyframe[known], detections.tag[known], detections.corners_px[known], detections.stamps_ns[known]
     )
     if not len(tag):
@@ -98,7 +98,7 @@ def read_detections(
         corner_bias_px=bias_px[good],
         corner_sigmas=np.ones(n),
     )
-    return readings, _told(run, tag[is_askew], good)
+    return readings, _warnings(run, tag[is_askew], good)
 
 
 def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArray:
@@ -115,7 +115,7 @@ def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArr
         return np.asarray(found.valid & (range_m > MIN_RANGE_M) & (sure | is_askew))
 
 
-def _told(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
+def _warnings(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
     """Sentences about tags that hang askew, and about readings that are not good."""
     told = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
@@ -145,14 +145,14 @@ def _upright_or_askew(
     sigma = np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
     chi2 = with_common_turn(upright, tag, _mount_axes(run.robot), sigma)
     level = level_of(chi2)
-    is_doubted = np.isin(tag, doubted(tag, chi2 / min(level, 1.0)))
-    general = upright.replaced(
+    is_doubted = np.isin(tag, are_tilted(tag, chi2 / min(level, 1.0)))
+    general = upright.replace(
         is_doubted,
         general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
     )
     is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
     spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
-    found = upright.replaced(is_askew, general.where(is_askew))
+    found = upright.replace(is_askew, general.where(is_askew))
     least_px = sigmas_px.min()
     random = level_of(chi2 * (sigmas_px / least_px) ** 2) * (least_px / sigmas_px) ** 2
     return replace(found, valid=np.asarray(found.valid & ~spoilt)), is_askew, random, tilt_rad

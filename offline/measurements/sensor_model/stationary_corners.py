@@ -5,7 +5,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 
 
-def averaged(
+def average_corners(
     keyframe: IntArray, tag: IntArray, corners_px: FloatArray, stamps_ns: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """One set of corners for each tag and keyframe; for each of several tags with one id that a picture shows.

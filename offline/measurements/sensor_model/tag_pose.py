@@ -71,7 +71,7 @@ class TagReadings:
         """Those of the mask."""
         return TagReadings(*(getattr(self, f.name)[mask] for f in dataclass_fields(self)))
 
-    def replaced(self, mask: BoolArray, others: "TagReadings") -> "TagReadings":
+    def replace(self, mask: BoolArray, others: "TagReadings") -> "TagReadings":
         """These, with those of the mask replaced by others (as many as the mask has)."""
         fields = []
         for mine, theirs in ((getattr(self, f.name), getattr(others, f.name)) for f in dataclass_fields(self)):

@@ -65,7 +65,7 @@ def with_common_turn(found: TagReadings, tag: IntArray, by_mount: FloatArray, si
     return np.where((as_turned < as_filed)[all_tags], turned, found.chi2)
 
 
-def doubted(tag: IntArray, chi2: FloatArray) -> IntArray:
+def are_tilted(tag: IntArray, chi2: FloatArray) -> IntArray:
     """Tags that the upright model does not explain."""
     count, mean = _mean_chi2(tag, chi2)
     dof = UPRIGHT_DOF * np.maximum(count, 1)

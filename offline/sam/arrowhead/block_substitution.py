@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 
@@ -47,7 +47,7 @@ def pieces_of(tree: Tree, system: System, rows: Rows) -> Pieces:
     )  # fmt: skip
 
 
-@jitted
+@njit
 def substitute(pieces: Pieces, vectors: FloatArray, outwards: bool, inside: FloatArray, outside: FloatArray) -> None:
     """Substitutes forward (outwards) or backward, all but the top.
 
@@ -102,7 +102,7 @@ def _out_of_leaf(pieces: Pieces, leaf: int, vectors: FloatArray, inside: FloatAr
             outside[a, c] = 0.0
     _leaf_forward(pieces.pose_rows, pieces.next_rows, first, last, inside)
     _leaf_backward(pieces.pose_rows, pieces.next_rows, first, last, inside)
-    _coupled(pieces, leaf, inside, outside, True)
+    _add_coupling(pieces, leaf, inside, outside, True)
     for a in range(end - start):
         _subtract(vectors, pieces.front[start + a], 1.0, outside, a)
 
@@ -114,7 +114,7 @@ def _into_leaf(pieces: Pieces, leaf: int, vectors: FloatArray, inside: FloatArra
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
     for a in range(end - start):
         _copy(vectors, pieces.front[start + a], outside, a, 1)
-    _coupled(pieces, leaf, inside, outside, False)
+    _add_coupling(pieces, leaf, inside, outside, False)
     _leaf_forward(pieces.pose_rows, pieces.next_rows, first, last, inside)
     _leaf_backward(pieces.pose_rows, pieces.next_rows, first, last, inside)
     _copy(inside, 0, vectors, 3 * first, 3 * (last - first))
@@ -173,7 +173,7 @@ def _leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end
 
 
 @inner
-def _coupled(pieces: Pieces, leaf: int, inside: FloatArray, outside: FloatArray, outwards: bool) -> None:
+def _add_coupling(pieces: Pieces, leaf: int, inside: FloatArray, outside: FloatArray, outwards: bool) -> None:
     """Adds B^T inside to outside (w, k), or takes B outside from inside (3 K, k).
 
     B are the blocks of H between the leaf's poses and its front.

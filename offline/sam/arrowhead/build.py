@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, IntArray
 from groundsbot.offline.sam.arrowhead.preintegration import add_moments, compose
-from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, measured_blocks
+from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Skeleton
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
 from groundsbot.offline.sam.factors.odometry_and_readings import (
@@ -68,7 +68,7 @@ def build_arrowhead(
         prior_sigma=prior.sigma,
         free=free,
         tangent=_tangent_order(columns),
-        measured=measured_blocks(measured, tree, free),
+        measured=prior_blocks(measured, tree, free),
     )
 
 
@@ -88,7 +88,7 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> Odometry:
     return motions
 
 
-def reweighed(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFactors) -> Arrowhead:
+def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFactors) -> Arrowhead:
     """The same factors with the whitenings that these have."""
     own = arrowhead.odometry._replace(
         information=np.empty_like(arrowhead.odometry.information),
@@ -123,7 +123,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
         slots=odometry.slots[begins],
     )
     compose(odometry, index, composed)
-    places = _relaxed(readings)._replace(pose=index[readings.pose])
+    places = _as_places(readings)._replace(pose=index[readings.pose])
     measured = NOTHING_MEASURED if whole.measured is None else whole.measured.factors.among(index)
     chains_in_top, tags_in_top = ends_in_top(measured, chain_start)
     own_tree = build_tree(
@@ -147,7 +147,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
         prior_sigma=whole.prior_sigma,
         free=free,
         tangent=np.arange(3 * n + 2 * tree.n_tags + tree.n_calibration),
-        measured=measured_blocks(measured, own_tree, free),
+        measured=prior_blocks(measured, own_tree, free),
     )
     return Skeleton(own, whole, index)
 
@@ -181,7 +181,7 @@ def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Re
     )
 
 
-def _relaxed(readings: Readings) -> Readings:
+def _as_places(readings: Readings) -> Readings:
     """The same as places (x, y), with the covariance that the reading had there."""
     first, second = readings.value.T
     range_m, cos, sin = np.maximum(first, 1e-6), np.cos(second), np.sin(second)

@@ -43,7 +43,7 @@ class SquareRoot(NamedTuple):
         """Of some of the columns."""
         return SquareRoot(self.top[:, columns], self.below[:, columns] if self.below.shape[0] else self.below)
 
-    def summed(self, columns: sparse.csc_array) -> "SquareRoot":
+    def sum_columns(self, columns: sparse.csc_array) -> "SquareRoot":
         """Of sums of the columns, as a sparse matrix (k, n) has them."""
         below = sparse.csc_array(self.below @ columns) if self.below.shape[0] else self.below
         top = np.empty((len(self.top), columns.shape[1]))

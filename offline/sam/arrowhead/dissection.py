@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import jitted
+from groundsbot.offline.foundation import njit
 
 _LEAF_POSES: Final = 30
 _LEAVES_IN_MIDDLE: Final = 8
@@ -41,12 +41,12 @@ def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
         # A cut is a pose, a separator; those at the chain's ends lie outside of it, or the first one is the top's.
         is_top = chain in in_top
         pose_level[first : first + is_top] = LEVELS - 1
-        cuts = _thinned(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
+        cuts = _thin(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
         for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):
             pose_level[cuts[1:-1]] = level + 1
             n = len(cuts) - 1
             rows.append(np.stack([np.full(n, level), np.full(n, chain), cuts[:-1], cuts[1:]]))
-            cuts = _thinned(cuts, n_joined)
+            cuts = _thin(cuts, n_joined)
     level, chain_of, left, right = np.concatenate(rows, axis=1)
     order = np.lexsort([level, right])
     level, chain_of, left, right = level[order], chain_of[order], left[order], right[order]
@@ -68,13 +68,13 @@ def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
     )
 
 
-def _thinned(cuts: IntArray, n_joined: int) -> IntArray:
+def _thin(cuts: IntArray, n_joined: int) -> IntArray:
     """The first, the last and evenly some between, so that about `n_joined` pieces become one."""
     n = max(1, round((len(cuts) - 1) / n_joined))
     return cuts[(np.arange(n + 1) * (len(cuts) - 1)) // n]
 
 
-@jitted
+@njit
 def nodes_of_poses(level: IntArray, first: IntArray, end: IntArray, pose_level: IntArray) -> IntArray:
     """(P, LEVELS) node of each level that a pose lies in; -1 below the level at which it is eliminated."""
     node_of = np.full((len(pose_level), LEVELS), -1)

@@ -8,14 +8,14 @@ the blocks of H again when needed, so that fill is never stored.
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.leaf_elimination import eliminate_leaf
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 
 
-@jitted
+@njit
 def eliminate(tree: Tree, system: System, damping: float, rows: Rows) -> int:
     """Eliminates all nodes but the top, whose front is left in the workspace.
 

@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.foundation import borrowed, inlined, jitted
+from groundsbot.offline.foundation import borrowed, inline, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.linearisation.kernels import Odometry, Readings, Values, wrapped
+from groundsbot.offline.sam.linearisation.kernels import Odometry, Readings, Values, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
 
 # A reading farther off than this many sigmas is passed over.
@@ -69,7 +69,7 @@ def starting_pass(
     _run(tree, odometry, readings, start, start_variance, known, out)
 
 
-@jitted
+@njit
 def _run(
     tree: Tree,
     odometry: Odometry,
@@ -101,15 +101,15 @@ def _run(
                     _read(readings, m, out.calibration, out.poses[pose], P, turn, out.tags[readings.tag[m]], known)
 
 
-@inlined
+@inline
 def _begin(variance: FloatArray, heading: float, P: FloatArray, turn: FloatArray) -> None:
     turn[0], turn[1] = np.cos(heading), np.sin(heading)
-    P[0], P[1], P[2] = turned((variance[0], 0.0, variance[1]), turn[0], turn[1])
+    P[0], P[1], P[2] = rotate_covariance((variance[0], 0.0, variance[1]), turn[0], turn[1])
     P[3], P[4], P[5] = 0.0, 0.0, variance[2]
 
 
-@inlined
-def turned(C: _Covariance, cos: float, sin: float) -> _Covariance:
+@inline
+def rotate_covariance(C: _Covariance, cos: float, sin: float) -> _Covariance:
     """R C R^T with R the turn."""
     cross = 2.0 * cos * sin * C[1]
     return (
@@ -119,7 +119,7 @@ def turned(C: _Covariance, cos: float, sin: float) -> _Covariance:
     )
 
 
-@inlined
+@inline
 def _predict(
     odometry: Odometry,
     m: int,
@@ -132,11 +132,11 @@ def _predict(
     """T <- T o M(c); P <- F P F^T + noise, where F moves the position by J d times the heading's error."""
     x, y, turned_by, _, _ = motion_at(odometry, m, wheel_correction(odometry, m, calibration))
     dx, dy = turn[0] * x - turn[1] * y, turn[1] * x + turn[0] * y
-    after[0], after[1], after[2] = before[0] + dx, before[1] + dy, wrapped(before[2] + turned_by)
+    after[0], after[1], after[2] = before[0] + dx, before[1] + dy, wrap(before[2] + turned_by)
     cos, sin = np.cos(after[2]), np.sin(after[2])
     turn[0], turn[1] = cos, sin
     C = odometry.covariance[m]
-    xx, xy, yy = turned((C[0, 0], C[0, 1], C[1, 1]), cos, sin)
+    xx, xy, yy = rotate_covariance((C[0, 0], C[0, 1], C[1, 1]), cos, sin)
     P[0], P[1], P[2] = P[0] + xx, P[1] + xy, P[2] + yy
     P[0] += dy * (dy * P[5] - 2.0 * P[3])
     P[1] += dx * P[3] - dy * P[4] - dx * dy * P[5]
@@ -146,7 +146,7 @@ def _predict(
     P[5] += C[2, 2]
 
 
-@inlined
+@inline
 def _read(
     readings: Readings,
     m: int,
@@ -180,7 +180,7 @@ def _read(
             turn[0], turn[1] = np.cos(pose[2]), np.sin(pose[2])
 
 
-@inlined
+@inline
 def _read_from_pose(
     readings: Readings, m: int, calibration: FloatArray, cos: float, sin: float
 ) -> tuple[float, float, _Covariance]:
@@ -200,10 +200,10 @@ def _read_from_pose(
         -inverse * (W[1, 1] * W[1, 0] + W[0, 1] * W[0, 0]),
         inverse * (W[1, 0] * W[1, 0] + W[0, 0] * W[0, 0]),
     )
-    return cos * x - sin * y, sin * x + cos * y, turned(noise, cos * c - sin * s, sin * c + cos * s)
+    return cos * x - sin * y, sin * x + cos * y, rotate_covariance(noise, cos * c - sin * s, sin * c + cos * s)
 
 
-@inlined
+@inline
 def _of_place(P: FloatArray, x: float, y: float) -> _Covariance:
     """Covariance of what lies at (x, y) from the pose and moves with it."""
     return (
@@ -213,18 +213,18 @@ def _of_place(P: FloatArray, x: float, y: float) -> _Covariance:
     )
 
 
-@inlined
+@inline
 def _sum(A: _Covariance, B: _Covariance) -> _Covariance:
     return A[0] + B[0], A[1] + B[1], A[2] + B[2]
 
 
-@inlined
+@inline
 def _place(tag: FloatArray, V: FloatArray, x: float, y: float, C: _Covariance) -> None:
     tag[0], tag[1] = x, y
     V[0], V[1], V[2] = C
 
 
-@inlined
+@inline
 def _correct(
     pose: FloatArray, P: FloatArray, H: tuple[float, float], S: _Covariance, off_x: float, off_y: float
 ) -> None:

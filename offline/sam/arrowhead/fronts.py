@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS, Pieces
 
 
@@ -25,7 +25,7 @@ class Fronts(NamedTuple):
     calibration_at: IntArray
 
 
-@jitted
+@njit
 def fronts_of(
     pieces: Pieces,
     separators: Lists,
@@ -87,7 +87,7 @@ def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
     return at + 3
 
 
-@jitted
+@njit
 def places_of(
     parent: IntArray,
     children: IntArray,
@@ -121,7 +121,7 @@ def places_of(
     return up, reading_at
 
 
-@jitted
+@njit
 def homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_tag: IntArray, n_tags: int) -> IntArray:
     """(T,) the lowest node above the leaves in which all readings of a tag lie."""
     common = np.full((n_tags, LEVELS), -2)
@@ -140,7 +140,7 @@ def homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_t
     return home
 
 
-@jitted
+@njit
 def tags_in_nodes(
     node_of: IntArray, reading_pose: IntArray, reading_tag: IntArray, home: IntArray
 ) -> tuple[IntArray, IntArray]:

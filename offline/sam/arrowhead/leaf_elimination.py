@@ -29,7 +29,7 @@ def eliminate_leaf(tree: Tree, system: System, damping: float, leaf: int, rows: 
         failed = _square_root(block, U)
         if failed >= 0:
             return int(3 * pose + failed)
-        _solve_transposed(U, now, width)
+        _solve_transpose(U, now, width)
         if pose + 1 < end or tree.right[leaf] >= 0:
             _solve_next(U, system.pose_next[pose], Z)
             _carry_on(U, Z, now, width, carried, following)
@@ -118,7 +118,7 @@ def _square_root(block: FloatArray, U: FloatArray) -> int:
 
 
 @inner
-def _solve_transposed(U: FloatArray, B: FloatArray, width: int) -> None:
+def _solve_transpose(U: FloatArray, B: FloatArray, width: int) -> None:
     """B <- U^-T B for the first columns of B (3, w)."""
     u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
     for a in range(width):

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
@@ -80,7 +80,7 @@ def _of_front(tree: Tree, rows: Rows, node: int, left: FloatArray) -> FloatArray
     return covariance
 
 
-@jitted
+@njit
 def _add_leaf(
     tree: Tree,
     system: System,

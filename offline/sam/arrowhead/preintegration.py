@@ -8,12 +8,12 @@ factors of Lupton and Sukkarieh, "Visual-inertial-aided navigation for high-dyna
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
-from groundsbot.offline.sam.linearisation.kernels import Odometry, multiply, wrapped
+from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.sam.linearisation.kernels import Odometry, multiply, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
 
 
-@jitted
+@njit
 def add_moments(odometry: Odometry, whitening: FloatArray) -> None:
     """Sets information W^T W and covariance (M, 3, 3) of each motion."""
     for m in range(len(whitening)):
@@ -37,7 +37,7 @@ def _invert(A: FloatArray, out: FloatArray) -> None:
             out[j, i] = out[i, j]
 
 
-@jitted
+@njit
 def compose(odometry: Odometry, index: IntArray, out: Odometry) -> None:
     """Composes the motions from each kept pose to the next: M_1 o M_2 o ... with covariance and derivatives.
 
@@ -94,11 +94,11 @@ def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, 
             blocks[1, i, j] = product[i, j] + odometry.jacobian[m, i, j]
     c, s = motion[3], motion[4]
     motion[0], motion[1] = motion[0] + c * x - s * y, motion[1] + s * x + c * y
-    motion[2] = wrapped(motion[2] + turn)
+    motion[2] = wrap(motion[2] + turn)
     motion[3], motion[4] = c * cos - s * sin, s * cos + c * sin
 
 
-@jitted
+@njit
 def expand(
     odometry: Odometry, index: IntArray, composed: Odometry, kept: FloatArray, calibration: FloatArray, out: FloatArray
 ) -> None:
@@ -142,7 +142,7 @@ def expand(
             give_x = C[0, 0] * along + C[0, 1] * across + C[0, 2] * here
             give_y = C[1, 0] * along + C[1, 1] * across + C[1, 2] * here
             T[0], T[1] = x + cos * give_x - sin * give_y, y + sin * give_x + cos * give_y
-            T[2] = wrapped(theta + C[2, 0] * along + C[2, 1] * across + C[2, 2] * here)
+            T[2] = wrap(theta + C[2, 0] * along + C[2, 1] * across + C[2, 2] * here)
 
 
 @inner
@@ -153,7 +153,7 @@ def _pull(composed: Odometry, at: int, kept: FloatArray, calibration: FloatArray
     c, s = np.cos(before[2]), np.sin(before[2])
     dx, dy = after[0] - before[0], after[1] - before[1]
     dx, dy = c * dx + s * dy - x, c * dy - s * dx - y
-    dx, dy, turned = cos * dx + sin * dy, cos * dy - sin * dx, wrapped(after[2] - before[2] - turn)
+    dx, dy, turned = cos * dx + sin * dy, cos * dy - sin * dx, wrap(after[2] - before[2] - turn)
     L = composed.information[at]
     along = L[0, 0] * dx + L[0, 1] * dy + L[0, 2] * turned
     across = L[1, 0] * dx + L[1, 1] * dy + L[1, 2] * turned

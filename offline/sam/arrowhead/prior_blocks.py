@@ -41,16 +41,16 @@ class MeasuredBlocks:
     known_at: IntArray
 
     @cached_property
-    def known_information(self) -> FloatArray:
+    def map_information(self) -> FloatArray:
         """(2 K + C, 2 K + C) of a map's tags and calibration."""
         whitening = self.factors.known.whitening
         return whitening.T @ whitening
 
     @cached_property
-    def known_across(self) -> FloatArray:
+    def coupling_of_tags(self) -> FloatArray:
         """(2 K, 2 K) of it, what couples different tags."""
         n = 2 * len(self.factors.known.tags)
-        across = self.known_information[:n, :n].copy()
+        across = self.map_information[:n, :n].copy()
         each = np.arange(n // 2)
         across.reshape(n // 2, 2, n // 2, 2)[each, :, each, :] = 0.0
         return across
@@ -70,11 +70,11 @@ class MeasuredBlocks:
         _add_squares(system.tag, ends.tag_b, blocks[3])
         system.distance[:] = np.concatenate(blocks, axis=-1).reshape(-1, 2, 5)
         _add_gradient(system, self.ends.reshape(-1, 10), system.distance.reshape(-1, 1, 10), distances.residual)
-        return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_known(state, system)
+        return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_map_prior(state, system)
 
-    def _add_known(self, state: State, system: System) -> float:
+    def _add_map_prior(self, state: State, system: System) -> float:
         """Adds a map's tags and calibration but for what couples tags; returns the sum of squares."""
-        known, information = self.factors.known, self.known_information
+        known, information = self.factors.known, self.map_information
         n, each = 2 * len(known.tags), np.arange(len(known.tags))
         numbers = self.columns.calibration[known.calibration]
         system.tag[known.tags] += information[:n, :n].reshape(len(each), 2, len(each), 2)[each, :, each, :]
@@ -93,17 +93,17 @@ class MeasuredBlocks:
         products = system.distance[:, 0, :, None] * system.distance[:, 1, None, :]
         np.add.at(front, (np.minimum(first, second), np.maximum(first, second)), products)
         row, column = np.nonzero(self.known_at[:, None] < self.known_at)
-        front[self.known_at[row], self.known_at[column]] += self.known_across[row, column]
+        front[self.known_at[row], self.known_at[column]] += self.coupling_of_tags[row, column]
 
     def add_product(self, system: System, x: FloatArray, y: FloatArray) -> None:
         """Adds to y what distances couple, times x."""
         along = (system.distance * x[self.ends]).sum(axis=-1)
         np.add.at(y, self.ends, system.distance * along[:, ::-1, None])
         tags = self.columns.tags[self.factors.known.tags].reshape(-1)
-        y[tags] += self.known_across @ x[tags]
+        y[tags] += self.coupling_of_tags @ x[tags]
 
 
-def measured_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | None:
+def prior_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | None:
     """Lays out what was measured; None where nothing was."""
     if not len(factors):
         return None

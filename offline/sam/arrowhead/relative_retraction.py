@@ -9,12 +9,12 @@ its start: odometry then follows its linear model all but exactly, and what is l
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import inner, jitted
+from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam.linearisation.kernels import Values
 
 
-@jitted
-def rolled(
+@njit
+def retract_relative(
     values: Values, step: FloatArray, anchor: IntArray, chain_start: IntArray, moved: Values, out: Values
 ) -> None:
     """Lays the chains out anew.

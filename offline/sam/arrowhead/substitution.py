@@ -3,12 +3,12 @@
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
 from groundsbot.offline.sam.linearisation.blocks import Rows, System
 
 
-@jitted
+@njit
 def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
@@ -32,7 +32,7 @@ def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
                 vector[columns[a]] -= R[k, a] * value
 
 
-@jitted
+@njit
 def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
     """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
@@ -73,7 +73,7 @@ def _rows_of(tree: Tree, node: int, rows: Rows) -> FloatArray:
     return rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape((n, size))
 
 
-@jitted
+@njit
 def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
     """Takes inside (K, 3) to A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
     first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
@@ -104,7 +104,7 @@ def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
         inside[k, 0], inside[k, 1], inside[k, 2] = x0, x1, x2
 
 
-@jitted
+@njit
 def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
     """Adds to outside (w,) B^T inside, with B the blocks of H between the leaf's poses and its front."""
     first, end = tree.first[leaf], tree.end[leaf]
@@ -154,7 +154,7 @@ def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, i
             inside[pose - first, i] = rest
 
 
-@jitted
+@njit
 def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
     """H x, in the arrowhead's order."""
     y = np.zeros(len(x))

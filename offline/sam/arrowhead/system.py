@@ -19,7 +19,7 @@ from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.preintegration import expand
 from groundsbot.offline.sam.arrowhead.prior_blocks import MeasuredBlocks
-from groundsbot.offline.sam.arrowhead.relative_retraction import rolled
+from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
@@ -76,22 +76,22 @@ class Arrowhead:
         linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
         return system, 0.5 * total
 
-    def moved(self, state: State, step: FloatArray, anchor: IntArray) -> State:
+    def retract(self, state: State, step: FloatArray, anchor: IntArray) -> State:
         """The state after a step in the arrowhead's order; tags move along with their anchor poses (T,)."""
         tree = self.tree
         values = Values(state.poses, state.tags, state.calibration)
         out = Values(np.empty_like(state.poses), np.empty_like(state.tags), state.calibration.copy())
-        linearise_kernels.moved(values, step, anchor, out)
+        linearise_kernels.retract(values, step, anchor, out)
         is_free = self.free.calibration >= 0
         out.calibration[is_free] += step[len(step) - tree.n_calibration :]
         return State(*out)
 
-    def rolled(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
+    def retract_relative(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
         """The state after the same step as `moved`, taken motion by motion along each chain."""
         values = Values(before.poses, before.tags, before.calibration)
         by_pose = Values(moved.poses, moved.tags, moved.calibration)
         out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
-        rolled(values, step, anchor, self.tree.chain_start, by_pose, out)
+        retract_relative(values, step, anchor, self.tree.chain_start, by_pose, out)
         return State(*out)
 
     @cached_property
@@ -273,29 +273,31 @@ class Skeleton:
             state: its calibration counts, and the pose at the start of each chain.
             start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
         """
-        own, start = self.arrowhead, self._kept(state)
+        own, start = self.arrowhead, self._select(state)
         values = Values(start.poses, start.tags, start.calibration)
         out = Values(np.empty_like(start.poses), np.empty_like(start.tags), np.empty_like(start.calibration))
         starting_pass(own.tree, own.odometry, own.readings, values, np.square(start_sigma), out)
-        return self._expanded(State(*out))
+        return self._expand(State(*out))
 
-    def relaxed(self, state: State, anchor: IntArray, steps: int) -> State:
+    def solve(self, state: State, anchor: IntArray, steps: int) -> State:
         """The state after some Gauss-Newton steps.
 
         Raises:
             UnderDeterminedError: something is not tied down; the column is the skeleton's.
         """
-        kept, own = self._kept(state), self.arrowhead
+        kept, own = self._select(state), self.arrowhead
         system, _, rows = own.scratch
         for _ in range(steps):
             own.linearise(kept, out=system)
-            kept = own.moved(kept, -own.factorise(system, out=rows).solve_in_order(system.gradient), self.index[anchor])
-        return self._expanded(kept)
+            kept = own.retract(
+                kept, -own.factorise(system, out=rows).solve_in_order(system.gradient), self.index[anchor]
+            )
+        return self._expand(kept)
 
-    def _kept(self, state: State) -> State:
+    def _select(self, state: State) -> State:
         return State(state.poses[self.index >= 0], state.tags, state.calibration)
 
-    def _expanded(self, kept: State) -> State:
+    def _expand(self, kept: State) -> State:
         poses = np.empty((len(self.index), 3))
         expand(self.whole.odometry, self.index, self.arrowhead.odometry, kept.poses, kept.calibration, poses)
         return State(poses, kept.tags, kept.calibration)

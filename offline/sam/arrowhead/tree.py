@@ -116,9 +116,9 @@ def build_tree(couplings: Couplings) -> Tree:
     home = homes_of_tags(node_of, n_nodes - 1, reading_pose, reading_tag, couplings.n_tags)
     home[couplings.top_tags] = n_nodes - 1
     inner_poses = np.flatnonzero(pieces.pose_level > 0)
-    separators = _grouped(node_of[inner_poses, pieces.pose_level[inner_poses]], inner_poses, n_nodes)
-    tags = _grouped(home, np.arange(couplings.n_tags), n_nodes)
-    shared_tags = _grouped(*tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
+    separators = _group(node_of[inner_poses, pieces.pose_level[inner_poses]], inner_poses, n_nodes)
+    tags = _group(home, np.arange(couplings.n_tags), n_nodes)
+    shared_tags = _group(*tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
     slots = Lists(couplings.slot_start, couplings.slots)
     n_poses = int(chain_start[-1])
     fronts = fronts_of(pieces, separators, tags, shared_tags, slots, n_poses, couplings.n_tags, couplings.n_free)
@@ -168,7 +168,7 @@ def _places(
     return up, reading_at
 
 
-def _grouped(node: IntArray, values: IntArray, n_nodes: int) -> Lists:
+def _group(node: IntArray, values: IntArray, n_nodes: int) -> Lists:
     """Values by node, order kept."""
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
     return Lists(start, values[np.argsort(node, kind="stable")])

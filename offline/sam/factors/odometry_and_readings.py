@@ -100,7 +100,7 @@ class OdometryFactors:
             ),
         )
 
-    def expected(self, state: State) -> FloatArray:
+    def predict(self, state: State) -> FloatArray:
         """M(c), (M, 3): the motions by the wheels as the calibration has them."""
         return se2.compose(self.motion, se2.exp(self._twist(state)))
 
@@ -112,7 +112,7 @@ class OdometryFactors:
 
     def _error(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
         moved = se2.between(state.poses[self.first], state.poses[self.first + 1])
-        return se2.log(se2.between(self.expected(state), moved)), moved, self._twist(state)
+        return se2.log(se2.between(self.predict(state), moved)), moved, self._twist(state)
 
     def _twist(self, state: State) -> FloatArray:
         return _times(self.jacobian, state.calibration[self.parameters])
@@ -160,10 +160,10 @@ class ReadingFactors:
         # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
         by_pose = np.zeros((len(self.pose), 2, 3))
         by_pose[..., :2] = -by_base
-        by_pose[..., 2] = _times(by_base, _turned_right(in_base))
+        by_pose[..., 2] = _times(by_base, _rotate_right(in_base))
         by_mount = np.zeros((len(self.pose), 2, 3))
         by_mount[..., :2] = -by_base
-        by_mount[..., 2] = _times(outer, _turned_right(in_sensor))
+        by_mount[..., 2] = _times(outer, _rotate_right(in_sensor))
         by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
         return Linearised(
             _times(self.whitening, self._difference(in_sensor, state)),
@@ -176,7 +176,7 @@ class ReadingFactors:
             ),
         )
 
-    def taken_for(self, reading: int, tags: IntArray) -> "ReadingFactors":
+    def with_other_tags(self, reading: int, tags: IntArray) -> "ReadingFactors":
         """One of the readings, once for each of some tags (K,), as if it were of that tag."""
         columns = {each.name: getattr(self, each.name)[np.full(len(tags), reading)] for each in fields(self)}
         return ReadingFactors(**{**columns, "tag": tags})
@@ -188,7 +188,7 @@ class ReadingFactors:
 
     def places_in_map(self, state: State) -> FloatArray:
         """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""
-        value = self._corrected(state)
+        value = self._correct(state)
         first, second = value.T
         in_sensor = np.where(
             self.polar[:, None], np.stack([first * np.cos(second), first * np.sin(second)], axis=-1), value
@@ -204,13 +204,13 @@ class ReadingFactors:
         scale = 1.0 + state.calibration[self.scale_parameter]
         return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
 
-    def _corrected(self, state: State) -> FloatArray:
+    def _correct(self, state: State) -> FloatArray:
         """(M, 2) what would have been read with the camera as the calibration has it."""
         return self.value + _times(self.by_camera, state.calibration[self.camera_parameters])
 
     def _difference(self, in_sensor: FloatArray, state: State) -> FloatArray:
         x, y = in_sensor[:, 0], in_sensor[:, 1]
-        first, second = self._corrected(state).T
+        first, second = self._correct(state).T
         turned = se2.wrap_angle(np.arctan2(y, x) - second)
         return np.stack(
             [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
@@ -249,7 +249,7 @@ class CalibrationPrior:
         return Linearised(self.residual(state), ((columns.calibration[:, None], weight[:, None, None]),))
 
 
-def stacked(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
+def stack(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
     """One sparse Jacobian (m, n), columns in no order within its rows, and its residuals (m,)."""
     values, columns, counts, residuals = [], [], [np.zeros(1, dtype=np.int64)], []
     for kind in kinds:
@@ -281,6 +281,6 @@ def _rotation(theta: FloatArray) -> FloatArray:
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
 
 
-def _turned_right(vectors: FloatArray) -> FloatArray:
+def _rotate_right(vectors: FloatArray) -> FloatArray:
     """(M, 2) turned by a quarter to the right: the derivative of R(a)^T v by a."""
     return np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1)

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import inlined, inner, jitted
+from groundsbot.offline.foundation import inline, inner, njit
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
@@ -41,7 +41,7 @@ def huber(threshold: float) -> Loss:
     return Loss(_HUBER, threshold)
 
 
-def curved(loss: Loss) -> Loss:
+def with_curvature(loss: Loss) -> Loss:
     """The same loss with the matrix of its steps as near to its second derivative as leaves it a square root.
 
     By weights alone each step leaves over a share of the way, nearly all of it where many readings lie beyond the
@@ -60,7 +60,7 @@ def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
     return loss.threshold * (2.0 * length - loss.threshold), loss.threshold / length
 
 
-@inlined
+@inline
 def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
     """Scales (2,) r up and (2, n) J down along r where the loss curves less there, so that J' r stays the same."""
     if loss.least_curvature == 1.0 or square <= loss.threshold * loss.threshold:
@@ -75,7 +75,7 @@ def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
     r[1] /= share
 
 
-@jitted
+@njit
 def losses_and_weights(loss: Loss, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(M,) losses and (M,) weights of whitened residuals (M, n)."""
     losses, weights = np.empty(len(residual)), np.empty(len(residual))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.foundation import inlined, inner, jitted
+from groundsbot.offline.foundation import inline, inner, njit
 from groundsbot.offline.sam.linearisation.blocks import System
 
 
@@ -70,7 +70,7 @@ class Readings(NamedTuple):
     slots: IntArray
 
 
-@jitted
+@njit
 def clear(system: System) -> None:
     """All zero, but for what is overwritten anyway."""
     for blocks in (system.pose, system.pose_next, system.pose_calibration, system.tag, system.tag_calibration):
@@ -79,7 +79,7 @@ def clear(system: System) -> None:
     system.gradient[:] = 0.0
 
 
-@jitted
+@njit
 def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: System) -> None:
     """What is held gets a one on the diagonal and nothing else: its step is zero."""
     n_poses = len(free.poses)
@@ -113,7 +113,7 @@ def _hold_one(block: FloatArray, i: int) -> None:
 
 
 @inner
-def wrapped(angle: float) -> float:
+def wrap(angle: float) -> float:
     """In [-pi, pi]."""
     return float(angle - 2.0 * np.pi * np.rint(angle * (0.5 / np.pi)))
 
@@ -152,17 +152,17 @@ def multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@inlined
+@inline
 def advance(pose: FloatArray, d0: float, d1: float, omega: float, out: FloatArray) -> None:
     """Out <- T o exp(d) of a pose (3,)."""
     along, even, _ = series(omega)
     across = omega * even
     x, y = along * d0 - across * d1, across * d0 + along * d1
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    out[0], out[1], out[2] = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrapped(pose[2] + omega)
+    out[0], out[1], out[2] = pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrap(pose[2] + omega)
 
 
-@inlined
+@inline
 def go_along(
     tag: FloatArray,
     before: FloatArray,
@@ -186,8 +186,8 @@ def go_along(
     out[0], out[1] = after[0] + cos * x - sin * y, after[1] + sin * x + cos * y
 
 
-@jitted
-def moved(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
+@njit
+def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
     """`solver.Problem.moved` with a step in the arrowhead's order; calibration apart."""
     n_poses = len(values.poses)
     for pose in range(n_poses):
@@ -201,7 +201,7 @@ def moved(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> No
         )  # fmt: skip
 
 
-@jitted
+@njit
 def diagonal_square(system: System, step: FloatArray) -> float:
     """step^T diag(H) step."""
     total = 0.0

@@ -8,10 +8,10 @@ Small matrices travel as tuples, row by row; of symmetric ones the upper triangl
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, jitted
+from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import System
-from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Values, half_angle_cotangent, series, wrapped
+from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Values, half_angle_cotangent, series, wrap
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]
@@ -19,7 +19,7 @@ _Upper = tuple[float, float, float, float, float, float]
 _Square = tuple[float, float, float, float, float, float, float, float, float]
 
 
-@jitted
+@njit
 def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, system: System) -> float:
     """Adds all odometry factors to the blocks; returns the sum of their losses."""
     odometry, values, free, system = borrowed(odometry), borrowed(values), borrowed(free), borrowed(system)
@@ -43,14 +43,14 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
         rho, w = loss_and_weight(loss, e[0] * f[0] + e[1] * f[1] + e[2] * f[2])
         total += rho
         L, f = (w * L[0], w * L[1], w * L[2], w * L[3], w * L[4], w * L[5]), (w * f[0], w * f[1], w * f[2])
-        M = _transposed_times(J, L)
+        M = _transpose_times(J, L)
         H = _times_jacobian(M, J)
         A = (cos, sin, sin * x - cos * y, cos * x + sin * y)
         _add_blocks(system, i, H, A)
         _add_gradient(system.gradient, 3 * i, f, J, A)
         if odometry.slots[m, 0] >= 0 or odometry.slots[m, 1] >= 0 or odometry.slots[m, 2] >= 0:
             error_by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
-            _unpacked(M, L, A, f, scratch)
+            _unpack(M, L, A, f, scratch)
             _add_wheels(odometry, m, free, scratch, system)
     return total
 
@@ -88,7 +88,7 @@ def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, floa
 @inner
 def error_of(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
     """log(motion^-1 o moved), and (a, b, p, q) of Jr^-1 with the rows (a, -b, p), (b, a, q), (0, 0, 1)."""
-    dx, dy, omega = x - motion[0], y - motion[1], wrapped(turn - motion[2])
+    dx, dy, omega = x - motion[0], y - motion[1], wrap(turn - motion[2])
     cos, sin = motion[3], motion[4]
     away_x, away_y = cos * dx + sin * dy, cos * dy - sin * dx
     half, cotangent = 0.5 * omega, half_angle_cotangent(omega)
@@ -120,7 +120,7 @@ def _times_vector(L: _Upper, e: _Three) -> _Three:
 
 
 @inner
-def _transposed_times(J: _Four, L: _Upper) -> _Square:
+def _transpose_times(J: _Four, L: _Upper) -> _Square:
     """J^T L."""
     a, b, p, q = J
     return (
@@ -224,7 +224,7 @@ def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray
 
 
 @inner
-def _unpacked(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
+def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
     """Into arrays: M, L, A and, in the first row of the fourth, f."""
     for k in range(3):
         scratch[0, 0, k], scratch[0, 1, k], scratch[0, 2, k] = M[k], M[3 + k], M[6 + k]

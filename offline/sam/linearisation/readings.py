@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
-from groundsbot.offline.foundation import borrowed, inlined, inner, jitted
+from groundsbot.offline.foundation import borrowed, inline, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import System
 from groundsbot.offline.sam.linearisation.kernels import Free, Readings, Values
@@ -16,7 +16,7 @@ _N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
 N_READING: Final = 5 + _N_PARAMETERS  # what a reading depends on: pose and tag before them
 
 
-@jitted
+@njit
 def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, system: System) -> float:
     """Adds all tag readings to the blocks; returns the sum of their losses.
 
@@ -88,7 +88,7 @@ def _add_calibration(
         system.gradient[base + column] += j0 * r[0] + j1 * r[1]
 
 
-@inlined
+@inline
 def reading_factor(
     readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
@@ -105,7 +105,7 @@ def reading_factor(
     c, s = np.cos(yaw), np.sin(yaw)
     x = (c * (base_x - mount_x) + s * (base_y - mount_y)) / scale
     y = (c * (base_y - mount_y) - s * (base_x - mount_x)) / scale
-    first, second = _corrected(readings, m, values)
+    first, second = _correct(readings, m, values)
     W = readings.whitening[m]
     o00, o01, o10, o11 = W[0, 0], W[0, 1], W[1, 0], W[1, 1]
     if readings.polar[m]:
@@ -136,8 +136,8 @@ def reading_factor(
                 J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
 
 
-@inlined
-def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float]:
+@inline
+def _correct(readings: Readings, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
     first, second = readings.value[m, 0], readings.value[m, 1]
     for k in range(_N_CAMERA):
@@ -148,7 +148,7 @@ def _corrected(readings: Readings, m: int, values: Values) -> tuple[float, float
     return first, second
 
 
-@jitted
+@njit
 def add_priors(sigma: FloatArray, values: Values, free: Free, system: System) -> float:
     """Adds r = c / sigma for all free calibration; returns the sum of squares, held ones included."""
     base = len(system.gradient) - len(system.calibration)

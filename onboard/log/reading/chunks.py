@@ -104,7 +104,7 @@ class ChunkReader:
                 if record is None:
                     return
                 if record.opcode == Opcode.CHUNK:
-                    chunk = self._uncompressed(record.content)
+                    chunk = self._uncompress(record.content)
                     self.n_chunks += 1
                     self.offset = record.following
                     yield chunk
@@ -194,7 +194,7 @@ class ChunkReader:
                 return None
             before = self._unfolded, self._unfolded_drawn, self._allowance.unfolded_bytes
             try:
-                self._uncompressed(content)
+                self._uncompress(content)
             except _BadRecordError as bad:
                 if bad.foreign:
                     return offset
@@ -232,7 +232,7 @@ class ChunkReader:
         (data_bytes,) = U64.unpack_from(window, position + U32.size + name_bytes)
         return bool(data_bytes == length - _SMALLEST_CHUNK_BYTES - name_bytes)
 
-    def _uncompressed(self, content: bytes) -> bytes:
+    def _uncompress(self, content: bytes) -> bytes:
         """A chunk's records; the stream stands at its end."""
         try:
             _, _, size, crc = CHUNK_HEAD.unpack_from(content)
@@ -243,13 +243,13 @@ class ChunkReader:
         data = content[position + U64.size :]
         if len(data) != length:  # more would hide what follows
             raise _BadRecordError(f"a chunk is damaged: holds {len(data)} bytes, not the {length} it claims")
-        self._take_unfolded(size)
-        data = _decompressed(data, compression, size)
+        self._check_size(size)
+        data = _decompress(data, compression, size)
         if len(data) != size or crc == 0 or zlib.crc32(data) != crc:
             raise _BadRecordError("a chunk is damaged: its checksum does not fit")
         return data
 
-    def _take_unfolded(self, size: int) -> None:
+    def _check_size(self, size: int) -> None:
         """Refuses a chunk that unfolds to more than the file is worth up to here and the allowance still gives."""
         worth = _UNFOLDED_SHARE * self._stream.tell()
         limit = min(RECORD_LIMIT_BYTES, worth + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
@@ -273,7 +273,7 @@ class ChunkReader:
 _READ_WHOLE: Final = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 
 
-def _decompressed(data: bytes, compression: str, size: int) -> bytes:
+def _decompress(data: bytes, compression: str, size: int) -> bytes:
     if not compression:
         return data
     if compression != "zstd":
@@ -292,18 +292,18 @@ def _check_form(opcode: int, content: bytes) -> None:
         return
     try:
         if opcode == Opcode.MESSAGE_INDEX:
-            end = _counted(content, U16.size)
+            end = _end_of_prefixed(content, U16.size)
         elif opcode == Opcode.HEADER:
             end = read_text(content, read_text(content, 0)[1])[1]
         else:  # a schema or a channel outside a chunk is somebody else's
             start = U16.size if opcode == Opcode.SCHEMA else 2 * U16.size
-            end = _counted(content, read_text(content, read_text(content, start)[1])[1])
+            end = _end_of_prefixed(content, read_text(content, read_text(content, start)[1])[1])
     except (struct.error, UnicodeDecodeError):
         end = -1
     if end != len(content):
         raise _BadRecordError("a record's length does not fit its content")
 
 
-def _counted(content: bytes, position: int) -> int:
+def _end_of_prefixed(content: bytes, position: int) -> int:
     """Where the bytes end that have their number before them."""
     return int(position + U32.size + U32.unpack_from(content, position)[0])

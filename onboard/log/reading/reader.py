@@ -74,7 +74,7 @@ def read_log(
     if not core and not pictures:
         raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
     _check_same_run([*core[:1], *pictures[:1]], allowance)
-    streams = [_joined(files, topics, losses, allowance) for files in (core, pictures) if files]
+    streams = [_join_files(files, topics, losses, allowance) for files in (core, pictures) if files]
     yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
 
 
@@ -152,7 +152,7 @@ def _reasons(losses: LogLosses | None) -> str:
     return "; ".join((losses or LogLosses()).lines())
 
 
-def _joined(
+def _join_files(
     files: list[Path], topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
 ) -> Iterator[LogMessage]:
     """The messages of files in their order. A disk that failed may leave the same ones at a seam twice."""
@@ -253,8 +253,8 @@ def _messages(
         if only_first:
             return
     if not reader.is_finished:
-        losses.add_unfinished(path, reader.end_offset)
+        losses.add_missing_end(path, reader.end_offset)
     elif reader.summary is not None and reader.summary.n_chunks is not None:
         losses.add_lost_chunks(path, reader.summary.n_chunks - reader.n_chunks)
     if reader.n_chunks == 0:
-        losses.add_nothing_found(path)
+        losses.add_empty_file(path)

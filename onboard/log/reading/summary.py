@@ -45,10 +45,10 @@ def read_summary(stream: BinaryIO, size: int, limit_bytes: int) -> Summary | Non
     stream.seek(start - _DATA_END_BYTES)
     if RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size)) != (Opcode.DATA_END, U32.size):
         return None
-    return _parsed(data, start - _DATA_END_BYTES)
+    return _parse(data, start - _DATA_END_BYTES)
 
 
-def _parsed(data: bytes, data_end: int) -> Summary | None:
+def _parse(data: bytes, data_end: int) -> Summary | None:
     declarations = []
     n_messages = n_chunks = None
     position = 0

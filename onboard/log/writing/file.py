@@ -67,7 +67,7 @@ class LogFile:
         )
         self._finished = False
         self._writer.start(profile="", library="groundsbot")
-        self._channels = {name: self._declared(name) for name in topics}
+        self._channels = {name: self._channel_of(name) for name in topics}
 
     @property
     def active_path(self) -> Path:
@@ -127,7 +127,7 @@ class LogFile:
         self._sink.close()
         self._storage.remove(self.active_path)
 
-    def _declared(self, name: str) -> int:
+    def _channel_of(self, name: str) -> int:
         schema = register_schema(self._writer, TOPICS[name].schema)
         return self._writer.register_channel(name, MessageEncoding.Protobuf, schema)
 

@@ -113,7 +113,7 @@ class LogSegments:
 
     def commit(self) -> None:
         """Writes all that was appended, in whole chunks."""
-        for file in self._unfinished():
+        for file in self._unfinished_files():
             file.commit()
 
     def sync(self) -> None:
@@ -121,7 +121,7 @@ class LogSegments:
         while self._new_in:
             self._storage.sync_folder(next(iter(self._new_in)))
             self._new_in.pop()
-        for file in self._unfinished():
+        for file in self._unfinished_files():
             file.sync()
 
     def finish_a_full_one(self) -> None:
@@ -138,7 +138,7 @@ class LogSegments:
 
     def abandon(self) -> list[Record]:
         """Leaves the files as they stand, called `.active`; returns the records that are not safe in them."""
-        unsafe = list(heapq.merge(*(file.unsafe for file in self._unfinished()), key=attrgetter("log_time_ns")))
+        unsafe = list(heapq.merge(*(file.unsafe for file in self._unfinished_files()), key=attrgetter("log_time_ns")))
         self._close_all(LogFile.abandon)
         return unsafe
 
@@ -147,7 +147,7 @@ class LogSegments:
         self._close_all(LogFile.discard)
 
     def _close_all(self, close: Callable[[LogFile], None]) -> None:
-        self._close(close, self._unfinished())
+        self._close(close, self._unfinished_files())
         self._full, self._new_in = [], set()
         self._replace_files({})
 
@@ -156,7 +156,7 @@ class LogSegments:
             with suppress(OSError):
                 close(file)
 
-    def _unfinished(self) -> list[LogFile]:
+    def _unfinished_files(self) -> list[LogFile]:
         return [*self._full, *self._files.values()]
 
     def _replace_files(self, files: dict[Path, LogFile]) -> None:

@@ -90,7 +90,7 @@ class LogWriter:
         store = storage or Disk(durable)
         files = single_file(store, path) if path.suffix == ".mcap" else files_of_run(store, path, keep_pictures)
         self._segments = LogSegments(store, files, head_records(path, head, start_ns), limits)
-        with self._told_errors():
+        with self._report_errors():
             try:
                 self._segments.open(start_ns)
                 self._segments.sync()
@@ -118,7 +118,7 @@ class LogWriter:
         if topic == PICTURE_TOPIC and not self._keeps_pictures:
             raise LogError(f"{topic}: this log keeps no pictures; open it with keep_pictures")
         self._last_ns = log_time_ns
-        with self._told_errors():
+        with self._report_errors():
             self._segments.append(record)
             if log_time_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
                 self._flush()
@@ -135,12 +135,12 @@ class LogWriter:
 
     def flush(self) -> None:
         """Puts everything written so far into the files."""
-        with self._told_errors():
+        with self._report_errors():
             self._flush()
 
     def close(self) -> None:
         """Finishes the files and gives them their names. A second call does nothing."""
-        with self._told_errors():
+        with self._report_errors():
             self._segments.finish()
 
     def discard(self) -> None:
@@ -161,11 +161,11 @@ class LogWriter:
             self._segments.finish_a_full_one()
 
     @contextmanager
-    def _told_errors(self) -> Iterator[None]:
+    def _report_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise told(self._path, error) from error
+            raise describe_os_error(self._path, error) from error
 
 
 LogOpener = Callable[[Path, Mapping[str, Message], int, bool], RunLog]
@@ -207,7 +207,7 @@ def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_
     return Record(topic, data, log_time_ns, publish_time_ns)
 
 
-def told(path: Path, error: OSError) -> LogError:
+def describe_os_error(path: Path, error: OSError) -> LogError:
     """A disk's failure as one line for a person."""
     where = Path(error.filename or path)
     exists = isinstance(error, FileExistsError)

@@ -70,13 +70,13 @@ class LogThread:
     def _work(self) -> None:
         while True:
             begun_s = time.monotonic()
-            self._told(self._keeper.step, begun_s)
+            self._run_safely(self._keeper.step, begun_s)
             self._stepped_s = time.monotonic()
             if self._stop.wait(begun_s + self._period_s - self._stepped_s):
                 break
-        self._finished = self._told(self._keeper.finish, time.monotonic())
+        self._finished = self._run_safely(self._keeper.finish, time.monotonic())
 
-    def _told(self, act: Callable[[float], None], now_s: float) -> bool:
+    def _run_safely(self, act: Callable[[float], None], now_s: float) -> bool:
         """Whether it went well; a fault of ours or of a library's is told of and must not end the log's thread."""
         try:
             act(now_s)

@@ -120,10 +120,10 @@ def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None
     """
     with ExitStack() as held:
         try:
-            held.callback(os.close, _locked(robot_file, os.O_RDONLY))
+            held.callback(os.close, _lock(robot_file, os.O_RDONLY))
             try:
                 folder.mkdir(parents=True, exist_ok=True)
-                held.callback(os.close, _locked(folder / f".{robot_id}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW))
+                held.callback(os.close, _lock(folder / f".{robot_id}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW))
             except OSError as error:
                 if error.errno not in NO_ROOM:
                     raise
@@ -137,7 +137,7 @@ def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None
         yield
 
 
-def _locked(path: Path, flags: int) -> int:
+def _lock(path: Path, flags: int) -> int:
     file = os.open(path, flags | os.O_CLOEXEC, 0o644)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

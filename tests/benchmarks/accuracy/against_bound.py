@@ -24,7 +24,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds.world import World, load_world
 from groundsbot.offline.evaluation.truth import Truth, read_truth
@@ -239,7 +239,7 @@ def run_study(worlds: dict[str, World], methods: Sequence[str], seeds: Sequence[
         for name, world in worlds.items():
             study_seed(name, world, seed, [each for each in tallies if each.world == name])
             output.parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(output) as partial:
+            with atomic_write(output) as partial:
                 partial.write_text("".join(json.dumps(each.row()) + "\n" for each in tallies if each.figures))
     return tallies
 

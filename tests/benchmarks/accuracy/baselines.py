@@ -75,7 +75,7 @@ def _keyframes(run: Run) -> _Drive:
     chain = _chain(run)
     readings, odometry = chain.readings, chain.odometry
     return _Drive(
-        run, chain.stamps_ns, odometry.motion, odometry.dead_reckoned(), readings.keyframe, chain.tags, readings.tag,
+        run, chain.stamps_ns, odometry.motion, odometry.dead_reckon(), readings.keyframe, chain.tags, readings.tag,
         _places_in_base(chain),
     )  # fmt: skip
 

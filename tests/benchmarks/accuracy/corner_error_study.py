@@ -35,7 +35,7 @@ from groundsbot.fixtures.pictures.visibility import Eye
 from groundsbot.fixtures.recording.session import Options, prepare
 from groundsbot.fixtures.worlds.scene import Tags, faces_of, tags_of
 from groundsbot.fixtures.worlds.world import Pictures, Wall, World, WorldTag, load_world
-from groundsbot.onboard.detection.corner_refinement import refined_corners
+from groundsbot.onboard.detection.corner_refinement import refine_corners
 from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.benchmarks.command_line import say
 
@@ -210,8 +210,8 @@ def refinements(camera: CameraModel) -> dict[str, Callable[[Grey, FloatArray], F
     return {
         "as detected": lambda _, corners: corners,
         "cornerSubPix": _sub_pix,
-        "sides": lambda grey, corners: refined_corners(grey, corners[None], cells)[0][0],
-        "sides, lens": lambda grey, corners: refined_corners(grey, corners[None], cells, camera)[0][0],
+        "sides": lambda grey, corners: refine_corners(grey, corners[None], cells)[0][0],
+        "sides, lens": lambda grey, corners: refine_corners(grey, corners[None], cells, camera)[0][0],
     }
 
 
@@ -281,8 +281,8 @@ def refinement_ms(n_tags: int, repeats: int = 20) -> dict[str, float]:
     many, cells = np.repeat(true_px[None], n_tags, axis=0), np.full(n_tags, CELLS)
     ways: dict[str, Callable[[], object]] = {
         "cornerSubPix": lambda: [_sub_pix(grey, each) for each in many],
-        "sides": lambda: refined_corners(grey, many, cells),
-        "sides, lens": lambda: refined_corners(grey, many, cells, camera),
+        "sides": lambda: refine_corners(grey, many, cells),
+        "sides, lens": lambda: refine_corners(grey, many, cells, camera),
     }
     found = {}
     for name, way in ways.items():

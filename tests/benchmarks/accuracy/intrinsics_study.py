@@ -27,7 +27,7 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, undistorted_camera, with_parameters
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.intrinsics.model_choice import KINDS, calibrated
+from groundsbot.calib.intrinsics.model_choice import KINDS, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
     difference_px,
@@ -56,7 +56,7 @@ class Outcome:
 
 def judged(truth: CameraModel, views: Sequence[View]) -> Outcome:
     """One calibration with the model given."""
-    lens = calibrated(views, BoardFinder(DEFAULT_BOARD), truth.name, [truth.distortion_model]).lens
+    lens = calibrate_camera(views, BoardFinder(DEFAULT_BOARD), truth.name, [truth.distortion_model]).lens
     covariance, off = lens.covariance(), parameters_of(lens.fit.model) - parameters_of(truth)
     distance = float(off @ np.linalg.solve(covariance, off))
     grid = PictureGrid.of(truth)
@@ -126,7 +126,7 @@ def beside(truth: CameraModel, views: Sequence[View]) -> Beside:
     """Both ways on the same views."""
     plain_px = plain_error_px(truth, views)
     try:
-        found = calibrated(views, BoardFinder(DEFAULT_BOARD), truth.name, KINDS)
+        found = calibrate_camera(views, BoardFinder(DEFAULT_BOARD), truth.name, KINDS)
     except CalibError:
         return Beside(np.nan, plain_px, "refused", 0)
     ours_px = rms_px(difference_px(found.model, PictureGrid.of(truth)))

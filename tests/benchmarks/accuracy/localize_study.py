@@ -38,7 +38,7 @@ from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import component_of, solve_global_map
-from groundsbot.offline.local_map.archive import kept_of, local_map_of
+from groundsbot.offline.local_map.archive import archive_map, local_map_of
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.localization.localization import localize_maps
 from groundsbot.offline.localization.online.drive import TagReading
@@ -126,7 +126,7 @@ def made_scene(seed: int) -> Scene | None:
     component = _joined(maps)
     if component is None:
         return None
-    known = MapResult((component,), (), NoiseParameters(), kept=tuple(kept_of(each) for each in maps))
+    known = MapResult((component,), (), NoiseParameters(), kept=tuple(archive_map(each) for each in maps))
     later, moved = _with_moved_tags(town, rng) if seed % _MOVED_EVERY == _MOVED_EVERY - 1 else (town, frozenset[int]())
     drive = _drive(first + 2, later, float(rng.uniform(25.0, 100.0)))
     seen = {tag.tag_id for tag in drive.chain.tags}

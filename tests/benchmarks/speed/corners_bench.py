@@ -18,10 +18,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.corners.bundle_adjustment import refine
-from groundsbot.offline.corners.floor_noise import guessed_wobble
+from groundsbot.offline.corners.floor_noise import initial_attitude_sigmas
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.foundation.stages import Stages
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for text in table(lines[-1]):
             say(text)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(REPORT) as partial:
+    with atomic_write(REPORT) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
     return 0 if all(line["solves"] <= MOST_SOLVES for line in lines) else 1
 
@@ -73,7 +73,7 @@ def measured(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
         "whole": lambda: refine(solved.graph, solved.solution),
         "problem and start": lambda: corner_graph(solved.graph, solved.solution.state),
         "solve": lambda: solve_corners(problem, start),
-        "whether the floor is even": lambda: guessed_wobble(found.problem, found.state, found.factor),
+        "whether the floor is even": lambda: initial_attitude_sigmas(found.problem, found.state, found.factor),
     }
     seconds = {name: _least(part, repeats) for name, part in parts.items()}
     on_floor = min(floor[1:])

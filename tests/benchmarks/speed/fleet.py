@@ -23,7 +23,7 @@ from typing import Any, Final
 import yaml
 
 from groundsbot.calib.foundation.command_line import EXIT_DONE, EXIT_WITH_LOSSES
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.offline.commands.map_drives import stage_lines
 from groundsbot.offline.foundation.stages import StageCost
 from tests.benchmarks.command_line import say
@@ -51,7 +51,7 @@ def main() -> int:
     measured(simulated_fleet(2, 500, 40, 1))  # compiles what is not compiled yet
     line = measured(logs) | {"seed": arguments.seed}
     REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(REPORT) as partial:
+    with atomic_write(REPORT) as partial:
         partial.write_text(json.dumps(line) + "\n", encoding="utf-8")
     for text in table(line):
         say(text)

@@ -5,7 +5,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, stacked
+from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, stack
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Losses, Problem
 
@@ -21,7 +21,7 @@ def plain_solve(problem: Problem, start: State, relative_tolerance: float) -> tu
         expected = -0.5 * float(gradient @ step)
         if expected <= relative_tolerance * cost:
             return state, iteration
-        candidate = problem.moved(state, step)
+        candidate = problem.retract(state, step)
         candidate_cost = problem.cost(candidate, PLAIN_SQUARES)
         if candidate_cost < cost:
             state, cost, damping = candidate, candidate_cost, 0.1 * damping if damping > 1e-9 else 0.0
@@ -53,7 +53,7 @@ def plain_normal_equations(
         problem.prior.linearise(state, problem.columns),
         *problem.measured.linearise(state, problem.columns),
     )
-    jacobian, residual = stacked(kinds, problem.columns.n)
+    jacobian, residual = stack(kinds, problem.columns.n)
     return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
 
 

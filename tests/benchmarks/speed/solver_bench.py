@@ -29,7 +29,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations, plain_solve, plain_step
@@ -74,7 +74,7 @@ def ours(fleet: Fleet) -> tuple[float, float, int, State]:
     def iterate() -> None:
         system, _ = arrowhead.linearise(start, out=blocks)
         step = -arrowhead.factorise(system, out=rows).solve_in_order(system.gradient)
-        arrowhead.moved(start, step, fleet.problem.anchor)
+        arrowhead.retract(start, step, fleet.problem.anchor)
 
     return seconds, least_seconds(iterate), solution.n_linearised, solution.state
 
@@ -307,7 +307,7 @@ def main() -> int:
     lines = compare(arguments.cases, arguments.solvers, arguments.repeats, arguments.seeds)
     sys.stdout.write(summary(lines))
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(OUTPUT) as part:
+    with atomic_write(OUTPUT) as part:
         part.write_text("".join(json.dumps(line) + "\n" for line in lines))
     return 0
 

@@ -31,7 +31,7 @@ def growth() -> None:
         def iterate() -> None:
             system, _ = arrowhead.linearise(fleet.truth, out=blocks)  # noqa: B023  (called at once)
             step = arrowhead.factorise(system, out=rows).solve_in_order(system.gradient)  # noqa: B023
-            arrowhead.moved(fleet.truth, step, fleet.problem.anchor)  # noqa: B023
+            arrowhead.retract(fleet.truth, step, fleet.problem.anchor)  # noqa: B023
 
         seconds.append(least_seconds(iterate, 5))
         # Counted, not asked of the system: small problems fit into what a process holds anyway.

@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
@@ -154,7 +154,7 @@ def _dead_reckoned(rng: np.random.Generator, problem: Problem, truth: State, n_r
     for robot, starts in enumerate(np.split(truth.poses, n_robots)):
         start = starts[0] if robot == 0 else se2.compose(starts[0], SIGMA_START * rng.standard_normal(3))
         n = len(starts)
-        poses.append(chained(problem.odometry.motion[robot * (n - 1) : (robot + 1) * (n - 1)], start))
+        poses.append(chain_motions(problem.odometry.motion[robot * (n - 1) : (robot + 1) * (n - 1)], start))
     state = State(np.concatenate(poses), np.zeros_like(truth.tags), truth.calibration)
     _, first_reading = np.unique(problem.readings.tag, return_index=True)
     return State(state.poses, problem.readings.places_in_map(state)[first_reading], truth.calibration)

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.inputs import read_runs
@@ -39,7 +39,7 @@ def main() -> int:
     given = parser.parse_args()
     lines = [measured(logs, given.repeats) for logs in ([given.logs] if given.logs else [_nsh(), _fleet()])]
     REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(REPORT) as partial:
+    with atomic_write(REPORT) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
     for line in lines:
         for text in table(line):

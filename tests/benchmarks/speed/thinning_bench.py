@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation.files import written_whole
+from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.mapping.inputs import read_runs
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 )
                 lines.append(line)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(REPORT) as partial:
+    with atomic_write(REPORT) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
     return 0 if all(line["lost"] <= MOST_LOST for line in lines) else 1
 

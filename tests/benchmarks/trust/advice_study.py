@@ -23,7 +23,7 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.advice.advice import Candidates, candidates_of, judged, known_of
+from groundsbot.offline.advice.advice import Candidates, best_candidates, candidates_of, joint_covariance_of
 from groundsbot.offline.advice.new_tags import Place, is_in_view, place_beside
 from groundsbot.offline.advice.passes import Pass, most_length_m
 from groundsbot.offline.alignment.merging import merge
@@ -31,7 +31,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.sensor_model.readings import joined
+from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
@@ -79,7 +79,7 @@ def made_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) 
 def largest_sigma_m(scene: Scene, maps: Sequence[LocalMap]) -> float:
     """Of the scene's tags, in a map of these; infinite where one of them is no longer in it."""
     graph, solution = _mapped(maps, scene.graph)
-    sigmas_m = dict(zip(graph.tags, known_of(solution, []).sigmas_m().tolist(), strict=True))
+    sigmas_m = dict(zip(graph.tags, joint_covariance_of(solution, []).sigmas_m().tolist(), strict=True))
     return max(float(sigmas_m.get(tag, np.inf)) for tag in scene.graph.tags)
 
 
@@ -171,7 +171,7 @@ def _past_new_tag(
     value += SIGMA_READING * rng.standard_normal(value.shape)
     like = chain.readings.where(np.zeros(len(keyframe), dtype=np.int64))
     new = replace(like, keyframe=keyframe, tag=np.full(len(keyframe), len(chain.tags)), value=value)
-    both = joined(chain.readings, new)
+    both = concatenate_observations(chain.readings, new)
     return replace(chain, tags=(*chain.tags, _NEW_TAG), readings=both.where(np.argsort(both.keyframe, kind="stable")))
 
 
@@ -207,7 +207,7 @@ class Outcome:
 
 def trial(scene: Scene, seed: int, n_draws: int) -> Outcome:
     """The advice of one map against chance."""
-    best = judged(scene.graph, scene.solution)
+    best = best_candidates(scene.graph, scene.solution)
     found_m = tuple(largest_sigma_m(scene, with_candidate(scene, each.candidate, seed)) for each in best)
     drawn = random_candidates(scene, np.random.default_rng([seed, 8]), n_draws)
     sigmas_m = [largest_sigma_m(scene, with_candidate(scene, each, 1000 * seed + i)) for i, each in enumerate(drawn)]

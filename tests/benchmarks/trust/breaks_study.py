@@ -30,7 +30,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
-from groundsbot.offline.outliers.odometry_breaks import split_where_broken
+from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.command_line import seeds_of
 from tests.support.data.broken_odometry import BrokenDrive, carried, made_clean_drive, slipped
@@ -76,7 +76,7 @@ def outcome_of(kind: str, seed: int) -> Outcome:
     broken = broken_drive(kind, seed)
     chain = broken.drive.chain
     whole = solve_local_map(chain)
-    mended = split_where_broken([whole])
+    mended = split_at_breaks([whole])
     two_runs, can_be_told = [whole], False
     if kind != "clean":
         ends = (0, broken.end), (broken.begin, len(chain.stamps_ns))
@@ -94,7 +94,7 @@ def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
     odometry = problem.odometry
     inside = (odometry.first >= broken.end - 1) & (odometry.first < broken.begin)
     weak = np.where(inside[:, None, None], _FREED, 1.0) * odometry.whitening
-    apart = solve(problem.reweighed(weak, problem.readings.whitening), state)
+    apart = solve(problem.reweigh(weak, problem.readings.whitening), state)
     joined = min(whole.solution.cost, solve(problem, apart.state).cost)
     n_places = len(np.unique(whole.chain.readings.keyframe))
     return 2.0 * (joined - apart.cost) > float(chi2.isf(FALSE_ALARM / n_places, 3))

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.local_map.goodness_of_fit import fitted_windows
+from groundsbot.offline.local_map.goodness_of_fit import fit_windows
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
@@ -56,7 +56,7 @@ def study_seed(seed: int) -> Figures:
     """Drives, solves and checks one seed."""
     drive = made_long_drive(seed)
     chain = drive.chain
-    dead_reckoned = chain.odometry.dead_reckoned()
+    dead_reckoned = chain.odometry.dead_reckon()
     turned = se2.between(drive.T_start_base[:-1], drive.T_start_base[1:])[:, 2].sum()
     graph = build_graph([chain])
     best = solve(graph.problem, drive.true_state(graph))
@@ -64,7 +64,7 @@ def study_seed(seed: int) -> Figures:
     began = time.perf_counter()
     ours = solve_local_map(chain)
     seconds = time.perf_counter() - began
-    windows = fitted_windows(graph.problem)
+    windows = fit_windows(graph.problem)
     return Figures(
         seed,
         float(np.hypot(*(dead_reckoned[-1] - drive.T_start_base[-1])[:2])),

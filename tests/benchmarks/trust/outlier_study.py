@@ -30,7 +30,7 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.outliers.outliers import Searched, split_alone, split_together, with_outliers_apart
-from groundsbot.offline.outliers.places import settled
+from groundsbot.offline.outliers.places import minimise_places
 from groundsbot.offline.outliers.report import suspect_tags
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
@@ -138,7 +138,7 @@ def foretold_sigmas(scene: Scene, searched: Searched) -> dict[int, float]:
             continue
         joined = place.copy()
         joined[members] = place[of_tag[~np.isin(of_tag, members)][0]]
-        _, information = gain_of(settled(evidence, joined), members)
+        _, information = gain_of(minimise_places(evidence, joined), members)
         shift_m = scene.other_m[tag_id] - scene.first_m[tag_id]
         # The frame of the map is turned against the town's; the weakest direction is what is asked for.
         found[tag_id] = float(np.linalg.norm(shift_m) * np.sqrt(np.linalg.eigvalsh(information)[0]))

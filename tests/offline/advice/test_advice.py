@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.advice.advice import advise, candidates_of, judged, known_of
+from groundsbot.offline.advice.advice import advise, best_candidates, candidates_of, joint_covariance_of
 from groundsbot.offline.advice.information_gain import Known
 from groundsbot.offline.advice.new_tags import Place, gain_of_place, place_beside
 from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
-from groundsbot.offline.advice.visibility import expected_sigmas_m, seen_shares
+from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
 from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.sensor_model.readings import joined
+from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.report.sentences import advice_sentence
 from groundsbot.offline.sam.factors.odometry_and_readings import State
@@ -31,28 +31,28 @@ def scene() -> Scene:
 def sigmas_at(graph: Graph, state: State) -> dict[TagKey, float]:
     """Exact ones, where a graph is linearised at a state."""
     solution = Solution(state, (0.0,), "", True, graph.problem)
-    return dict(zip(graph.tags, known_of(solution, []).sigmas_m().tolist(), strict=True))
+    return dict(zip(graph.tags, joint_covariance_of(solution, []).sigmas_m().tolist(), strict=True))
 
 
 def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
     candidates = candidates_of(scene.graph, scene.solution.state)
     wanted = candidates.passes[len(candidates.passes) // 2]
     gain = gain_of_pass(scene.graph, scene.solution.state, wanted)
-    foretold = known_of(scene.solution, [gain]).sigmas_with_m(gain)
+    foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
     part = scene.graph.chains[wanted.chain].part(wanted.first, wanted.last + 1)
     graph = build_graph([*scene.graph.chains, replace(part, name="again")])
     state = scene.solution.state
     driven = scene.graph.poses_of(state, wanted.chain)[wanted.first : wanted.last + 1]
     exact = sigmas_at(graph, State(np.concatenate([state.poses, driven]), state.tags, state.calibration))
     np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
-    assert foretold.max() < 0.999 * known_of(scene.solution, []).sigmas_m().max()
+    assert foretold.max() < 0.999 * joint_covariance_of(scene.solution, []).sigmas_m().max()
 
 
 def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
     found = candidates_of(scene.graph, scene.solution.state)
     place = max(found.places, key=lambda each: each.n_sightings)
     gain = gain_of_place(found.drives, found.view, place)
-    foretold = known_of(scene.solution, [gain]).sigmas_with_m(gain)
+    foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
     state, chains = scene.solution.state, list(scene.graph.chains)
     for i, chain in enumerate(chains):
         first = int(scene.graph.first_pose[i])
@@ -68,7 +68,7 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
             value=_seen(found.drives.sensors[first + keyframe], place),
             covariance=like.covariance / n_each,  # all readings of these drives have the same
         )
-        both = joined(chain.readings, new)
+        both = concatenate_observations(chain.readings, new)
         both = both.where(np.argsort(both.keyframe, kind="stable"))
         chains[i] = replace(chain, tags=(*chain.tags, NEW), readings=both)
     exact = sigmas_at(
@@ -97,21 +97,21 @@ def _seen(sensors: FloatArray, place: Place) -> FloatArray:
 
 def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
     told = advise(scene.graph, scene.solution, 0)
-    best = judged(scene.graph, scene.solution)
+    best = best_candidates(scene.graph, scene.solution)
     assert sorted(each.kind for each in told) == ["pass", "tag"]
     assert told[0].sigma_then_m <= told[1].sigma_then_m < told[0].sigma_m == pytest.approx(best[0].now_m.max())
     found = candidates_of(scene.graph, scene.solution.state)
     gains = {"pass": [gain_of_pass(scene.graph, scene.solution.state, each) for each in found.passes]}
     drives, view = found.drives, found.view
     gains["tag"] = [gain_of_place(drives, view, each) for each in found.places]
-    known = known_of(scene.solution, gains["tag"])
-    shares = [seen_shares(drives, view, each, known) for each in found.places]
+    known = joint_covariance_of(scene.solution, gains["tag"])
+    shares = [visibility_probabilities(drives, view, each, known) for each in found.places]
     assert {float(each.max()) for each in shares} == {1.0}  # from the pose beside it
     assert min(float(each.min()) for each in shares) < 0.9  # some may have passed too far away
     expected = [expected_sigmas_m(drives, view, each, known).max() for each in found.places]
     for certain, doubtful in zip(gains["tag"], expected, strict=True):
         assert known.sigmas_with_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
-    by_pass = known_of(scene.solution, gains["pass"])
+    by_pass = joint_covariance_of(scene.solution, gains["pass"])
     foretold = {"tag": expected, "pass": [by_pass.sigmas_with_m(gain).max() for gain in gains["pass"]]}
     for each in told:
         assert each.sigma_then_m == pytest.approx(min(foretold[each.kind]))
@@ -183,8 +183,8 @@ def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(sce
     """Readings that count by their probability would promise as good as all of what certain ones do."""
     found = candidates_of(scene.graph, scene.solution.state)
     drives, view = found.drives, found.view
-    known = known_of(scene.solution, [gain_of_place(drives, view, each) for each in found.places])
-    shares = [seen_shares(drives, view, each, known) for each in found.places]
+    known = joint_covariance_of(scene.solution, [gain_of_place(drives, view, each) for each in found.places])
+    shares = [visibility_probabilities(drives, view, each, known) for each in found.places]
     place, share = min(zip(found.places, shares, strict=True), key=lambda each: float(each[1].min()))
     without = known.sigmas_with_m(gain_of_place(drives, view, place, share > share.min()))
     with_it = known.sigmas_with_m(gain_of_place(drives, view, place))

@@ -40,7 +40,7 @@ def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tm
 
 def test_a_camera_file_of_another_size(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
     write_robot_yaml(made_robot("a"), tmp_path / "robot.yaml")
-    write_camera_yaml(CAMERA.scaled(0.5), tmp_path / "camera.yaml")
+    write_camera_yaml(CAMERA.resize(0.5), tmp_path / "camera.yaml")
     text = refused(logs["a"], "--robot", tmp_path / "robot.yaml")
     for part in (str(logs["a"]), "1280x720", "640x360", "--robot"):
         assert part in text

@@ -17,11 +17,11 @@ from groundsbot.calib.tags.edges import outward
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.offline.corners import bundle_adjustment
 from groundsbot.offline.corners.bundle_adjustment import refine
-from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import SpatialState
-from groundsbot.offline.corners.floor_noise import fitted_wobble, guessed_wobble, with_wobble
+from groundsbot.offline.corners.floor_noise import fit_attitude_sigmas, initial_attitude_sigmas, with_wobble
 from groundsbot.offline.corners.graph import corner_graph
-from groundsbot.offline.corners.initial_tag_poses import hung_otherwise, tags_rehung
+from groundsbot.offline.corners.initial_tag_poses import alternative_states, tags_rehung
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.corners.solver import CornerSolution, solve_corners
 from groundsbot.offline.evaluation.against_truth import evaluate
@@ -265,7 +265,7 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
     solved = room[2].solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     looks = corners.problem.corners.looks
-    expected = facing_as_predicted(corners.problem.corners, start).looks.outward
+    expected = with_predicted_facings(corners.problem.corners, start).looks.outward
     np.testing.assert_array_equal(looks.outward, expected)
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
 
@@ -319,7 +319,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
     problem = with_wobble(on_uneven_floor(corners.problem, found.state, tilt, 6), tilt)
     n_turned = 0
     for tag in range(len(solved.graph.tags)):
-        for other in hung_otherwise(problem, found.state, tag):
+        for other in alternative_states(problem, found.state, tag):
             if np.trace(other.turns[tag].T @ found.state.turns[tag]) > 1.0 + 2.0 * np.cos(np.radians(20.0)):
                 continue
             right = tags_rehung(problem, other)
@@ -333,13 +333,13 @@ def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapRe
     solved = room[2].solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
-    assert not guessed_wobble(found.problem, found.state).any()
+    assert not initial_attitude_sigmas(found.problem, found.state).any()
     problem = on_uneven_floor(corners.problem, found.state, np.radians([0.5, 0.5, 0.0]), 5)
     level = solve_corners(problem, found.state)
-    guess = guessed_wobble(level.problem, level.state)
+    guess = initial_attitude_sigmas(level.problem, level.state)
     assert guess.any()
     uneven = solve_corners(with_wobble(problem, guess), level.state)
-    sigma = fitted_wobble(uneven.problem, uneven.state)
+    sigma = fit_attitude_sigmas(uneven.problem, uneven.state)
     assert np.degrees(sigma[:2]) == pytest.approx(0.5, rel=0.2)
     assert sigma[2] < 0.003
     again = solve_corners(with_wobble(uneven.problem, sigma), uneven.state)

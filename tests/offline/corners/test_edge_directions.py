@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.tags.edges import outward
-from groundsbot.offline.corners.edge_directions import facing_as_predicted
+from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState
 from tests.offline.corners.test_factors import CAMERAS, made_factors, made_state
 
@@ -27,7 +27,7 @@ def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
 @pytest.mark.parametrize("model", CAMERAS)
 def test_sides_face_as_the_state_has_them(model: str) -> None:
     factors, state = made(model)
-    faced = facing_as_predicted(factors, state)
+    faced = with_predicted_facings(factors, state)
     np.testing.assert_allclose(faced.looks.outward, outward(predicted_px(factors, state)), atol=1e-9)
     np.testing.assert_array_equal(faced.looks.corners_px, factors.looks.corners_px)
 
@@ -37,7 +37,7 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
     seen = predicted_px(factors, state)
     noise = np.random.default_rng(4).standard_normal(seen.shape)
     clean, noisy = (
-        facing_as_predicted(replace(factors, looks=replace(factors.looks, corners_px=each)), state).looks.outward
+        with_predicted_facings(replace(factors, looks=replace(factors.looks, corners_px=each)), state).looks.outward
         for each in (seen, seen + noise)
     )
     np.testing.assert_array_equal(clean, noisy)
@@ -46,7 +46,7 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
 def test_where_a_lens_has_no_image_sides_face_as_they_were_seen() -> None:
     factors, state = made()
     behind = replace(state, tags=np.where(np.arange(len(state.tags))[:, None] == 1, -state.tags, state.tags))
-    faced, hidden = facing_as_predicted(factors, behind), factors.looks.tag == 1
+    faced, hidden = with_predicted_facings(factors, behind), factors.looks.tag == 1
     np.testing.assert_array_equal(faced.looks.outward[hidden], factors.looks.outward[hidden])
     assert (faced.looks.outward[~hidden] != factors.looks.outward[~hidden]).any()
     assert np.isfinite(faced.looks.outward).all()

@@ -11,7 +11,7 @@ from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.corners.factors import CornerFactors, Looks, SpatialColumns, SpatialState
-from groundsbot.offline.corners.floor_noise import guessed_wobble
+from groundsbot.offline.corners.floor_noise import initial_attitude_sigmas
 from groundsbot.offline.corners.multifrontal.fronts import (
     Fronts,
     Normal,
@@ -235,7 +235,7 @@ def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wob
         np.testing.assert_allclose(each / scale, g / scale, atol=1e-10 * np.abs(g / scale).max())
     assert (same_cost, also_same_cost) == pytest.approx((cost, cost), rel=1e-12)
     linearised, by_standing = problem.corners.linearise(state, problem.columns)
-    share = (problem.weighed(linearised.residual, by_standing).weight < 1.0).mean()
+    share = (problem.weigh(linearised.residual, by_standing).weight < 1.0).mean()
     assert pictures_at(problem, state).outliers == pytest.approx(share)
     assert 0.0 < share < 1.0
 
@@ -247,7 +247,7 @@ def test_after_a_step_tags_have_gone_along_with_their_anchors_and_by_their_own_s
     columns = columns_of(N_POSES, free, SIGMAS)
     problem = replace(problem, columns=columns, anchor=1 + np.arange(N_TAGS))
     step = 0.3 * np.random.default_rng(9).standard_normal(columns.n)
-    after, padded = problem.moved(state, step), np.append(step, 0.0)
+    after, padded = problem.retract(state, step), np.append(step, 0.0)
     np.testing.assert_allclose(after.poses, moved(state, columns, step).poses, atol=1e-14)
     before, way = state.poses[problem.anchor], padded[columns.poses][problem.anchor]
     seen = se2.apply(se2.inverse(before), state.tags)
@@ -274,7 +274,7 @@ def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> Non
     few = problem.corners.looks.where(problem.corners.looks.pose < N_POSES - 1)
     found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, looks=few)), state)
     assert (found.reason, found.factor) == ("something is not tied down", None)
-    assert not guessed_wobble(found.problem, found.state, found.factor, found.pictures).any()
+    assert not initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures).any()
 
 
 def assembled(order: Fronts, matrices: list[FloatArray]) -> System:
@@ -308,7 +308,7 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
         vector = rng.standard_normal(n)
         np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(whole, vector), rtol=1e-8)
         some = rng.standard_normal((3, n))
-        whitened = factor.whitened(some)
+        whitened = factor.whiten(some)
         np.testing.assert_allclose(whitened @ whitened.T, some @ np.linalg.solve(whole, some.T), rtol=1e-8)
         wanted = np.array([16, 0, -1, 7, 14])
         inverse = np.linalg.inv(whole)

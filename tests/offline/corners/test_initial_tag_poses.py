@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.camera.planar_pose import planar_poses
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.corners.factors import spatial_values
-from groundsbot.offline.corners.initial_calibration import calibrated
-from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, allowed, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, looks_by_tag, posed
+from groundsbot.offline.corners.initial_calibration import initial_calibration
+from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, candidate_poses, fit, rays_of
+from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, looks_by_tag, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
 from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, made_problem
@@ -24,7 +24,7 @@ def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str
     rays = np.empty((N_LOOKS, 4, 3))
     rays_of(problem.corners.arrays, problem.corners.lenses, which, rays)
     places, turns = np.empty((N_LOOKS, POSES, 3)), np.empty((N_LOOKS, POSES, 3, 3))
-    allowed(problem.corners.arrays, spatial_values(state), which, rays, places, turns)
+    candidate_poses(problem.corners.arrays, spatial_values(state), which, rays, places, turns)
     mount = looks.mount + state.calibration[looks.mount_parameters]
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for m in range(N_LOOKS):
@@ -62,7 +62,7 @@ def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_numb
     assert np.isfinite(rays[1]).all()
     rays[1, 2] *= -1.0  # a corner behind the camera
     places, turns = np.empty((2, POSES, 3)), np.empty((2, POSES, 3, 3))
-    allowed(factors.arrays, spatial_values(state), which, rays, places, turns)
+    candidate_poses(factors.arrays, spatial_values(state), which, rays, places, turns)
     assert np.isnan(turns[:, :2]).all()
     assert np.isnan(places[:, :2]).all()
 
@@ -73,7 +73,7 @@ def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_anothe
     corners_px = np.stack([small, 0.95 * square, square, narrow, small]) + 100.0
     by_tag = ByTag(np.array([4, 0, 1, 2, 3]), np.array([0, 1, 1, 5]))
     chosen = np.zeros((N_TAGS, 2), dtype=np.int64)
-    posed(corners_px, by_tag, chosen)
+    select_views(corners_px, by_tag, chosen)
     assert chosen.tolist() == [[4, -1], [-1, -1], [2, 3]]
 
 
@@ -103,7 +103,7 @@ def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
 def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> None:
     problem, state = made_problem(5)
     off = replace(state, calibration=state.calibration + 2.0 * SIGMAS, heights_m=state.heights_m + 0.02)
-    found = calibrated(problem, off)
+    found = initial_calibration(problem, off)
     np.testing.assert_array_equal(found.poses, state.poses)
     begun, ended, true = (problem.system(each)[1] for each in (off, found, state))
     assert ended - true < 0.02 * (begun - true)
@@ -114,7 +114,7 @@ def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
     free = np.arange(N_TAGS) > 0
     corners = replace(problem.corners, looks=problem.corners.looks.where(problem.corners.looks.tag > 0))
     problem = replace(problem, corners=corners, columns=columns_of(N_POSES, free, SIGMAS))
-    found = calibrated(problem, replace(state, calibration=state.calibration + 2.0 * SIGMAS))
+    found = initial_calibration(problem, replace(state, calibration=state.calibration + 2.0 * SIGMAS))
     np.testing.assert_allclose(found.tags[0], state.tags[0], atol=1e-14)
     np.testing.assert_array_equal(found.turns[0], state.turns[0])
     assert np.abs(found.tags[1:] - state.tags[1:]).min() > 1e-6
@@ -124,4 +124,4 @@ def test_a_start_that_a_step_does_not_better_stays() -> None:
     """Tags behind the camera, and three times as far off as they are, where squares lead the wrong way."""
     problem, state = made_problem(6)
     for off in (replace(state, tags=-state.tags), replace(state, tags=3.0 * state.tags)):
-        assert calibrated(problem, off) is off
+        assert initial_calibration(problem, off) is off

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation.against_truth import aligned, evaluate
+from groundsbot.offline.evaluation.against_truth import align_points, evaluate
 from groundsbot.offline.evaluation.truth import TrueRun, Truth, read_truth
 from groundsbot.offline.maps.result import Component
 from tests.support.data.maps import STEP_NS, made_component, made_map, made_truth
@@ -93,9 +93,9 @@ def test_a_turned_map_is_wrong_as_it_stands_and_right_when_aligned() -> None:
 def test_alignment_neither_scales_nor_mirrors() -> None:
     points = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
     for changed in (2 * points, points * [1, -1]):
-        assert np.abs(aligned(changed, points) - points).max() > 0.1
+        assert np.abs(align_points(changed, points) - points).max() > 0.1
     # All in one point, or two on a line: no turn can be told, and nothing falls over.
-    np.testing.assert_allclose(aligned(points[:1].repeat(2, 0) + 5, points[:1].repeat(2, 0)), 0, atol=1e-12)
+    np.testing.assert_allclose(align_points(points[:1].repeat(2, 0) + 5, points[:1].repeat(2, 0)), 0, atol=1e-12)
 
 
 def test_the_trajectory_is_compared_at_its_own_times() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.foundation import jit
-from groundsbot.offline.foundation.jit import COMPILING, compilation_announced, jitted
+from groundsbot.offline.foundation.jit import COMPILING, announce_compilation, njit
 
 
 def test_compiles_where_no_cache_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,7 +29,7 @@ def test_compiles_where_no_cache_can_be_kept(monkeypatch: pytest.MonkeyPatch) ->
     def one_more(x: float) -> float:
         return x + 1.0
 
-    assert jitted(one_more)(1.0) == 2.0
+    assert njit(one_more)(1.0) == 2.0
 
 
 def test_compiling_is_told_of_once() -> None:
@@ -39,7 +39,7 @@ def test_compiling_is_told_of_once() -> None:
         return float(x + 1.0)
 
     compiled: Any = numba.njit(one_more)  # without a cache: it must compile each time
-    with compilation_announced(told.append):
+    with announce_compilation(told.append):
         assert not told
         assert (compiled(1.0), compiled(1)) == (2.0, 2)
     assert compiled(np.float32(1.0)) == 2.0  # compiles once more, after the block
@@ -67,8 +67,8 @@ def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> Non
     """A caller in one room must not be loaded with what a callee in another used to be."""
     package = made_package(tmp_path)
     callee, caller = package / "one" / "callee.py", package / "other" / "inside" / "caller.py"
-    imported = "from groundsbot.offline.foundation.jit import inner, jitted\n"
-    caller.write_text(f"{imported}from groundsbot.offline.one.callee import f\n@jitted\ndef g(x):\n    return f(x)\n")
+    imported = "from groundsbot.offline.foundation.jit import inner, njit\n"
+    caller.write_text(f"{imported}from groundsbot.offline.one.callee import f\n@njit\ndef g(x):\n    return f(x)\n")
     found = []
     for plus in ("1.0", "2.0"):
         callee.write_text(f"{imported}@inner\ndef f(x):\n    return x + {plus}\n")
@@ -77,7 +77,7 @@ def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> Non
 
 
 def test_all_files_with_kernels_are_counted() -> None:
-    decorators = {"jitted", "inner", "inlined"}
+    decorators = {"njit", "inner", "inline"}
     package = Path(jit.__file__).parents[1]
     with_kernels = {path for path in package.rglob("*.py") if jit._COMPILED.search(path.read_bytes())}
     importing = {

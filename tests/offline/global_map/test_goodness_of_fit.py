@@ -8,9 +8,9 @@ import pytest
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
-from groundsbot.offline.global_map.goodness_of_fit import joined_goodness
+from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.sam.solver import Solution
@@ -28,7 +28,7 @@ def mapped(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
 
 
 def by_windows(solution: Solution, least_factor: float = 0.0) -> Goodness:
-    return fitted_windows(solution.problem, least_factor=least_factor).judge(solution.state)
+    return fit_windows(solution.problem, least_factor=least_factor).judge(solution.state)
 
 
 @pytest.mark.parametrize(("kind", "n_tags", "fits"), [(CLEAN, 0, True), (MOVED, 4, False)])
@@ -36,7 +36,7 @@ def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fit
     maps, solution = mapped(kind, n_tags)
     assert all(each.goodness.fits for each in maps)
     # Fitted noise counts what readings share, of which windows show less.
-    found, all_windows = joined_goodness(maps, solution), by_windows(solution, least_factor=1.0)
+    found, all_windows = joint_goodness_of_fit(maps, solution), by_windows(solution, least_factor=1.0)
     assert found.fits == all_windows.fits == fits
     assert found.expected == all_windows.expected
     assert found.chi_square == pytest.approx(all_windows.chi_square, rel=0.2)
@@ -47,5 +47,5 @@ def test_sigmas_that_were_told_are_not_believed() -> None:
     """Windows then tell how far off they are, and nothing is added up."""
     maps, solution = mapped(CLEAN, 0)
     told = [replace(each, goodness=replace(each.goodness, reading_factor=1.5)) for each in maps]
-    assert joined_goodness(told, solution) == by_windows(solution)
-    assert joined_goodness(maps, solution) != by_windows(solution)
+    assert joint_goodness_of_fit(told, solution) == by_windows(solution)
+    assert joint_goodness_of_fit(maps, solution) != by_windows(solution)

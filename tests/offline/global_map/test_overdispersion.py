@@ -18,7 +18,7 @@ from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.findings import Found
 from groundsbot.offline.maps.result import Component
-from groundsbot.offline.maps.widening import widened
+from groundsbot.offline.maps.widening import inflate_covariances
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.passes import passes_of
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
@@ -66,7 +66,7 @@ def test_gentle_drives_keep_their_sigmas() -> None:
     assert (scatter.factors == 1.0).all()
     assert scatter_warnings(graph, scatter) == []
     component = component_of(graph, solution)
-    assert widened(component, None, scatter) is component
+    assert inflate_covariances(component, None, scatter) is component
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,9 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
     if sigmas:
         assert misfit.run == graph.chains[1].name
     before = component_of(graph, solution)
-    after = widened(before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_freedom(maps)))
+    after = inflate_covariances(
+        before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_freedom(maps))
+    )
     assert after.sigma_factor == misfit.variance_factor**0.5
     assert squared_sigmas(before) > 1.05
     assert 0.5 < squared_sigmas(after) < 1.5
@@ -97,7 +99,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
     (said,) = scatter_warnings(graph, scatter)
     assert f"passes of tags {moved} (" in said
     before = component_of(graph, solution)
-    after = widened(before, None, scatter)
+    after = inflate_covariances(before, None, scatter)
     grown = after.joint_covariance - before.joint_covariance
     rows = slice(6 + 2 * which, 8 + 2 * which)
     sigmas_m = np.sqrt(np.linalg.eigvalsh(grown[rows, rows]))

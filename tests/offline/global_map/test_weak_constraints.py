@@ -71,7 +71,7 @@ def solved(tags_of: dict[str, Sequence[int]]) -> tuple[Graph, Solution]:
 
 def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_is_known() -> None:
     graph, solution = solved({"a": (1, 2), "b": (3, 4)})
-    assert solution.untied.chains == (1,)
+    assert solution.unobservable.chains == (1,)
     assert solution.rank == graph.problem.columns.n - 3
     (sentence,) = [s for s in weak_parts(graph, solution) if s.startswith("b ")]
     assert "b shares no tag with the others" in sentence
@@ -88,7 +88,7 @@ def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_
 
 def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
     graph, solution = solved({"a": (1, 2), "b": (2, 3)})
-    assert solution.untied.n_directions == 1
+    assert solution.unobservable.n_directions == 1
     assert any("b shares only tag 2 with the others, about which it can turn" in s for s in weak_parts(graph, solution))
 
 
@@ -106,8 +106,8 @@ def test_chains_and_shared_tags_are_bars_and_joints(
     tags_of: dict[str, Sequence[int]], n_untied: int, chains: tuple[int, ...]
 ) -> None:
     graph, solution = solved(tags_of)
-    assert solution.untied.n_directions == n_untied
-    assert solution.untied.chains == chains
+    assert solution.unobservable.n_directions == n_untied
+    assert solution.unobservable.chains == chains
     assert np.isfinite(solution.covariance(np.arange(graph.problem.columns.n))).all()
 
 

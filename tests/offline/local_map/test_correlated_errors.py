@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.local_map.correlated_errors import SharedErrors, fit_shared_errors
-from groundsbot.offline.local_map.goodness_of_fit import fitted_windows, in_windows
+from groundsbot.offline.local_map.goodness_of_fit import fit_windows, in_windows
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
 from groundsbot.offline.sam.graph import Graph, build_graph
@@ -33,7 +33,7 @@ def test_errors_that_neighbours_share_raise_no_alarm(seed: int) -> None:
     drive = dense_drive(seed)
     graph = drifting_graph(drive)
     best = solve(graph.problem, drive.true_state(graph))
-    windows = fitted_windows(graph.problem)
+    windows = fit_windows(graph.problem)
     assert windows.judge(best.state).fits
 
 
@@ -42,7 +42,7 @@ def test_a_moved_tag_is_noticed_among_them() -> None:
     drifting = with_drifting_readings(drive.chain, SIGMAS, DRIFT_M, seed=1)
     graph = build_graph([with_a_moved_tag(drive, drifting)])
     best = solve(graph.problem, drive.true_state(graph))
-    assert not fitted_windows(graph.problem).judge(best.state).fits
+    assert not fit_windows(graph.problem).judge(best.state).fits
 
 
 def test_a_wrong_end_is_noticed_among_them() -> None:
@@ -50,10 +50,10 @@ def test_a_wrong_end_is_noticed_among_them() -> None:
     drive = dense_drive(0)
     graph = drifting_graph(drive)
     right = solve(graph.problem, drive.true_state(graph))
-    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckoned(), {}, {}))
+    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckon(), {}, {}))
     assert wrong.converged
     assert wrong.cost > 1.01 * right.cost
-    windows = fitted_windows(graph.problem)
+    windows = fit_windows(graph.problem)
     assert windows.judge(right.state).fits
     assert not windows.judge(wrong.state).fits
 
@@ -103,9 +103,9 @@ def test_drives_that_only_a_tape_joins_have_nothing_to_contradict() -> None:
         StartFactors(second, placed, np.diag([100.0, 100.0, 100.0])[None]),
         DistanceFactors(first, none, second, none, np.array([9.0]), np.array([0.01])),
     )
-    alone = chain.odometry.dead_reckoned()
+    alone = chain.odometry.dead_reckon()
     poses = np.concatenate([alone, alone + placed])
     state = State(poses, np.zeros((0, 2)), np.zeros(len(problem.prior.sigma)))
-    verdict = fitted_windows(replace(problem, measured=measured)).judge(state)
+    verdict = fit_windows(replace(problem, measured=measured)).judge(state)
     assert verdict.expected == 0
     assert verdict.fits

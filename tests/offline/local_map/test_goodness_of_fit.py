@@ -10,7 +10,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map import goodness_of_fit
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, fitted_windows, in_windows
+from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows, in_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
@@ -37,9 +37,9 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     drive = made_long_drive(seed, LENGTH_M)
     graph = build_graph([drive.chain])
     right = solve(graph.problem, drive.true_state(graph))
-    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckoned(), {}, {}))
+    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckon(), {}, {}))
     assert wrong.cost > 1.01 * right.cost
-    windows = fitted_windows(graph.problem)
+    windows = fit_windows(graph.problem)
     assert windows.judge(right.state).fits
     assert windows.judge(right.state).warnings("a_run") == []
     verdict = windows.judge(wrong.state)
@@ -75,14 +75,14 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
     tags = [TagKey(FAMILY, i) for i in range(3)]
     (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     rounds = []
-    left_over = goodness_of_fit._left_over
+    left_over = goodness_of_fit._mean_squares
 
     def counted(solution: Solution) -> tuple[FloatArray, FloatArray]:
         rounds.append(solution)
         return left_over(solution)
 
-    monkeypatch.setattr(goodness_of_fit, "_left_over", counted)
-    windows = fitted_windows(build_graph([chain]).problem)
+    monkeypatch.setattr(goodness_of_fit, "_mean_squares", counted)
+    windows = fit_windows(build_graph([chain]).problem)
     assert (windows.factors < 0.1).all()
     assert len(rounds) <= 8
 
@@ -99,7 +99,7 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
     drive = made_long_drive(5, LENGTH_M)
     graph = build_graph([with_a_moved_tag(drive)])
     best = solve(graph.problem, drive.true_state(graph))
-    assert not fitted_windows(graph.problem).judge(best.state).fits
+    assert not fit_windows(graph.problem).judge(best.state).fits
 
 
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])

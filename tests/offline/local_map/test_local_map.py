@@ -13,7 +13,7 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameter
 from groundsbot.offline.local_map import local_map
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.coarse_chain import coarse_keyframes, coarsened, refined
+from groundsbot.offline.measurements.coarse_chain import coarse_keyframes, coarsen, refine_poses
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
@@ -72,7 +72,7 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
     """Has the first start be dead reckoning; gathers what is started from."""
     starts: list[Chain] = []
-    built_up: Callable[[Chain, Effort], Any] = local_map._built_up
+    built_up: Callable[[Chain, Effort], Any] = local_map._build_up
 
     def worse(chain: Chain, effort: Effort) -> Any:
         starts.append(chain)
@@ -80,33 +80,33 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
         if len(starts) > 1:
             return known
         return known._replace(
-            poses=chain.odometry.dead_reckoned(), wheel_calibration=np.zeros(3), tags={}, calibration={}
+            poses=chain.odometry.dead_reckon(), wheel_calibration=np.zeros(3), tags={}, calibration={}
         )
 
-    monkeypatch.setattr(local_map, "_built_up", worse)
+    monkeypatch.setattr(local_map, "_build_up", worse)
     return starts
 
 
 def test_a_coarse_chain_is_the_same_drive() -> None:
     chain = made_long_drive(4, 100.0).chain
     keyframes = coarse_keyframes(chain)
-    coarse = coarsened(chain, keyframes)
+    coarse = coarsen(chain, keyframes)
     assert len(keyframes) < 0.5 * len(chain.stamps_ns)
     assert (keyframes[0], keyframes[-1]) == (0, len(chain.stamps_ns) - 1)
     calibration = 1e-4 * np.array([1.0, -2.0, 3.0])
     np.testing.assert_allclose(
-        se2.between(coarse.odometry.dead_reckoned(), chain.odometry.dead_reckoned()[keyframes]), 0.0, atol=1e-9
+        se2.between(coarse.odometry.dead_reckon(), chain.odometry.dead_reckon()[keyframes]), 0.0, atol=1e-9
     )
     np.testing.assert_allclose(
-        se2.between(coarse.odometry.dead_reckoned(calibration), chain.odometry.dead_reckoned(calibration)[keyframes]),
+        se2.between(coarse.odometry.dead_reckon(calibration), chain.odometry.dead_reckon(calibration)[keyframes]),
         0.0,
         atol=1e-4,
     )
     assert coarse.odometry.distance_m.sum() == pytest.approx(chain.odometry.distance_m.sum())
     assert {chain.tags[t] for t in np.unique(chain.readings.tag)} == set(coarse.tags)
     # Wherever a chain is cut in between, covariances and Jacobians come out the same.
-    again = coarsened(coarse, np.array([0, len(keyframes) // 3, len(keyframes) - 1]))
-    at_once = coarsened(chain, keyframes[[0, len(keyframes) // 3, -1]])
+    again = coarsen(coarse, np.array([0, len(keyframes) // 3, len(keyframes) - 1]))
+    at_once = coarsen(chain, keyframes[[0, len(keyframes) // 3, -1]])
     np.testing.assert_allclose(again.odometry.covariance, at_once.odometry.covariance, rtol=1e-9)
     np.testing.assert_allclose(again.odometry.jacobian, at_once.odometry.jacobian, rtol=1e-9, atol=1e-12)
 
@@ -115,7 +115,7 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
     chain = made_long_drive(4, 100.0).chain
     keyframes = coarse_keyframes(chain)
     poses = np.random.default_rng(0).normal(size=(len(keyframes), 3))
-    found = refined(chain, keyframes, poses, np.zeros(3))
+    found = refine_poses(chain, keyframes, poses, np.zeros(3))
     np.testing.assert_allclose(se2.between(found[keyframes], poses), 0.0, atol=1e-9)
     inside = np.setdiff1d(np.arange(len(chain.stamps_ns) - 1), keyframes - 1)
     np.testing.assert_allclose(

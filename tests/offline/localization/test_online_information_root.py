@@ -12,10 +12,10 @@ from groundsbot.offline.localization.online import information_root
 from groundsbot.offline.localization.online.drive import Table
 from groundsbot.offline.localization.online.information_root import OnlineRoot
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
-from groundsbot.offline.localization.online.moving_frame import Known, pose_among, turned
+from groundsbot.offline.localization.online.moving_frame import Known, pose_among, rotate_step
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import State, stacked
+from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD
 from tests.benchmarks.accuracy.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one
@@ -43,7 +43,7 @@ def _root_about(online: OnlineLocalizer, calibration: FloatArray, places_m: Floa
     prior = OnlinePrior(online._known, smoother._numbers, calibration)
     root = OnlineRoot(prior, smoother.drive.poses[0], held=False)
     for tag, place_m in enumerate(places_m):
-        root.add_tag(place_m, smoother.held.get(tag))
+        root.add_tag(place_m, smoother.map_tags.get(tag))
     while not root.is_at_end_of(smoother.drive):
         root.advance(smoother.drive)
     return root
@@ -53,9 +53,9 @@ def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray
     """Information and gradient by the solver's own factors, of the same drive about the same points."""
     smoother, tags = online._smoother, online._index
     graph = unheld(build_graph([smoother.drive.chain(tags)]))
-    names = {tag: smoother.held[i] for tag, i in tags.items() if i in smoother.held}
+    names = {tag: smoother.map_tags[i] for tag, i in tags.items() if i in smoother.map_tags}
     numbers = dict(zip(online._parameters, calibration.tolist(), strict=True))
-    graph = online._known.held_in(graph, names)
+    graph = online._known.constrain(graph, names)
     problem = graph.problem
     state = graph.start(smoother.drive.poses.copy(), dict(zip(tags, smoother.places_m, strict=True)), numbers)
     residual = problem.readings.residual(state)
@@ -70,7 +70,7 @@ def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray
         weighed,
         problem.prior.linearise(state, problem.columns),
     )
-    jacobian, residuals = stacked(kinds, problem.columns.n)
+    jacobian, residuals = stack(kinds, problem.columns.n)
     information, gradient = (jacobian.T @ jacobian).toarray(), jacobian.T @ residuals
     factor = problem.measured.known
     at = factor.columns(problem.columns)
@@ -201,7 +201,7 @@ def test_tags_that_turn_together_go_along_arcs(twist: tuple[float, float, float]
     known = Known(np.zeros((12, 12)), np.zeros(12), np.concatenate([places_m, np.full((7, 2), np.nan)]))
 
     def went(steps_m: FloatArray) -> FloatArray:
-        return turned(known, np.concatenate([np.zeros(first), steps_m.reshape(-1)]), first)[first:].reshape(-1, 2)
+        return rotate_step(known, np.concatenate([np.zeros(first), steps_m.reshape(-1)]), first)[first:].reshape(-1, 2)
 
     along_arcs = se2.apply(se2.exp(np.array(twist)), places_m - middle) + middle - places_m
     np.testing.assert_allclose(went(straight), along_arcs, atol=1e-12)
@@ -251,7 +251,7 @@ def _straight_step(root: OnlineRoot) -> FloatArray:
 
 
 def _turned(root: OnlineRoot, step: FloatArray) -> FloatArray:
-    return turned(root._known, step, root.prior.first_tag)
+    return rotate_step(root._prior, step, root.prior.first_tag)
 
 
 def _feed(online: OnlineLocalizer, taken: Sequence[Taken]) -> None:
@@ -264,7 +264,7 @@ def _feed(online: OnlineLocalizer, taken: Sequence[Taken]) -> None:
 
 def _called(online: OnlineLocalizer, tag: TagKey) -> TagKey:
     """In this scene tags bear the map's names."""
-    return online._smoother.held.get(online._index[tag], tag)
+    return online._smoother.map_tags.get(online._index[tag], tag)
 
 
 def _finish(work: Iterator[None]) -> None:

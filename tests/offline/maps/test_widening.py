@@ -13,7 +13,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.fit_results import Misfit
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose
-from groundsbot.offline.maps.widening import TagScatter, widened
+from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.report.sentences import contradiction_sentence, sentences
 from tests.support.data.maps import made_component, made_map
 
@@ -34,7 +34,7 @@ def full_component() -> Component:
 
 def test_everything_reported_grows_by_the_factor() -> None:
     before = full_component()
-    after = widened(before, MISFIT, QUIET)
+    after = inflate_covariances(before, MISFIT, QUIET)
     assert (after.sigma_factor, after.misfit) == (1.5, MISFIT)
     pairs = [
         (after.joint_covariance, before.joint_covariance),
@@ -57,14 +57,14 @@ def test_everything_reported_grows_by_the_factor() -> None:
     ]
     for large, small in pairs:
         np.testing.assert_allclose(large, 2.25 * small)
-    assert widened(before, None, QUIET) is before
+    assert inflate_covariances(before, None, QUIET) is before
 
 
 def test_what_passes_add_is_an_error_of_the_tags_own() -> None:
     before = full_component()
     added_m2 = np.zeros((3, 2, 2))
     added_m2[0] = 0.01 * np.eye(2)
-    after = widened(before, None, TagScatter(np.array([3.0, 1.0, 1.0]), added_m2))
+    after = inflate_covariances(before, None, TagScatter(np.array([3.0, 1.0, 1.0]), added_m2))
     grown = after.joint_covariance - before.joint_covariance
     np.testing.assert_allclose(grown[6:8, 6:8], added_m2[0])
     assert np.count_nonzero(grown) == 2
@@ -79,7 +79,7 @@ def test_what_passes_add_is_an_error_of_the_tags_own() -> None:
 
 def test_files_keep_the_factor_and_old_ones_have_none(tmp_path: Path) -> None:
     scatter = TagScatter(np.array([3.0, 1.0, 1.0]), np.zeros((3, 2, 2)))
-    write_map(made_map(widened(made_component(), MISFIT, scatter)), tmp_path)
+    write_map(made_map(inflate_covariances(made_component(), MISFIT, scatter)), tmp_path)
     (found,) = read_map(tmp_path).components
     assert (found.sigma_factor, found.misfit, found.tags[0].sigma_factor) == (1.5, MISFIT, 3.0)
     document = json.loads((tmp_path / "map.json").read_text())
@@ -98,7 +98,7 @@ def test_files_keep_the_factor_and_old_ones_have_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("kind", "said"), [("joins", "each other"), ("windows", "the model")])
 def test_terminal_and_report_say_it_first(kind: str, said: str) -> None:
-    result = made_map(widened(made_component(), replace(MISFIT, kind=kind), QUIET))
+    result = made_map(inflate_covariances(made_component(), replace(MISFIT, kind=kind), QUIET))
     first = summary(result, Path("out"))[0]
     assert first.startswith(f"These drives contradict {said} by more than chance explains (90 squared sigmas, 40 expec")
     assert "all sigmas are 1.5 times as large as computed" in first
@@ -118,7 +118,7 @@ def test_gentle_maps_say_nothing_of_it() -> None:
 
 def test_of_several_components_the_worst_is_named() -> None:
     result = made_map(
-        widened(made_component(), MISFIT, QUIET),
-        widened(made_component("a_b", "c_d"), Misfit("joins", "c_d", 360.0, 40), QUIET),
+        inflate_covariances(made_component(), MISFIT, QUIET),
+        inflate_covariances(made_component("a_b", "c_d"), Misfit("joins", "c_d", 360.0, 40), QUIET),
     )
     assert contradiction_sentence(map_as_json(result)).startswith("In component 2 drives contradict each other")

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.calib.tags.edges import moved_out
+from groundsbot.calib.tags.edges import shift_edges
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import CalibrationResult
@@ -36,7 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """All sides seen 0.05 px too far in."""
     folder: Path = tmp_path_factory.mktemp("shifted")
     plain = load_run(write_drive(folder, made_drive(START, LEGS), TAGS, made_robot("a"), corner_sigma_px=SIGMA_PX))
-    corners_px = moved_out(plain.detections.corners_px, SHIFT_PX)
+    corners_px = shift_edges(plain.detections.corners_px, SHIFT_PX)
     return replace(plain, detections=replace(plain.detections, corners_px=corners_px))
 
 

@@ -146,8 +146,8 @@ def test_a_moving_robot_reads_less_well_by_what_stamps_scatter() -> None:
     assert readings.parts.names == POSITION_NOISE
     noisier = NOISE.model_copy(update={STAMP_NOISE: 0.05})
     np.testing.assert_allclose(
-        readings.weighed(noisier).covariance[0], still + 25.0 * np.outer(by_stamp, by_stamp), rtol=1e-9
+        readings.with_noise(noisier).covariance[0], still + 25.0 * np.outer(by_stamp, by_stamp), rtol=1e-9
     )
     own = read_one(value, polar=True, in_camera=True)
     np.testing.assert_array_equal(own.covariance[0], COVARIANCE)
-    np.testing.assert_array_equal(own.weighed(noisier).covariance[0], COVARIANCE)
+    np.testing.assert_array_equal(own.with_noise(noisier).covariance[0], COVARIANCE)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2, wheels
-from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
 from tests.support.data.drives import START_NS, MadeDrive, S, made_drive
@@ -32,7 +32,7 @@ def test_motions_over_any_keyframes_lead_where_all_arcs_lead(after_ns: list[int]
     found = odometry(made, stamps)
     true = made.at(stamps)
     np.testing.assert_allclose(found.motion, se2.between(true[:-1], true[1:]), atol=1e-9)
-    np.testing.assert_allclose(found.dead_reckoned(start=true[0])[:, :2], true[:, :2], atol=1e-9)
+    np.testing.assert_allclose(found.dead_reckon(start=true[0])[:, :2], true[:, :2], atol=1e-9)
 
 
 def test_how_finely_readings_are_spaced_makes_no_difference() -> None:
@@ -124,12 +124,10 @@ def test_dead_reckoning_takes_a_calibration() -> None:
     made = drive()
     truly_left_m, truly_right_m = made.left_m * 1.01 * 0.999, made.right_m * 1.01 * 1.001
     steps = wheels.advance(np.diff(truly_left_m), np.diff(truly_right_m), TRACK_M * 1.005)
-    true = chained(steps, np.array([1.0, 2.0, 0.5]))
-    found = odometry(made, made.stamps_ns[::10]).dead_reckoned(np.array([0.01, 0.002, 0.005]), true[0])
+    true = chain_motions(steps, np.array([1.0, 2.0, 0.5]))
+    found = odometry(made, made.stamps_ns[::10]).dead_reckon(np.array([0.01, 0.002, 0.005]), true[0])
     np.testing.assert_allclose(found[:, :2], true[::10, :2], atol=2e-3)
-    assert (
-        np.linalg.norm(odometry(made, made.stamps_ns[::10]).dead_reckoned(start=true[0])[-1, :2] - true[-1, :2]) > 0.01
-    )
+    assert np.linalg.norm(odometry(made, made.stamps_ns[::10]).dead_reckon(start=true[0])[-1, :2] - true[-1, :2]) > 0.01
 
 
 def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
@@ -158,7 +156,7 @@ def test_one_keyframe_has_no_motion() -> None:
     found = odometry(drive(), [START_NS])
     assert len(found) == 0
     assert found.covariance.shape == (0, 3, 3)
-    np.testing.assert_array_equal(found.dead_reckoned(start=np.array([1.0, 2.0, 3.0])), [[1.0, 2.0, 3.0]])
+    np.testing.assert_array_equal(found.dead_reckon(start=np.array([1.0, 2.0, 3.0])), [[1.0, 2.0, 3.0]])
 
 
 def test_a_robot_that_stands_still_is_certain_but_not_infinitely() -> None:

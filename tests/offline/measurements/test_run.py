@@ -161,7 +161,7 @@ def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
     run = load_run(
         write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02), ("/tags/observations", sent)])
     )
-    other = run.retimed(-0.003)
+    other = run.shift_stamps(-0.003)
     assert (other.picture_stamps_ns - run.picture_stamps_ns).tolist() == [3_000_000] * 2
     assert (other.detections.stamps_ns - run.detections.stamps_ns).tolist() == [3_000_000]
     assert (other.positions.stamps_ns - run.positions.stamps_ns).tolist() == [3_000_000]
@@ -285,7 +285,7 @@ def test_a_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
 
 def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
     log = write_log(tmp_path, [*TWO_READINGS, picture(0.05, tag(1))])
-    text = refusal(log, {"carl": RobotFile(ROBOT, CAMERA.scaled(0.5))})
+    text = refusal(log, {"carl": RobotFile(ROBOT, CAMERA.resize(0.5))})
     for part in ("1280x720", "--robot", "640x360"):
         assert part in text
 

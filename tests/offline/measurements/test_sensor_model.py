@@ -12,7 +12,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, EDGE_SHIFT, RANGE_OFFSET, TIME_OFFSET
 from groundsbot.calib.robot.robot_yaml import Robot
-from groundsbot.calib.tags.edges import moved_out
+from groundsbot.calib.tags.edges import shift_edges
 from groundsbot.offline.mapping.inputs import check_tag_sizes
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
@@ -317,7 +317,7 @@ def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) 
     corners_px = corners_of(tag)
 
     def read(too_far_out_px: float) -> Readings:
-        seen = np.tile(moved_out(corners_px, -too_far_out_px), (3, 1, 1))
+        seen = np.tile(shift_edges(corners_px, -too_far_out_px), (3, 1, 1))
         detections = detections_of(seen, [0, 0, 0])
         return read_detections(run, detections, np.arange(3), np.zeros((3, 2)), NOISE)[0]
 

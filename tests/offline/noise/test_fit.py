@@ -21,7 +21,7 @@ from groundsbot.offline.measurements.sensor_model.sensor_model import STAMP_NOIS
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.fit import fit_noise
 from groundsbot.offline.noise.likelihood import Looker
-from groundsbot.offline.noise.reweighing import fit_and_weigh, weighed_as
+from groundsbot.offline.noise.reweighing import fit_and_weigh, with_noise_of_map
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
 from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
@@ -88,7 +88,7 @@ def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no
     assert found.noise == fit_and_weigh(maps[1:], PRIOR).noise
     larger = {name: max(value, getattr(PRIOR, name)) for name, value in found.noise.model_dump().items()}
     assert larger != found.noise.model_dump()
-    expected = maps[0].chain.weighed(NoiseParameters(**larger)).odometry.covariance
+    expected = maps[0].chain.with_noise(NoiseParameters(**larger)).odometry.covariance
     np.testing.assert_allclose(found.maps[0].chain.odometry.covariance, expected)
     alone = fit_and_weigh([odd], PRIOR)
     assert alone.noise == PRIOR
@@ -199,13 +199,15 @@ def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) 
 @pytest.mark.parametrize("prior", [PRIOR, NoiseParameters(sigma_corner_px=0.05)])
 def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap], prior: NoiseParameters) -> None:
     """Of m readings of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
-    plain = [solve_local_map(each.chain.weighed(prior)) for each in maps]
+    plain = [solve_local_map(each.chain.with_noise(prior)) for each in maps]
     refined = []
     for each in plain:
         bias_px = np.tile([0.1, 0.2], (len(each.chain.readings), 1))
         chain = replace(each.chain, readings=replace(each.chain.readings, corner_bias_px=bias_px))
         refined.append(replace(each, chain=chain))
-    for before, after in zip(weighed_as(plain, prior, None), weighed_as(refined, prior, None), strict=True):
+    for before, after in zip(
+        with_noise_of_map(plain, prior, None), with_noise_of_map(refined, prior, None), strict=True
+    ):
         assert (before.chain.readings.corner_sigmas == 1.0).all()
         times = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
         m = (times - 1.0) / (0.1 / prior.sigma_corner_px) ** 2

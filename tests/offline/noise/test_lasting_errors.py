@@ -35,13 +35,13 @@ def covariance(place: FloatArray, series: FloatArray) -> FloatArray:
 
 
 def test_drawn_errors_have_the_covariance_of_the_process(errors: LastingErrors, covariance: FloatArray) -> None:
-    root = errors.drawn(np.eye(len(covariance)))
+    root = errors.correlate(np.eye(len(covariance)))
     np.testing.assert_allclose(root @ root.T, covariance, atol=1e-12)
 
 
 def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
     rows = np.random.default_rng(0).standard_normal((len(covariance), 3))
-    squares = (errors.projected(rows) ** 2).sum(axis=0)
+    squares = (errors.correlate_transpose(rows) ** 2).sum(axis=0)
     np.testing.assert_allclose(squares, np.einsum("in,ij,jn->n", rows, covariance, rows))
 
 
@@ -51,5 +51,5 @@ def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: Flo
 
 def test_without_readings_there_is_nothing() -> None:
     none = LastingErrors(np.zeros(0, dtype=np.int64), np.zeros(0))
-    assert none.drawn(np.zeros((0, 8))).shape == (0, 8)
+    assert none.correlate(np.zeros((0, 8))).shape == (0, 8)
     assert none.alike().shape == (0,)

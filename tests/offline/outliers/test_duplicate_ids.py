@@ -10,7 +10,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import Detections, TagKey
-from groundsbot.offline.outliers.duplicate_ids import told_apart
+from groundsbot.offline.outliers.duplicate_ids import split_duplicates
 from groundsbot.offline.outliers.outliers import split_alone
 from tests.support.data.drives import (
     CAMERA,
@@ -69,7 +69,7 @@ def test_two_tags_in_one_picture_are_duplicated() -> None:
 
 
 def test_each_keeps_its_readings_however_they_are_ordered() -> None:
-    (chain,) = (told_apart(each) for each in chains_of(drive_past(TAGS), NoiseParameters()))
+    (chain,) = (split_duplicates(each) for each in chains_of(drive_past(TAGS), NoiseParameters()))
     first, second = (chain.readings.tag == i for i in (0, 1))
     assert [tag.tag_id for tag in chain.tags] == [0, 0, 1, 2, 3]
     assert first.sum() > 15 and second.sum() > 15  # noqa: PT018
@@ -88,7 +88,7 @@ def back_and_forth(tags: list[MadeTag], slip_rad: float) -> LocalMap:
     looks = np.minimum(stamps_ns - drive.stamps_ns[0], drive.stamps_ns[-1] - stamps_ns) < 2 * S
     run = seen_by(drive, tags, stamps_ns[looks], told)
     noise = NoiseParameters(sigma_heading_rad_per_sqrt_m=0.15)
-    (chain,) = (told_apart(each) for each in chains_of(run, noise))
+    (chain,) = (split_duplicates(each) for each in chains_of(run, noise))
     return split_alone(solve_local_map(chain))
 
 
@@ -108,4 +108,4 @@ def test_three_with_one_id_stay_three() -> None:
 
 def test_a_drive_past_one_of_each_id_is_left_as_it_is() -> None:
     (chain,) = chains_of(drive_past(TAGS[1:]), NoiseParameters())
-    assert told_apart(chain) is chain
+    assert split_duplicates(chain) is chain

@@ -13,7 +13,7 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import Grown
-from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_where_broken
+from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
 from tests.support.data.broken_odometry import made_clean_drive
 from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
@@ -50,7 +50,7 @@ def test_the_map_is_as_good_as_that_of_two_runs() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_split_where_nothing_broke(seed: int) -> None:
     local_map = solve_local_map(made_clean_drive(seed).chain)
-    mended = split_where_broken([local_map])
+    mended = split_at_breaks([local_map])
     assert mended.maps == [local_map]
     assert not mended.warnings
 
@@ -128,4 +128,4 @@ def test_stretches_of_several_runs_keep_their_names() -> None:
     one, other = (
         solve_local_map(replace(made_clean_drive(seed).chain.prefix(200), name=f"r{seed}")) for seed in (0, 1)
     )
-    assert [each.chain.name for each in split_where_broken([one, other]).maps] == ["r0", "r1"]
+    assert [each.chain.name for each in split_at_breaks([one, other]).maps] == ["r0", "r1"]

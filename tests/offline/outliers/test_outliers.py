@@ -23,11 +23,11 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.outliers.evidence import gathered, heard, noise_scales
+from groundsbot.offline.outliers.evidence import linearise_observations, marginalise, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.outliers import Searched, split_together, with_outliers_apart
-from groundsbot.offline.outliers.places import NOWHERE, settled
+from groundsbot.offline.outliers.places import NOWHERE, minimise_places
 from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
 from groundsbot.offline.sam.arrowhead import covariance
 from groundsbot.offline.sam.graph import build_graph
@@ -145,10 +145,10 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
     seen = searched()
     own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
-    plain = heard(seen.graph, seen.solution.state, np.ones((4, 2)))
-    bare = gathered(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
+    plain = linearise_observations(seen.graph, seen.solution.state, np.ones((4, 2)))
+    bare = marginalise(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
     at = int(np.flatnonzero(bare.which == own)[0])
-    gain, _ = gain_of(settled(bare, seen.place[bare.which]), np.array([at]))
+    gain, _ = gain_of(minimise_places(bare, seen.place[bare.which]), np.array([at]))
     joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)
     place = seen.place.copy()
     place[own] = place.max() + 1
@@ -167,17 +167,17 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
     whole = information.times(np.eye(n))
     monkeypatch.setattr(covariance, "_FEW", 0)
     scales = noise_scales([each.goodness for each in local_maps()])
-    apart = gathered(heard(seen.graph, seen.solution.state, scales), seen.sightings).information
+    apart = marginalise(linearise_observations(seen.graph, seen.solution.state, scales), seen.sightings).information
     assert apart.root.below.shape[0] > 0
     assert information.root.below.shape[0] == 0
     gather = np.zeros((2 * int(seen.places.place.max()) + 2, n))
     gather[rows_of(seen.places.place), np.arange(n)] = 1.0
     across = whole @ gather.T
     stiffness = whole - across @ np.linalg.inv(gather @ across + NOWHERE * np.eye(len(gather))) @ across.T
-    members = seen.places.held[3].members
+    members = seen.places.tracks[3].members
     rows = rows_of(members)
     for each in (information, apart):
-        parts = each.gathered(seen.places.place, len(gather) // 2)
+        parts = each.gather(seen.places.place, len(gather) // 2)
         assert_allclose(each.times(np.eye(n)), whole, rtol=0.0, atol=1e-6 * whole.max())
         assert_allclose(each.among(rows), whole[np.ix_(rows, rows)], rtol=0.0, atol=1e-6 * whole.max())
         assert_allclose(parts.whole(), gather @ across, rtol=0.0, atol=1e-6 * whole.max())
@@ -190,7 +190,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
 
 def test_all_splits_of_a_place_are_weighed_at_once() -> None:
     places = searched().places
-    held = next(each for each in places.held if len(each.members) > 3)
+    held = next(each for each in places.tracks if len(each.members) > 3)
     masks = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
     masks = np.pad(masks, ((0, 0), (0, len(held.members) - 4)))
     one_by_one = [gain_of(places, held.members[mask > 0.0])[0] for mask in masks]

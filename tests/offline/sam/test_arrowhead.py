@@ -155,12 +155,12 @@ def test_gradient_is_the_costs_derivative(seed: int, loss: Loss) -> None:
     """Far from the optimum too: residuals, Jacobians and losses belong together."""
     problem, truth = made_graph(seed, [20, 9], 4)
     rng = np.random.default_rng(seed)
-    start = problem.moved(truth, 0.1 * rng.standard_normal(problem.columns.n))
+    start = problem.retract(truth, 0.1 * rng.standard_normal(problem.columns.n))
     arrowhead = arrowhead_of(problem)
     system, _ = arrowhead.linearise(start, loss, loss)
     way = rng.standard_normal(problem.columns.n)
     way /= np.linalg.norm(way)
-    ahead, behind = (arrowhead.linearise(problem.moved(start, h * way), loss, loss)[1] for h in (1e-6, -1e-6))
+    ahead, behind = (arrowhead.linearise(problem.retract(start, h * way), loss, loss)[1] for h in (1e-6, -1e-6))
     slope = float(system.gradient[arrowhead.tangent] @ way)
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=1e-4, abs=1e-4 * float(np.linalg.norm(system.gradient)))
 

@@ -50,7 +50,7 @@ def test_costs_fall_and_the_reason_is_given() -> None:
     assert found.reason == "converged"
     assert all(after < before for before, after in zip(found.costs, found.costs[1:], strict=False))
     assert found.n_linearised >= len(found.costs)
-    assert found.untied.n_directions == 0
+    assert found.unobservable.n_directions == 0
     assert found.rank == fleet.problem.columns.n
 
 
@@ -86,7 +86,7 @@ def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
     )
     loose = Problem(problem.odometry, readings, problem.prior, problem.columns, np.zeros(3, dtype=np.int64))
     found = solve(loose, truth)
-    assert found.untied.chains == (1,)
+    assert found.unobservable.chains == (1,)
     assert found.rank == problem.columns.n - 3
     assert np.isfinite(found.state.poses).all()
     sigma = np.sqrt(found.covariance(problem.columns.poses[60]).diagonal())
@@ -115,6 +115,6 @@ def test_other_weights_on_the_same_factors_solve_like_a_new_problem() -> None:
         odometry=replace(problem.odometry, whitening=odometry),
         readings=replace(problem.readings, whitening=readings),
     )
-    found, expected = solve(problem.reweighed(odometry, readings), truth), solve(anew, truth)
+    found, expected = solve(problem.reweigh(odometry, readings), truth), solve(anew, truth)
     assert found.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(found.state.tags, expected.state.tags, atol=1e-9)

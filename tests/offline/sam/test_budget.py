@@ -12,11 +12,11 @@ from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import load_run
-from groundsbot.offline.outliers.odometry_breaks import split_where_broken
+from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.sam.budget import Effort, efforts_of, size_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
-from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
@@ -185,13 +185,13 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         return solution
 
     monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
-    told_by([found], {chain.run.name: chain.run.robot}, NoiseParameters(), [effort], corners=False)
+    information_of([found], {chain.run.name: chain.run.robot}, NoiseParameters(), [effort], corners=False)
     assert 0.0 < sum(taken) < 0.5 * effort.allowed
 
 
 def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
     local_map = solve_local_map(broken_drive("carried", 1).drive.chain)
-    maps, warnings = split_where_broken([local_map], [Effort(1e8, 1e8, 1e9)])
+    maps, warnings = split_at_breaks([local_map], [Effort(1e8, 1e8, 1e9)])
     assert maps == [local_map]
     (warning,) = warnings
     assert "was not searched to the end: that takes more work than a log of this size is worth" in warning

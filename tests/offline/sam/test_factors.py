@@ -38,7 +38,7 @@ def numeric(residual: Callable[[State], FloatArray], problem: Problem, state: St
     """The same by central differences in the tangent space."""
     columns = []
     for step in h * np.eye(problem.columns.n):
-        ahead, behind = residual(problem.moved(state, step)), residual(problem.moved(state, -step))
+        ahead, behind = residual(problem.retract(state, step)), residual(problem.retract(state, -step))
         columns.append((ahead - behind).reshape(-1) / (2 * h))
     return np.array(columns).T
 
@@ -80,7 +80,7 @@ def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
     _, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
     h = 1e-6
     expected = [
-        (made.problem.cost(made.problem.moved(state, step)) - made.problem.cost(made.problem.moved(state, -step)))
+        (made.problem.cost(made.problem.retract(state, step)) - made.problem.cost(made.problem.retract(state, -step)))
         / (2 * h)
         for step in h * np.eye(made.problem.columns.n)
     ]

@@ -105,7 +105,7 @@ def test_the_time_offset_puts_late_stamps_right_as_retiming_does(polar: bool, in
     wrong = np.abs(misfit(graph, chain)).max()
     assert wrong > 0.1
     assert np.abs(misfit(graph, chain, time_offset_s=late_s)).max() < 0.02 * wrong
-    on_time = chain_of(late.retimed(late_s))
+    on_time = chain_of(late.shift_stamps(late_s))
     assert np.abs(misfit(build_graph([on_time]), on_time)).max() < 1e-6
 
 

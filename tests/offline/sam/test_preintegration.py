@@ -47,7 +47,7 @@ def test_poses_between_are_laid_where_they_are_likeliest() -> None:
     """Moving them alone would gain next to nothing, where dead reckoning would leave all of it to the last motion."""
     fleet = made_fleet(3, 2, 400, 12)
     problem, skeleton = fleet.problem, fleet.problem.skeleton
-    state = skeleton.relaxed(skeleton.starting_values(fleet.dead_reckoned, np.full((2, 3), 0.1)), problem.anchor, 2)
+    state = skeleton.solve(skeleton.starting_values(fleet.dead_reckoned, np.full((2, 3), 0.1)), problem.anchor, 2)
     between = problem.columns.poses[skeleton.index < 0].reshape(-1)
 
     def gain(poses: FloatArray) -> float:
@@ -65,7 +65,7 @@ def test_poses_between_are_laid_where_they_are_likeliest() -> None:
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_what_is_kept_stays_where_it_is(calibrated: bool) -> None:
     problem, truth, skeleton = made_skeleton(2, calibrated=calibrated)
-    same = skeleton.relaxed(truth, problem.anchor, 0)
+    same = skeleton.solve(truth, problem.anchor, 0)
     kept = skeleton.index >= 0
     np.testing.assert_array_equal(same.poses[kept], truth.poses[kept])
     assert np.isfinite(same.poses).all()
@@ -77,9 +77,9 @@ def test_what_is_kept_stays_where_it_is(calibrated: bool) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_relaxed_steps_lead_to_the_same_optimum_with_calibration_free(seed: int) -> None:
     problem, truth = made_graph(seed, [80, 60], 6, reach=0.3)
-    start = problem.moved(truth, 0.02 * np.random.default_rng(seed).standard_normal(problem.columns.n))
+    start = problem.retract(truth, 0.02 * np.random.default_rng(seed).standard_normal(problem.columns.n))
     one, other = solve(problem, start, relaxed_steps=2), solve(problem, truth)
     assert one.converged
     assert one.cost == pytest.approx(other.cost, rel=1e-9)
-    relaxed = problem.skeleton.relaxed(start, problem.anchor, 2)
+    relaxed = problem.skeleton.solve(start, problem.anchor, 2)
     assert problem.cost(relaxed) - other.cost < 0.05 * (problem.cost(start) - other.cost)

@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2, wheels
-from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.chain import chains_of
@@ -34,7 +34,7 @@ def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, 
 
     h = 1e-6
     columns = [
-        (residual(problem.moved(state, step)) - residual(problem.moved(state, -step))) / (2 * h)
+        (residual(problem.retract(state, step)) - residual(problem.retract(state, -step))) / (2 * h)
         for step in h * np.eye(problem.columns.n)
     ]
     jacobian = np.array(columns).T
@@ -70,7 +70,7 @@ def test_the_optimum_is_where_dense_gauss_newton_ends(seed: int, n_outliers: int
     for _ in range(40):
         hessian, gradient = dense_normal_equations(made.problem, state)
         step = np.asarray(-np.linalg.solve(hessian, gradient), dtype=np.float64)
-        state = made.problem.moved(state, step)
+        state = made.problem.retract(state, step)
         if np.abs(step).max() < 1e-7:
             break
     assert distance(made.problem, solution.state, state) < 1e-5
@@ -99,7 +99,7 @@ def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
 def test_steps_do_not_creep_where_many_readings_lie_beyond_the_threshold(seed: int) -> None:
     made = made_problem(seed)
     whitening = 5.0 * made.problem.readings.whitening  # sigmas told too small: most readings lie beyond 3 of them
-    problem = made.problem.reweighed(made.problem.odometry.whitening, whitening)
+    problem = made.problem.reweigh(made.problem.odometry.whitening, whitening)
     solution = solve(problem, made.truth)
     weights = losses_and_weights(solution.losses.readings, problem.readings.residual(solution.state))[1]
     assert (weights < 1.0).mean() > 0.3
@@ -218,7 +218,7 @@ def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> Loca
     root_m = np.sqrt(step_m)
     sigma = [noise.sigma_distance_m_per_sqrt_m * root_m, noise.sigma_lateral_m_per_sqrt_m * root_m]
     disturbance = se2.exp(np.array([*sigma, np.sqrt(heading_variance)]) * rng.standard_normal((n_steps, 3)))
-    true = chained(se2.compose(wheels.advance(left_m, right_m, 0.5), disturbance), np.zeros(3))
+    true = chain_motions(se2.compose(wheels.advance(left_m, right_m, 0.5), disturbance), np.zeros(3))
     stamps_ns = START_NS + 50_000_000 * np.arange(n_steps + 1, dtype=np.int64)
     counted_left_m, counted_right_m = (np.concatenate([[0.0], np.cumsum(each)]) for each in (left_m, right_m))
     track = WheelTrack(stamps_ns, counted_left_m, counted_right_m)

@@ -19,8 +19,14 @@ def both_ways(step: float) -> tuple[Arrowhead, State, State, State, FloatArray]:
     problem, state = made_graph(3, [40, 25], 6)
     random = step * np.random.default_rng(1).standard_normal(problem.columns.n)
     ordered = problem.arrowhead.in_order(random)
-    moved = problem.arrowhead.moved(state, ordered, problem.anchor)
-    return problem.arrowhead, state, moved, problem.arrowhead.rolled(state, ordered, problem.anchor, moved), ordered
+    moved = problem.arrowhead.retract(state, ordered, problem.anchor)
+    return (
+        problem.arrowhead,
+        state,
+        moved,
+        problem.arrowhead.retract_relative(state, ordered, problem.anchor, moved),
+        ordered,
+    )
 
 
 def difference(one: State, other: State) -> float:

@@ -26,12 +26,12 @@ from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
-from groundsbot.offline.self_calibration.information import told_by
+from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
-from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, corrected, opened
+from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, correct_robot, open_parameters
 from groundsbot.offline.self_calibration.robot_table import AGREES, ASKED, WRONG, verdict_lines
 from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose, is_overruled
-from groundsbot.offline.self_calibration.words import DRIVES, refused_lines
+from groundsbot.offline.self_calibration.words import DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
 from tests.support.data.drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
@@ -77,7 +77,7 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     readings = replace(chain.readings, corner_bias_px=np.tile(bias_px, (len(chain.readings), 1)))
     biased = replace(found, chain=replace(chain, readings=readings))
     robots, efforts = {chain.run.name: chain.run.robot}, [Effort(1e11, 1e11, 1e9)]
-    plain, less = (told_by([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
+    plain, less = (information_of([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
 
@@ -167,7 +167,7 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     reasons = {each.name: each.reason for each in result.choices}
     assert reasons["wheel_scale"] == TELLS_LESS
     assert {each.name for each in result.robot_numbers if each.verdict == ASKED} == {"wheel_ratio"}
-    (refused_line,) = refused_lines(result)
+    (refused_line,) = refusal_lines(result)
     assert refused_line.startswith("not freed: wheel_scale of a: held by robot.yaml's sigma")
     assert "--distance" in refused_line
     assert reasons["track_scale"] == "it was not asked for"
@@ -247,7 +247,7 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     wrong = mistaken(track_m=0.08, radius_left_m=0.02, yaw_rad=0.06, pitch_rad=-0.01)
     result = mapped(log, wrong)
     learnt = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in result.calibration}
-    better = corrected(wrong, learnt)
+    better = correct_robot(wrong, learnt)
     assert better.wheels.radius_left_m == pytest.approx(0.1, rel=1e-2)
     assert better.wheels.radius_left_m / better.wheels.radius_right_m == pytest.approx(1.0, rel=2e-3)
     assert better.wheels.track_m == pytest.approx(0.5, rel=1e-2)
@@ -259,23 +259,25 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
 
 def test_what_was_learnt_of_edges_is_written() -> None:
     robot = made_robot("a", edge_shift_px=0.02)
-    better = corrected(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
+    better = correct_robot(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
     assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
-    assert opened(robot, {Owned("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
+    assert open_parameters(robot, {Owned("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
 
 
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
     assert set(NAMES) == set(OPEN_SIGMAS) == set(DRIVES)
     robot = made_robot("a")
     batch = Owned(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
-    everything = opened(robot, {Owned("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15})
+    everything = open_parameters(
+        robot, {Owned("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15}
+    )
     sigmas = dict(zip(WHEEL_PARAMETERS, [each.sigma for each in parameters_of_wheels(everything)], strict=True))
     assert sigmas == pytest.approx({name: OPEN_SIGMAS[name] for name in WHEEL_PARAMETERS})
     assert everything.tags[0].relative_sigma == pytest.approx(OPEN_SIGMAS[TAG_SCALE])
     assert everything.mount.roll_rad_sigma == OPEN_SIGMAS["mount_roll_rad"]
     assert everything.mount.z_m_sigma == robot.mount.z_m_sigma
-    assert opened(robot, {}) == robot
-    assert opened(robot, {Owned("another", "track_scale"): 0.1}) == robot
+    assert open_parameters(robot, {}) == robot
+    assert open_parameters(robot, {Owned("another", "track_scale"): 0.1}) == robot
 
 
 def test_a_name_that_is_none_is_refused() -> None:

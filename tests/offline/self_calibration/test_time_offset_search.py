@@ -94,7 +94,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, float]:
 @pytest.mark.parametrize("late_s", [-0.1, 0.3, 0.6])
 def test_an_offset_of_a_camera_is_found(simulated: tuple[Run, float], late_s: float) -> None:
     run, drawn_s = simulated
-    found = found_in(run.retimed(-late_s))
+    found = found_in(run.shift_stamps(-late_s))
     assert found.offset_s == pytest.approx(late_s + drawn_s, abs=3.0 * found.sigma_s)
     assert found.sigma_s < 0.02
 

@@ -245,7 +245,7 @@ def test_a_place_that_cannot_be_written_to_costs_only_the_picture_to_look_at(tmp
 def test_a_terminal_shows_what_is_missing_and_rings_for_each_picture() -> None:
     screen = io.StringIO()
     guide, view = CaptureGuide(DEFAULT_BOARD, 30), CaptureView(Console(file=screen, force_terminal=True, width=120))
-    with view.shown():
+    with view.live():
         for index, picture in enumerate([*thrice(0, 4), EMPTY]):
             view.show(guide.handle_frame(picture, index * STEP_NS), guide)
     last = screen.getvalue().rpartition("groundsbot capture")[2]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.onboard.detection.corner_refinement import refined_corners
+from groundsbot.onboard.detection.corner_refinement import refine_corners
 from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.benchmarks.accuracy.corner_error_study import CASES, Case, Errors, pictures_of, study_case
 from tests.support.tag_pictures import draw_tag
@@ -31,11 +31,11 @@ def near_the_truth() -> FloatArray:
 
 
 def test_corners_come_to_lie_where_they_are() -> None:
-    found, good = refined_corners(picture(), near_the_truth()[None], CELLS)
+    found, good = refine_corners(picture(), near_the_truth()[None], CELLS)
     assert good.tolist() == [True]
     assert np.sqrt(np.mean((found[0] - LEANING) ** 2)) < 0.02
     # In whatever order they come: the sides are the same.
-    turned, _ = refined_corners(picture(), np.roll(near_the_truth(), 1, axis=0)[None, ::-1], CELLS)
+    turned, _ = refine_corners(picture(), np.roll(near_the_truth(), 1, axis=0)[None, ::-1], CELLS)
     np.testing.assert_allclose(turned[0, ::-1], np.roll(found[0], 1, axis=0), atol=5e-3)
 
 
@@ -43,7 +43,7 @@ def test_corners_come_to_lie_where_they_are() -> None:
 def test_light_from_one_side_is_not_taken_for_sides_that_lie_askew(blur_px: float) -> None:
     light = np.linspace(0.5, 1.0, 640)  # a sixth brighter at one end of the tag than at the other
     lit = cv2.GaussianBlur(picture(), (0, 0), blur_px) * light
-    found, good = refined_corners(lit.astype(np.uint8), near_the_truth()[None], CELLS)
+    found, good = refine_corners(lit.astype(np.uint8), near_the_truth()[None], CELLS)
     assert good.tolist() == [True]
     assert np.sqrt(np.mean((found[0] - LEANING) ** 2)) < 0.03
 
@@ -54,7 +54,7 @@ def test_small_tags_are_not_moved_by_the_cells_beside_their_border() -> None:
     for shift_px in np.random.default_rng(2).uniform(-0.5, 0.5, (6, 2)):
         true_px = small + shift_px
         blurred = cv2.GaussianBlur(draw_tag("tag36h11", 17, true_px), (0, 0), 0.9)
-        found, good = refined_corners(blurred.astype(np.uint8), true_px[None], CELLS)
+        found, good = refine_corners(blurred.astype(np.uint8), true_px[None], CELLS)
         assert good.tolist() == [True]
         errors.append(found[0] - true_px)
     assert np.abs(np.mean(errors, axis=0)).max() < 0.02
@@ -63,8 +63,8 @@ def test_small_tags_are_not_moved_by_the_cells_beside_their_border() -> None:
 def test_each_tag_of_a_picture_on_its_own() -> None:
     off = near_the_truth()
     elsewhere = off + np.array([40.0, 30.0])  # where no tag is
-    both, good = refined_corners(picture(), np.stack([elsewhere, off]), np.array([8, 8]))
-    alone, _ = refined_corners(picture(), off[None], CELLS)
+    both, good = refine_corners(picture(), np.stack([elsewhere, off]), np.array([8, 8]))
+    alone, _ = refine_corners(picture(), off[None], CELLS)
     assert good.tolist() == [False, True]
     np.testing.assert_array_equal(both[0], elsewhere)
     np.testing.assert_allclose(both[1], alone[0], atol=1e-3)
@@ -74,18 +74,18 @@ def test_each_tag_of_a_picture_on_its_own() -> None:
 def test_a_tag_with_something_before_one_side_stays_as_detected(first: tuple[int, int], last: tuple[int, int]) -> None:
     hidden = picture().copy()
     cv2.rectangle(hidden, first, last, 90.0, -1)
-    found, good = refined_corners(hidden, LEANING[None], CELLS)
+    found, good = refine_corners(hidden, LEANING[None], CELLS)
     assert good.tolist() == [False]
     np.testing.assert_array_equal(found[0], LEANING)
 
 
 def test_no_tag_and_a_tag_beyond_the_pictures_edge() -> None:
-    none, good = refined_corners(picture(), np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64))
+    none, good = refine_corners(picture(), np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64))
     assert none.shape == (0, 4, 2)
     assert good.shape == (0,)
     cut = picture()[:, 230:]  # through the tag
     there = LEANING - [230.0, 0.0]
-    found, good = refined_corners(cut, there[None], CELLS)
+    found, good = refine_corners(cut, there[None], CELLS)
     assert good.tolist() == [False]
     np.testing.assert_array_equal(found[0], there)
 
@@ -96,7 +96,7 @@ def test_a_lens_bends_sides_and_that_is_heeded() -> None:
     with_lens, without = Errors(), Errors()
     for grey, true_px in taken:
         for errors, model in ((with_lens, camera), (without, None)):
-            errors.add(refined_corners(grey, true_px[None], CELLS, model)[0][0], true_px)
+            errors.add(refine_corners(grey, true_px[None], CELLS, model)[0][0], true_px)
     assert with_lens.rmse_px < 0.06
     assert with_lens.rmse_px < 0.4 * without.rmse_px
 
@@ -109,7 +109,7 @@ def test_the_detector_sharpens_and_says_so() -> None:
     other = TagDetector(camera=camera)  # of pictures of another size: nothing is known of this lens
     assert "corners=sides,lens" in other.settings
     (detected,), (found,), (of_other,) = (each.detect(picture()) for each in (plain, sharp, other))
-    expected, _ = refined_corners(picture(), detected.corners_px[None], CELLS)
+    expected, _ = refine_corners(picture(), detected.corners_px[None], CELLS)
     np.testing.assert_array_equal(found.corners_px, expected[0])
     np.testing.assert_array_equal(of_other.corners_px, expected[0])
     assert np.abs(found.corners_px - detected.corners_px).max() > 0.005

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.foundation.picture_bytes import claimed_size
+from groundsbot.calib.foundation.picture_bytes import size_in_header
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.picture import decode, decode_grey
 
@@ -13,10 +13,10 @@ from groundsbot.onboard.log.picture import decode, decode_grey
 @pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
 def test_the_size_is_read_from_the_head(suffix: str, shape: tuple[int, ...]) -> None:
     encoded = cv2.imencode(suffix, np.zeros(shape, np.uint8))[1].tobytes()
-    assert claimed_size(encoded) == (64, 48)
+    assert size_in_header(encoded) == (64, 48)
     assert decode(encoded).shape[:2] == decode_grey(encoded).shape == (48, 64)
     for end in range(len(encoded)):
-        assert claimed_size(encoded[:end]) in ((64, 48), (0, 0), (64, 0), (0, 48))
+        assert size_in_header(encoded[:end]) in ((64, 48), (0, 0), (64, 0), (0, 48))
 
 
 def test_a_picture_that_would_fill_the_memory_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,8 +10,8 @@ LIMIT_S = 30.0  # only a program that hangs comes near
 # The lock that the main thread holds for moments in `wait` and in `set`.
 TOLD_WHILE_LOCKED = """
 import os, signal
-from groundsbot.onboard.process.ending import told_to_end
-stop = told_to_end()
+from groundsbot.onboard.process.ending import stop_event
+stop = stop_event()
 assert not stop.is_set()
 with stop._cond:
     for _ in range(100):
@@ -21,9 +21,9 @@ print(stop.wait(10.0))
 
 TOLD_WHAT_IS_IGNORED = """
 import os, signal
-from groundsbot.onboard.process.ending import told_to_end
+from groundsbot.onboard.process.ending import stop_event
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
-stop = told_to_end()
+stop = stop_event()
 os.kill(os.getpid(), signal.SIGHUP)
 print(stop.wait(0.2))
 """

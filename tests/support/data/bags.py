@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import wheels
-from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.robot_yaml import Mount
 from groundsbot.offline.importing.bags.reader import DEFINITIONS
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
@@ -163,7 +163,7 @@ class BagOfLog:
     def poses(self) -> FloatArray:
         """(N, 3) by the wheels, starting somewhere in odom."""
         left, right = np.diff(self.track.left_m), np.diff(self.track.right_m)
-        return chained(wheels.advance(left, right, self.run.robot.wheels.track_m), np.array([3.0, -2.0, 2.5]))
+        return chain_motions(wheels.advance(left, right, self.run.robot.wheels.track_m), np.array([3.0, -2.0, 2.5]))
 
     def odometry(self, topic: str = "/odom", covariances: FloatArray | None = None) -> "BagOfLog":
         """nav_msgs/Odometry from the wheels; covariances (N, 3, 3) of (x, y, yaw)."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2, wheels
-from groundsbot.calib.geometry.se2 import chained
+from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.run import Run
@@ -108,7 +108,7 @@ def made_drive(
     speeds = np.concatenate([np.tile([left, right], (round(s * S / step_ns), 1)) for left, right, s in legs])
     advances = speeds * step_ns * 1e-9
     stamps_ns = START_NS + step_ns * np.arange(len(speeds) + 1, dtype=np.int64)
-    poses = chained(wheels.advance(advances[:, 0], advances[:, 1], track_m), np.array(start, dtype=np.float64))
+    poses = chain_motions(wheels.advance(advances[:, 0], advances[:, 1], track_m), np.array(start, dtype=np.float64))
     left_m, right_m = (np.concatenate([[0.0], np.cumsum(advance)]) for advance in advances.T)
     return MadeDrive(stamps_ns, left_m, right_m, poses)
 
