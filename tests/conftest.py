@@ -147,6 +147,6 @@ def refused(map_to: Run, tmp_path: Path) -> Callable[..., str]:
 @pytest.fixture
 def logs(tmp_path: Path) -> dict[str, Path]:
     """Two short drives for `map`, by robot."""
-    from tests.support.data.map_cases import made_logs
+    from tests.support.data.map_cases import make_logs
 
-    return made_logs(tmp_path / "logs")
+    return make_logs(tmp_path / "logs")

@@ -116,13 +116,13 @@ def main() -> int:
         folder = Path(name)
         sources = revision_sources(arguments.revision, folder / "old"), checkout_sources(folder / "new")
         installed = [install(each, folder / "installed" / each.name) for each in sources]
-        n_different = _compared(installed, folder, arguments.relative)
+        n_different = _compare(installed, folder, arguments.relative)
         if arguments.keep:
             shutil.copytree(folder, arguments.keep, symlinks=True)
     return int(n_different > 0)
 
 
-def _compared(installed: Sequence[Path], folder: Path, relative: float) -> int:
+def _compare(installed: Sequence[Path], folder: Path, relative: float) -> int:
     made = _run_both(installed, folder / "inputs", INPUTS)
     n_different = report(made, relative)
     inputs = made[0].folder
@@ -186,7 +186,7 @@ def report(sides: Sequence[Side], relative: float) -> int:
         difference = relative_difference(old, new)
         n_different += relative == 0.0 or not difference <= relative
         say(f"differs: {name}, numbers by {difference:.1e} relative")
-    failed = [line for path in sorted(sides[0].folder.glob("*.printed")) for line in _failed(path)]
+    failed = [line for path in sorted(sides[0].folder.glob("*.printed")) for line in _failure(path)]
     for line in failed:
         say(f"REVISION ends with {line}")
     say(f"{n_same} files are the same, {n_different} are not")
@@ -196,7 +196,7 @@ def report(sides: Sequence[Side], relative: float) -> int:
 def relative_difference(old: Path, new: Path) -> float:
     """The largest of all numbers with a fraction, by the larger of the two; inf where anything else differs."""
     try:
-        (before, old_numbers), (after, new_numbers) = (_parted(path) for path in (old, new))
+        (before, old_numbers), (after, new_numbers) = (_split_numbers(path) for path in (old, new))
     except (UnicodeDecodeError, ValueError, McapError):
         return np.inf
     if before != after or len(old_numbers) != len(new_numbers):
@@ -206,7 +206,7 @@ def relative_difference(old: Path, new: Path) -> float:
     return float(np.max(np.abs(a - b) / np.where(largest > 0, largest, 1.0), initial=0.0))
 
 
-def _parted(path: Path) -> tuple[str, list[float]]:
+def _split_numbers(path: Path) -> tuple[str, list[float]]:
     """A file's text, whole numbers (ids, counts, stamps) included, and its numbers with a fraction or an exponent."""
     if path.suffix == ".npz":
         return _arrays_parted(path)
@@ -236,7 +236,7 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_file()]
 
 
-def _failed(path: Path) -> list[str]:
+def _failure(path: Path) -> list[str]:
     """The exit code and the command, where it did not do what it was to do."""
     command, code, *_ = path.read_text(encoding="utf-8").splitlines()
     return [] if code in DONE else [f"{code}: {command}"]

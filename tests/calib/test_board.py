@@ -10,7 +10,7 @@ from groundsbot.calib.board.board import DEFAULT_BOARD, Board, parse_board
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.printing.board import print_board
-from tests.support.scanned_prints import n_pages, scanned, words
+from tests.support.scanned_prints import n_pages, scan_page, words
 
 DPI = 300.0
 
@@ -32,7 +32,7 @@ def test_the_printed_board_is_found_at_its_true_size(tmp_path: Path, board: Boar
     assert board.specification in said
     assert ("--board" in said) == (board != DEFAULT_BOARD)
 
-    scan = scanned(pdf, DPI)
+    scan = scan_page(pdf, DPI)
     corners, ids, _, marker_ids = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(scan.picture)
     assert len(marker_ids) == board.n_markers
     assert len(ids) == (board.columns - 1) * (board.rows - 1)

@@ -28,7 +28,7 @@ def pictures(
     return [painter.picture(change(view), rng) for view in views]
 
 
-def saved(folder: Path, shown: list[ByteArray]) -> Path:
+def save(folder: Path, shown: list[ByteArray]) -> Path:
     folder.mkdir(exist_ok=True)
     for picture in shown:
         assert cv2.imwrite(str(folder / f"{len(list(folder.iterdir())):03d}.png"), picture)
@@ -51,7 +51,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Good:
     folder = tmp_path_factory.mktemp("good")
     shown = pictures(WIDE, 10)
     blurred = pictures(WIDE, 1, 3, change=lambda view: replace(view, defocus_px=1.0))
-    saved(folder / "pictures", [*shown, *blurred])
+    save(folder / "pictures", [*shown, *blurred])
     output = folder / "calibrated" / "camera.yaml"
     output.parent.mkdir()
     said = calibrate_camera([folder / "pictures"], output, None, "auto", "100", "front", 60, False)
@@ -120,15 +120,15 @@ def bad_cut_short(good: Good, folder: Path) -> list[object]:
 
 
 def bad_no_board(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", [np.full((480, 640), 90, np.uint8)] * 2)]
+    return [save(folder / "p", [np.full((480, 640), 90, np.uint8)] * 2)]
 
 
 def bad_one_view(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", good.pictures[:1])]
+    return [save(folder / "p", good.pictures[:1])]
 
 
 def bad_alike(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", [good.pictures[0], good.pictures[1]] * 5)]
+    return [save(folder / "p", [good.pictures[0], good.pictures[1]] * 5)]
 
 
 def bad_dictionary(good: Good, folder: Path) -> list[object]:
@@ -144,11 +144,11 @@ def bad_marker_size(good: Good, folder: Path) -> list[object]:
 
 
 def bad_sizes(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", [*good.pictures[:3], cv2.resize(good.pictures[3], (320, 240))])]  # type: ignore[list-item]
+    return [save(folder / "p", [*good.pictures[:3], cv2.resize(good.pictures[3], (320, 240))])]  # type: ignore[list-item]
 
 
 def bad_flipped(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", pictures(WIDE, 2, flipped=True))]
+    return [save(folder / "p", pictures(WIDE, 2, flipped=True))]
 
 
 def bad_ruler(good: Good, folder: Path) -> list[object]:
@@ -173,7 +173,7 @@ def bad_video(good: Good, folder: Path) -> list[object]:
 
 
 def bad_tiny(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", [np.zeros((60, 80), np.uint8)])]
+    return [save(folder / "p", [np.zeros((60, 80), np.uint8)])]
 
 
 def facing(view: View) -> View:
@@ -185,15 +185,15 @@ def facing(view: View) -> View:
 
 
 def bad_frontal(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", pictures(NARROW, 6, change=facing)), "--model", "plumb_bob"]
+    return [save(folder / "p", pictures(NARROW, 6, change=facing)), "--model", "plumb_bob"]
 
 
 def bad_blurred(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", pictures(WIDE, 5, change=lambda view: replace(view, defocus_px=8.0)))]
+    return [save(folder / "p", pictures(WIDE, 5, change=lambda view: replace(view, defocus_px=8.0)))]
 
 
 def bad_two_cameras(good: Good, folder: Path) -> list[object]:
-    return [saved(folder / "p", [*good.pictures[:5], *pictures(NARROW, 5)]), "--model", "plumb_bob"]
+    return [save(folder / "p", [*good.pictures[:5], *pictures(NARROW, 5)]), "--model", "plumb_bob"]
 
 
 def bad_model(good: Good, folder: Path) -> list[object]:
@@ -262,14 +262,14 @@ def test_an_output_that_cannot_be_is_refused_before_any_work(
 
 
 def test_a_camera_goes_on_fitting_pictures_it_took_later(good: Good, calib: Run, tmp_path: Path) -> None:
-    outcome = calib("check", good.camera, saved(tmp_path / "p", pictures(WIDE, 6, seed=5)))
+    outcome = calib("check", good.camera, save(tmp_path / "p", pictures(WIDE, 6, seed=5)))
     assert outcome.code == 0, outcome.out
     assert outcome.out.startswith("fits")
 
 
 def test_a_camera_that_was_changed_fits_no_more_and_it_is_said_where(good: Good, calib: Run, tmp_path: Path) -> None:
     refocused = replace(WIDE, fx_px=1.006 * WIDE.fx_px, fy_px=1.006 * WIDE.fy_px)
-    outcome = calib("check", good.camera, saved(tmp_path / "p", pictures(refocused, 6, seed=5)))
+    outcome = calib("check", good.camera, save(tmp_path / "p", pictures(refocused, 6, seed=5)))
     assert outcome.code == 3
     assert "does not fit any more" in outcome.out
     assert "the most at the" in outcome.out
@@ -297,7 +297,7 @@ def test_check_refuses_pictures_of_another_size(good: Good, calib: Run, tmp_path
 
 def test_a_fisheye_is_recognised_and_calibrated(calib: Run, tmp_path: Path) -> None:
     output = tmp_path / "camera.yaml"
-    outcome = calib("camera", saved(tmp_path / "p", pictures(FISHEYE, 7)), "-o", output)
+    outcome = calib("camera", save(tmp_path / "p", pictures(FISHEYE, 7)), "-o", output)
     assert outcome.code == 0, outcome.err
     model, estimate = read_camera_yaml(output), read_estimate(output)
     assert model.distortion_model == "equidistant"

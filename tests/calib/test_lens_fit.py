@@ -30,7 +30,7 @@ FINDER = BoardFinder(DEFAULT_BOARD)
 every_camera = pytest.mark.parametrize("camera", CASES.values(), ids=lambda camera: camera.name)
 
 
-def made_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Observations, list[View]]:
+def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Observations, list[View]]:
     """Exact corners and noise, without pictures."""
     rng = np.random.default_rng(seed)
     views = drawn_views(camera, DEFAULT_BOARD, count, rng)
@@ -109,7 +109,7 @@ def test_corners_of_edges_along_the_pixels_rows_are_as_good_as_others() -> None:
 
 def test_a_board_far_off_the_axis_of_a_fisheye_has_a_pose() -> None:
     """Its origin may even lie behind the camera."""
-    seen, views = made_corners(FISHEYE, 1, 30)
+    seen, views = make_corners(FISHEYE, 1, 30)
     origins = np.array([view.T_camera_board[2, 3] for view in views])
     assert origins.min() < 0.0
     for index, view in enumerate(views):
@@ -123,7 +123,7 @@ def test_a_board_far_off_the_axis_of_a_fisheye_has_a_pose() -> None:
 def test_a_fit_finds_the_camera_to_within_its_covariance(camera: CameraModel) -> None:
     squares = []
     for seed in range(2):
-        seen, views = made_corners(camera, seed)
+        seen, views = make_corners(camera, seed)
         size_px = (camera.width_px, camera.height_px)
         lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
         off = parameters_of(lens.fit.model) - parameters_of(camera)
@@ -136,7 +136,7 @@ def test_a_fit_finds_the_camera_to_within_its_covariance(camera: CameraModel) ->
 
 
 def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
-    seen, views = made_corners(WIDE, 1)
+    seen, views = make_corners(WIDE, 1)
     wrong = np.zeros(len(seen.view), dtype=bool)
     wrong[np.random.default_rng(0).choice(len(wrong), 20, replace=False)] = True
     seen.pixels[wrong] += [0.9, -0.7]
@@ -160,7 +160,7 @@ def test_a_turned_camera_is_no_other_camera() -> None:
 
 @every_camera
 def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera: CameraModel) -> None:
-    seen, views = made_corners(camera, 2)
+    seen, views = make_corners(camera, 2)
     start = first_guess(seen, len(views), (640, 480), camera.distortion_model, "c")
     lens = fit_lens(seen, len(views), start)
     covariance, grid = 0.01 * lens.covariance(), PictureGrid.of(lens.fit.model, 12)
@@ -180,7 +180,7 @@ def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera
 @pytest.mark.parametrize("n_corners", [1, 2])
 def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: CameraModel, n_corners: int) -> None:
     """Robust weights may leave a spoilt view as few: its pose is then no matter, and the others tell the camera."""
-    seen, views = made_corners(camera, seed=2, count=6)
+    seen, views = make_corners(camera, seed=2, count=6)
     T_camera_board = np.array([view.T_camera_board for view in views])
     poses = Poses(T_camera_board[:, :3, :3], T_camera_board[:, :3, 3])
     counts = (seen.view > 0) | (np.cumsum(seen.view == 0) <= n_corners)
@@ -195,7 +195,7 @@ def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
     """A kind with more freedom fits a little better each time, and bends where there are no corners."""
     size_px = (WIDE.height_px, WIDE.width_px)
     for seed in range(3):
-        seen, views = made_corners(WIDE, seed=seed, count=8)
+        seen, views = make_corners(WIDE, seed=seed, count=8)
         found = [_view_of(seen, index, size_px) for index in range(len(views))]
         assert first_fit(found, FINDER, "camera", KINDS).fit.model.distortion_model != "rational_polynomial"
 

@@ -11,7 +11,7 @@ from groundsbot.calib.printing.sheet import PAPERS_MM
 from groundsbot.calib.tags.family import families, family_size, tag_bits
 from groundsbot.onboard.detection.tag_detector import TagDetector
 from tests.support.programs import Run
-from tests.support.scanned_prints import n_pages, ruler_ticks_mm, scanned, words
+from tests.support.scanned_prints import n_pages, ruler_ticks_mm, scan_page, words
 
 DPI = 150.0
 RULER_DPI = 300.0
@@ -21,7 +21,7 @@ LETTERS_MM = 5.0  # a detector of tag16h5 sees tags in letters too
 
 def tags_on(pdf: Path, family: str, page: int) -> list[tuple[int, FloatArray]]:
     """Ids and corners `[4, 2]` of the tags on a sheet, in mm from the paper's upper left corner, in reading order."""
-    scan = scanned(pdf, DPI, page)
+    scan = scan_page(pdf, DPI, page)
     found = [
         (each.tag_id, scan.place_mm(each.corners_px))
         for each in TagDetector([family], quad_decimate=1.0).detect(scan.picture)
@@ -66,7 +66,7 @@ def test_without_packing_each_tag_has_a_sheet_and_its_white_margin(calib: Run, t
         ((found, corners),) = tags_on(pdf, "tag36h11", page)
         assert found == tag_id
         np.testing.assert_allclose(corners - corners.mean(axis=0), CORNERS * 150.0, atol=0.1)
-        scan = scanned(pdf, DPI, page)
+        scan = scan_page(pdf, DPI, page)
         cell_mm, bleed_mm = 150.0 / 8, 0.3
         (top, left), (inner_top, inner_left) = (scan.pixel(*(corners[0] - d)) for d in (cell_mm, bleed_mm))
         (bottom, right), (inner_bottom, inner_right) = (scan.pixel(*(corners[2] + d)) for d in (cell_mm, bleed_mm))
@@ -79,7 +79,7 @@ def test_cutting_marks_stand_around_the_white_margin_and_name(calib: Run, tmp_pa
     pdf = tmp_path / "tags.pdf"
     calib("tags", "--ids", "0", "--size-mm", "80", "-o", pdf)
     ((_, corners),) = tags_on(pdf, "tag36h11", 0)
-    scan = scanned(pdf, RULER_DPI)
+    scan = scan_page(pdf, RULER_DPI)
 
     def dark(x_mm: float, y_mm: float) -> bool:
         row, column = scan.pixel(x_mm, y_mm)
@@ -104,7 +104,7 @@ def test_the_rulers_ticks_are_a_millimetre_apart(
 ) -> None:
     pdf = tmp_path / "page.pdf"
     assert calib(*command, "--paper", paper, "-o", pdf).code == 0
-    scan = scanned(pdf, RULER_DPI)
+    scan = scan_page(pdf, RULER_DPI)
     width_mm, height_mm = PAPERS_MM[paper]
     np.testing.assert_allclose(scan.pixel_mm * scan.picture.shape[::-1], [width_mm, height_mm], atol=1e-4)
     for ticks_mm, longest_mm in zip(ruler_ticks_mm(scan), (height_mm, width_mm), strict=True):

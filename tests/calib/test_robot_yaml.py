@@ -40,14 +40,14 @@ wheels: {radius_left_m: 0.05, radius_right_m: 0.04, track_m: 0.3, ticks_per_turn
 """
 
 
-def documented(heading: str) -> str:
+def document(heading: str) -> str:
     """The text of one section of the documentation."""
     text = DOCUMENTATION.read_text(encoding="utf-8")
     return next(part for part in re.split(r"^## ", text, flags=re.MULTILINE) if part.startswith(f"{heading}\n"))
 
 
 def example() -> str:
-    found = re.search(r"```yaml\n(.*?)```", documented("Example"), flags=re.DOTALL)
+    found = re.search(r"```yaml\n(.*?)```", document("Example"), flags=re.DOTALL)
     assert found
     return found[1]
 
@@ -67,7 +67,7 @@ def test_the_documented_example_is_read() -> None:
 
 @pytest.mark.parametrize("heading", SECTIONS)
 def test_the_documentation_lists_every_field_with_its_default(heading: str) -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|.*\|$", documented(heading), flags=re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|.*\|$", document(heading), flags=re.MULTILINE)
     fields = SECTIONS[heading].model_fields
     assert [name for name, _ in rows] == list(fields)
     for name, default in rows:

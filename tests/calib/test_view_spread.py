@@ -6,13 +6,13 @@ import pytest
 from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.board.view_spread import SeenBoard, Spread, describe_board
 from groundsbot.fixtures.pictures.board_picture import View
-from tests.support.board_views import PLAIN, held, projected
+from tests.support.board_views import PLAIN, hold_board, project
 
 SIZE_PX = (PLAIN.width_px, PLAIN.height_px)
 
 
-def seen(view: View) -> SeenBoard:
-    pixels = projected(view)
+def observe_view(view: View) -> SeenBoard:
+    pixels = project(view)
     inside = ((pixels > -0.5) & (pixels < np.array(SIZE_PX) - 0.5)).all(axis=1)
     found = describe_board(np.flatnonzero(inside), pixels[inside], DEFAULT_BOARD, SIZE_PX)
     assert found is not None
@@ -22,18 +22,18 @@ def seen(view: View) -> SeenBoard:
 @pytest.mark.parametrize(("right_deg", "lower_deg"), [(0, 0), (30, 0), (-30, 0), (0, 25), (0, -40), (60, 0)])
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_tilt_and_size_of_a_board_in_the_middle(right_deg: float, lower_deg: float, share: float) -> None:
-    found = seen(held(share=share, right_deg=right_deg, lower_deg=lower_deg))
+    found = observe_view(hold_board(share=share, right_deg=right_deg, lower_deg=lower_deg))
     np.testing.assert_allclose(found.tilt_deg, [right_deg, lower_deg], atol=1.0)
     assert found.share == pytest.approx(share, rel=0.01)
 
 
 def test_a_board_parallel_to_the_picture_is_not_tilted_wherever_it_is() -> None:
     for at in ((0.2, 0.2), (0.8, 0.5), (0.4, 0.9)):
-        assert np.hypot(*seen(held(at)).tilt_deg) < 1.0
+        assert np.hypot(*observe_view(hold_board(at)).tilt_deg) < 1.0
 
 
 def test_corners_that_tell_nothing() -> None:
-    pixels = projected(held())
+    pixels = project(hold_board())
     row, column = np.arange(6), np.arange(0, 48, 6)
     for ids in (np.arange(0), np.array([0, 1, 6, 7, 8]), row, column):
         assert describe_board(ids, pixels[ids], DEFAULT_BOARD, SIZE_PX) is None
@@ -41,9 +41,9 @@ def test_corners_that_tell_nothing() -> None:
 
 
 def test_regions_are_those_that_corners_lie_in() -> None:
-    assert seen(held((0.5, 0.5), 0.25)).regions == {(1, 1)}
-    assert seen(held((0.2, 0.2), 0.25)).regions == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    assert seen(held((0.83, 0.5), 0.25)).regions == {(1, 1), (1, 2)}
+    assert observe_view(hold_board((0.5, 0.5), 0.25)).regions == {(1, 1)}
+    assert observe_view(hold_board((0.2, 0.2), 0.25)).regions == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert observe_view(hold_board((0.83, 0.5), 0.25)).regions == {(1, 1), (1, 2)}
 
 
 def test_what_is_missing_is_said_until_it_is_there() -> None:
@@ -56,19 +56,19 @@ def test_what_is_missing_is_said_until_it_is_there() -> None:
 
     for _ in range(2):  # one view of each may turn out to be of no use
         assert "left, right, upper, lower" in spread.missing()[1]
-        spread.add(seen(held((0.2, 0.2), 0.3, right_deg=30.0)))
+        spread.add(observe_view(hold_board((0.2, 0.2), 0.3, right_deg=30.0)))
     where, tilts, nearer = spread.missing()
     assert where == "show the board at the picture's top right, right, bottom left, bottom, bottom right"
     assert tilts == "tilt the board, its left, upper, lower side nearer to the camera"
     assert nearer == "bring the board nearer"
 
-    for view in [held((0.8, 0.2), 0.3, lower_deg=-30.0), held((0.8, 0.8), 0.3, right_deg=-30.0)] * 2:
-        spread.add(seen(view))
+    for view in [hold_board((0.8, 0.2), 0.3, lower_deg=-30.0), hold_board((0.8, 0.8), 0.3, right_deg=-30.0)] * 2:
+        spread.add(observe_view(view))
     assert spread.missing() == [
         "show the board at the picture's bottom left",
         "tilt the board, its lower side nearer to the camera",
         "bring the board nearer",
     ]
-    for view in [held((0.2, 0.8), 0.3, lower_deg=30.0), held(share=0.6)] * 2:
-        spread.add(seen(view))
+    for view in [hold_board((0.2, 0.8), 0.3, lower_deg=30.0), hold_board(share=0.6)] * 2:
+        spread.add(observe_view(view))
     assert spread.missing() == []

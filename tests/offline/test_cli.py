@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from groundsbot.offline.maps.files import write_map
-from tests.support.data.maps import made_component, made_map, made_truth
+from tests.support.data.maps import make_component, make_map, make_truth
 from tests.support.programs import Run
 
 ODOMETRY = "t_s,left_m_s,right_m_s\n0,0,0\n1,1,1\n2,0.5,1\n"
@@ -25,7 +25,7 @@ def drive(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def truth_file(tmp_path: Path) -> Path:
-    truth = made_truth(made_component())
+    truth = make_truth(make_component())
     data = {
         "runs": {
             name: {"poses": [[int(t), *map(float, pose)] for t, pose in zip(r.stamps_ns, r.T_world_base, strict=True)]}
@@ -98,7 +98,7 @@ def test_info_of_a_damaged_log_ends_with_exit_code_3(run: Run, drive: Path, tmp_
 def test_compare_prints_figures_as_text_and_json(run: Run, truth_file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "map"
     folder.mkdir()
-    write_map(made_map(), folder)
+    write_map(make_map(), folder)
     outcome = run("compare", folder, "--truth", truth_file)
     assert outcome.code == 0
     assert "start of red_one to start of blue_two: 10.198 m found, 10.198 m true" in outcome.out

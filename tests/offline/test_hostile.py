@@ -67,16 +67,16 @@ LARGE = ("arrays that unfold", "a bz2 bomb.bag", "many bz2 bombs.bag", "a zstd b
 def test_row_09_no_small_file_of_another_kind_does(tmp_path: Path, kind: str, form: Form) -> None:
     log = tmp_path / "log.mcap"
     log.write_bytes(honest())
-    check(measure(form, made(tmp_path, kind), {"LOG": log}))
+    check(measure(form, make_file(tmp_path, kind), {"LOG": log}))
 
 
 @pytest.mark.parametrize("kind", ["truth", "survey"])
 def test_row_09_no_small_truth_or_survey_does(tmp_path: Path, kind: str) -> None:
-    (folder,) = made(tmp_path, "map", "honest").values()
-    check(measure(OTHER_FORMS[kind], made(tmp_path, kind), {"MAP": folder}))
+    (folder,) = make_file(tmp_path, "map", "honest").values()
+    check(measure(OTHER_FORMS[kind], make_file(tmp_path, kind), {"MAP": folder}))
 
 
-def made(folder: Path, kind: str, only: str = "") -> dict[str, Path]:
+def make_file(folder: Path, kind: str, only: str = "") -> dict[str, Path]:
     (folder / kind).mkdir()
     return {
         name: make(folder / kind / name) for name, make in FILES[kind].items() if only in name and name not in LARGE

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import groundsbot
-from tests.support.data.drives import HALL, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, make_drive, make_robot, write_drive
 from tests.support.paths import ROOT
 
 DOCUMENT = ROOT / "docs" / "library.md"
@@ -26,8 +26,8 @@ LEGS = [(0.4, 0.4, 2.0), (-0.3, 0.3, 6.0), (0.4, 0.5, 2.0)]
 @pytest.fixture
 def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for robot, run_id, start in DRIVES:
-        drive = made_drive(start, LEGS, step_ns=20_000_000)
-        write_drive(tmp_path / "recordings", drive, TAGS, made_robot(robot), run_id=run_id, corner_sigma_px=0.2)
+        drive = make_drive(start, LEGS, step_ns=20_000_000)
+        write_drive(tmp_path / "recordings", drive, TAGS, make_robot(robot), run_id=run_id, corner_sigma_px=0.2)
     monkeypatch.chdir(tmp_path)
     return tmp_path / "recordings"
 

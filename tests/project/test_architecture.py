@@ -20,11 +20,11 @@ ROOMS = sorted(path.parent for package in PACKAGES for path in (ROOT / package).
 MOST_MODULES = 20
 
 
-def dotted(folder: Path) -> str:
+def module_of(folder: Path) -> str:
     return ".".join(("groundsbot", *folder.relative_to(ROOT).parts))
 
 
-def defined_in(path: Path) -> set[str]:
+def definitions_of(path: Path) -> set[str]:
     """Names of a file's classes and functions, those of methods as Class.method."""
     found: set[str] = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
@@ -47,7 +47,7 @@ def test_files_that_the_page_names_are_there() -> None:
 def test_functions_that_the_page_names_are_there() -> None:
     named = re.findall(r"`([\w/]+\.py)` `([A-Za-z][\w.]*)`", PAGE)
     assert len(named) > 25
-    assert [(path, name) for path, name in named if name not in defined_in(ROOT / path)] == []
+    assert [(path, name) for path, name in named if name not in definitions_of(ROOT / path)] == []
 
 
 def test_the_page_and_the_picture_name_every_room() -> None:
@@ -59,7 +59,7 @@ def test_the_page_and_the_picture_name_every_room() -> None:
 
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: f"{room.parent.name}.{room.name}")
 def test_a_room_says_what_it_is_and_what_others_may_use(room: Path) -> None:
-    module: ModuleType = importlib.import_module(dotted(room))
+    module: ModuleType = importlib.import_module(module_of(room))
     assert module.__doc__
     if room.parent.name != "fixtures":  # the paper has no simulator
         assert re.search(r"\bIn: .*\bOut: .*\bpaper\b", module.__doc__, re.DOTALL)
@@ -77,8 +77,8 @@ def test_public_names_are_those_that_other_rooms_use() -> None:
                 module = f"groundsbot.{node.module}" if node.level else node.module
                 used.setdefault(module, set()).update(each.name for each in node.names)
     for room in ROOMS:
-        public = set(importlib.import_module(dotted(room)).__all__)
-        assert public == used.get(dotted(room), set()), room
+        public = set(importlib.import_module(module_of(room)).__all__)
+        assert public == used.get(module_of(room), set()), room
 
 
 def test_no_folder_is_crowded() -> None:
@@ -121,17 +121,17 @@ def test_no_folder_is_crowded() -> None:
     ],
 )
 def test_contracts_break(tmp_path: Path, file: str, line: str, contract: str) -> None:
-    found = linted(tmp_path, file, line)
+    found = lint(tmp_path, file, line)
     assert [told for told in found if contract in told and told.endswith("BROKEN")], found
 
 
 def test_contracts_hold_without_that(tmp_path: Path) -> None:
-    found = linted(tmp_path, "offline/sam/graph.py", "")
+    found = lint(tmp_path, "offline/sam/graph.py", "")
     assert not [told for told in found if told.endswith("BROKEN")]
     assert len([told for told in found if told.endswith("KEPT")]) == 10
 
 
-def linted(tmp_path: Path, file: str, line: str) -> list[str]:
+def lint(tmp_path: Path, file: str, line: str) -> list[str]:
     """What the import linter says of a copy with one more line in a file."""
     for name in ("groundsbot", *PACKAGES, "tests/support"):
         shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))

@@ -25,7 +25,7 @@ from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.fixtures.worlds import world
 from tests.project.test_robot_page import blocks as blocks_of_robot_setup
 from tests.support.data.bags import BagOfLog
-from tests.support.data.drives import START_NS, MadeTag, S, made_drive, made_robot, write_drive
+from tests.support.data.drives import START_NS, MadeTag, S, make_drive, make_robot, write_drive
 from tests.support.paths import ROOT
 from tests.support.tag_pictures import draw_tag
 
@@ -76,7 +76,7 @@ class Shown(NamedTuple):
     text: str
 
 
-def shown() -> list[Shown]:
+def show_all() -> list[Shown]:
     """All of them in their order, each once a page."""
     found: list[Shown] = []
     for page in PAGES:
@@ -136,7 +136,7 @@ def parse(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_command_is_run_or_has_a_reason() -> None:
-    found = shown()
+    found = show_all()
     assert len(found) > 60
     for words in NOT_OURS | PARSED_ONLY:
         assert any(each.text.startswith(words) for each in found), f"{words!r} is on no page any more"
@@ -145,7 +145,7 @@ def test_every_command_is_run_or_has_a_reason() -> None:
 
 
 def test_what_is_not_run_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    parsed = [each for each in shown() if why_not_run(each.text) and not each.text.startswith(tuple(NOT_OURS))]
+    parsed = [each for each in show_all() if why_not_run(each.text) and not each.text.startswith(tuple(NOT_OURS))]
     assert len(parsed) > 30
     for each in parsed:
         parse(each.text, monkeypatch)
@@ -154,15 +154,15 @@ def test_what_is_not_run_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
 def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the pages take for granted: recordings, drives of other programs, and a small world called nsh."""
     for i, (name, start) in enumerate({"a": [0.0, 0.0, 0.2], "b": [0.5, 1.0, -0.1]}.items()):
-        drive = made_drive(start, AHEAD)
-        write_drive(folder / "recordings", drive, TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
+        drive = make_drive(start, AHEAD)
+        write_drive(folder / "recordings", drive, TAGS, make_robot(name), corner_sigma_px=0.3, seed=i)
     for i, day in enumerate(("friday", "saturday")):
-        drive = made_drive([0.2, -0.3, 0.1 * i], AHEAD)
-        write_drive(folder / day, drive, TAGS, made_robot("a"), corner_sigma_px=0.3, seed=5 + i, run_id=day)
+        drive = make_drive([0.2, -0.3, 0.1 * i], AHEAD)
+        write_drive(folder / day, drive, TAGS, make_robot("a"), corner_sigma_px=0.3, seed=5 + i, run_id=day)
     bag = BagOfLog.of(folder / "recordings" / "a" / "one").odometry().mount().camera_info()
     bag.picture("mono8", draw_tag("tag36h11", 7, CORNERS_PX, (720, 1280)), START_NS + S)
     bag.write(folder / "drive.bag")
-    write_robot_yaml(made_robot("a"), folder / "robot.yaml")
+    write_robot_yaml(make_robot("a"), folder / "robot.yaml")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
     for day in ("monday", "tuesday"):
@@ -190,7 +190,7 @@ def run_elsewhere(page: str, text: str) -> bool:
 
 def test_commands_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs(tmp_path, monkeypatch)
-    wanted = [each for each in shown() if not why_not_run(each.text) and not run_elsewhere(*each)]
+    wanted = [each for each in show_all() if not why_not_run(each.text) and not run_elsewhere(*each)]
     assert {each.page for each in wanted} >= {"README.md"}
     for each in wanted:
         # The paper's recordings make a map of their own, in a folder of their own.

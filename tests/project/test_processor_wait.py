@@ -10,19 +10,19 @@ from contextlib import suppress
 import pytest
 
 from tests.support import processor_wait
-from tests.support.processor_wait import ended_within
+from tests.support.processor_wait import wait_for_end
 
 
 def test_a_process_that_sleeps_is_over_the_limit_and_one_that_ends_is_not() -> None:
     with subprocess.Popen([sys.executable, "-c", "print('done')"], stdout=subprocess.PIPE, text=True) as process:
-        assert ended_within(process, 20.0) == "done\n"
+        assert wait_for_end(process, 20.0) == "done\n"
     code = "import time; print('up', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         n_threads = threading.active_count()
         with pytest.raises(AssertionError, match="waiting for a processor"):
-            ended_within(process, 1.0)
+            wait_for_end(process, 1.0)
         assert threading.active_count() == n_threads
 
 
@@ -42,4 +42,4 @@ def test_a_process_that_ends_while_nobody_can_look_is_not_over_the_limit(monkeyp
         monkeypatch.setattr(wait, "look", held_up)
         monkeypatch.setattr(processor_wait, "ProcessorWait", lambda _: wait)
         monkeypatch.setattr(time, "monotonic", lambda: now_s)
-        ended_within(process, 5.0)
+        wait_for_end(process, 5.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.installed import checkout_sources, install, printed
+from tests.support.installed import checkout_sources, install, output_of
 from tests.support.paths import ROOT
 
 HEAVY = ("numpy", "cv2", "scipy", "numba", "matplotlib", "google.protobuf", "reportlab")
@@ -101,7 +101,7 @@ def test_a_wheel_works_beside_a_project_that_has_a_package_offline(tmp_path: Pat
     (project / "offline" / "__init__.py").write_text("raise ImportError('not yours')")
 
     def run(*words: str) -> str:
-        return printed([sys.executable, *words], project, installed)
+        return output_of([sys.executable, *words], project, installed)
 
     where = run("-c", "import groundsbot.fixtures as package; print(package.__file__)")
     assert Path(where.strip()).is_relative_to(installed)

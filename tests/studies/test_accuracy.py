@@ -19,8 +19,8 @@ from tests.benchmarks.accuracy.against_bound import (
     Drives,
     Method,
     Tally,
-    held,
-    missed_in_pairs,
+    broken_pairs,
+    exact,
     rough,
     run_study,
     study_worlds,
@@ -87,9 +87,9 @@ def test_what_is_found_is_held_against_the_most_likely_map_of_the_same_seeds() -
     elsewhere = replace(good, seed=1, tags_rmse_m=0.5)  # of a seed that the other was not given
     likeliest = Tally("room", "corners from the truth", [good], [bound])
     found = Tally("room", "corners", [worse, elsewhere], [bound, bound])
-    (sentence,) = missed_in_pairs([found, likeliest])
+    (sentence,) = broken_pairs([found, likeliest])
     assert sentence.startswith("room: start_rmse_m is 1.030 times that of the most likely map")
-    assert missed_in_pairs([found]) == missed_in_pairs([replace(found, figures=[good]), likeliest]) == []
+    assert broken_pairs([found]) == broken_pairs([replace(found, figures=[good]), likeliest]) == []
 
 
 def test_the_most_likely_map_is_where_a_solve_from_the_wheels_ends_too(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_wide_methods_get_drives_of_robots_that_nobody_knows_and_their_bound(
     assert wheels.track_m_sigma == pytest.approx(0.03 * wheels.track_m)
     wide = bound_of(with_wide_priors(load_world("room")), 0, exact_calibration=False)
     assert tally.bounds[0].tags_m == wide.tags_m
-    sure = held(drives.runs[0]).robot
+    sure = exact(drives.runs[0]).robot
     assert sure.wheels.track_m_sigma == pytest.approx(1e-4 * wheels.track_m_sigma)
     assert sure.mount.yaw_rad_sigma < 1e-5
     assert sure.time_offset_s_sigma < 1e-5

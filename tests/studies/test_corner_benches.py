@@ -8,18 +8,18 @@ import pytest
 from groundsbot.offline.measurements import keyframes
 from groundsbot.offline.measurements.run import Run, load_run
 from tests.benchmarks.speed import corners_bench, thinning_bench
-from tests.support.data.drives import HALL, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, make_drive, make_robot, write_drive
 
 
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Past tags at 0.05 m/s, where pictures are four times as dense as keyframes."""
-    drive = made_drive([1.0, 1.5, 0.3], [(0.05, 0.05, 12.0), (0.05, 0.03, 6.0)])
-    return load_run(write_drive(tmp_path_factory.mktemp("slow"), drive, HALL[:3], made_robot("a"), corner_sigma_px=0.2))
+    drive = make_drive([1.0, 1.5, 0.3], [(0.05, 0.05, 12.0), (0.05, 0.03, 6.0)])
+    return load_run(write_drive(tmp_path_factory.mktemp("slow"), drive, HALL[:3], make_robot("a"), corner_sigma_px=0.2))
 
 
 def test_what_thinning_loses_is_what_fewer_pictures_tell_less(slow: Run) -> None:
-    found = thinning_bench.lost([slow], corners=False)
+    found = thinning_bench.loss([slow], corners=False)
     assert found["pictures"] > 3 * found["keyframes"]
     # With n times the looks of a tag nearly as much more is known, but for what the wheels add between keyframes.
     assert 0.2 < found["lost"] < 1.0 - found["keyframes"] / found["pictures"]
@@ -27,7 +27,7 @@ def test_what_thinning_loses_is_what_fewer_pictures_tell_less(slow: Run) -> None
 
 
 def test_the_bench_of_corners_counts_solves_on_the_floor(slow: Run, tmp_path: Path) -> None:
-    line = corners_bench.measured([slow, *_another(tmp_path)], repeats=1)
+    line = corners_bench.measure([slow, *_another(tmp_path)], repeats=1)
     assert set(line["cpu_seconds"]) == {"whole", "problem and start", "solve", "whether the floor is even"}
     assert line["solves"] == pytest.approx(line["cpu_seconds"]["whole"] / line["floor_seconds"])
     assert line["floor_seconds"] > 0.0
@@ -35,5 +35,5 @@ def test_the_bench_of_corners_counts_solves_on_the_floor(slow: Run, tmp_path: Pa
 
 
 def _another(folder: Path) -> list[Run]:
-    drive = made_drive([1.2, 1.4, 0.2], [(0.2, 0.2, 4.0)])
-    return [load_run(write_drive(folder, drive, HALL[:3], made_robot("b"), corner_sigma_px=0.2))]
+    drive = make_drive([1.2, 1.4, 0.2], [(0.2, 0.2, 4.0)])
+    return [load_run(write_drive(folder, drive, HALL[:3], make_robot("b"), corner_sigma_px=0.2))]

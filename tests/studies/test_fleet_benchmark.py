@@ -37,7 +37,7 @@ def test_a_small_fleet_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     simulated = (logs / "truth.json").stat().st_mtime_ns
     assert fleet.simulated_fleet(2, 500, 40, 1) == logs
     assert (logs / "truth.json").stat().st_mtime_ns == simulated
-    line = fleet.measured(logs)
+    line = fleet.measure(logs)
     assert line["robots"] == 2
     assert 1000 <= line["keyframes"] <= 1500
     # Wheels at 100 Hz and pictures at 15; the head of each log.

@@ -1,11 +1,11 @@
 """The study of intrinsics, small."""
 
-from tests.benchmarks.accuracy.intrinsics_study import beside, judged
-from tests.support.board_cases import FISHEYE, NARROW, taken_views, taken_with_and_without
+from tests.benchmarks.accuracy.intrinsics_study import beside, judge
+from tests.support.board_cases import FISHEYE, NARROW, take_with_and_without, taken_views
 
 
 def test_a_fisheye_lies_in_the_region_that_its_calibration_names() -> None:
-    outcome = judged(FISHEYE, taken_views(FISHEYE, 3, 10))
+    outcome = judge(FISHEYE, taken_views(FISHEYE, 3, 10))
     assert outcome.inside
     assert outcome.error_px < 0.02
     assert outcome.views == 10
@@ -13,7 +13,7 @@ def test_a_fisheye_lies_in_the_region_that_its_calibration_names() -> None:
 
 
 def test_spoilt_views_harm_less_than_the_plain_way() -> None:
-    good, mixed = taken_with_and_without(NARROW, 2, 14, spoilt_share=0.15)
+    good, mixed = take_with_and_without(NARROW, 2, 14, spoilt_share=0.15)
     assert sum(any(view is other for other in mixed) for view in good) == 12  # two are spoilt
     found = beside(NARROW, mixed)
     assert found.better

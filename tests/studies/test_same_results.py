@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 from tests.benchmarks.same_results import COMMANDS, INPUTS, PAPER, Side, relative_difference, report
-from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
 
 
 def two_files(folder: Path, name: str, old: str, new: str) -> tuple[Path, Path]:
@@ -47,9 +47,9 @@ def test_arrays_and_logs_are_looked_into(tmp_path: Path) -> None:
 
 
 def test_messages_of_logs_are_looked_into(tmp_path: Path) -> None:
-    drive, tag = made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 2.0)]), MadeTag(1, (4.0, 0.2, 0.5), np.pi)
+    drive, tag = make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 2.0)]), MadeTag(1, (4.0, 0.2, 0.5), np.pi)
     logs = [
-        write_drive(tmp_path / str(seed), drive, [tag], made_robot("a"), corner_sigma_px=0.1, seed=seed)
+        write_drive(tmp_path / str(seed), drive, [tag], make_robot("a"), corner_sigma_px=0.1, seed=seed)
         for seed in (0, 1)
     ]
     files = [log / "0000.core.mcap" for log in logs]

@@ -43,21 +43,21 @@ def spoilt(view: Taken, camera: CameraModel, rng: np.random.Generator) -> Taken:
 
 def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.0) -> list[View]:
     """Pictures of the default board as `drawn_views` has them, some spoilt, and the board found in them."""
-    drawn, worse = _drawn(camera, seed, count, spoilt_share)
-    return _seen([_found(camera, worse.get(index, view), seed, index) for index, view in enumerate(drawn)])
+    drawn, worse = _draw(camera, seed, count, spoilt_share)
+    return _observe([_find(camera, worse.get(index, view), seed, index) for index, view in enumerate(drawn)])
 
 
-def taken_with_and_without(
+def take_with_and_without(
     camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.1
 ) -> tuple[list[View], list[View]]:
     """The views of a seed with none spoilt, and with some; those that are in both are taken once."""
-    drawn, worse = _drawn(camera, seed, count, spoilt_share)
-    good = [_found(camera, view, seed, index) for index, view in enumerate(drawn)]
-    mixed = [_found(camera, worse[index], seed, index) if index in worse else view for index, view in enumerate(good)]
-    return _seen(good), _seen(mixed)
+    drawn, worse = _draw(camera, seed, count, spoilt_share)
+    good = [_find(camera, view, seed, index) for index, view in enumerate(drawn)]
+    mixed = [_find(camera, worse[index], seed, index) if index in worse else view for index, view in enumerate(good)]
+    return _observe(good), _observe(mixed)
 
 
-def _drawn(camera: CameraModel, seed: int, count: int, spoilt_share: float) -> tuple[list[Taken], dict[int, Taken]]:
+def _draw(camera: CameraModel, seed: int, count: int, spoilt_share: float) -> tuple[list[Taken], dict[int, Taken]]:
     """How pictures are taken, and by their numbers how those that are spoilt are taken instead."""
     rng = np.random.default_rng(seed)
     drawn = drawn_views(camera, DEFAULT_BOARD, count, rng)
@@ -70,10 +70,10 @@ def _painter(camera: CameraModel) -> BoardPainter:
     return BoardPainter(camera, DEFAULT_BOARD)
 
 
-def _found(camera: CameraModel, view: Taken, seed: int, index: int) -> View | None:
+def _find(camera: CameraModel, view: Taken, seed: int, index: int) -> View | None:
     picture = _painter(camera).picture(view, np.random.default_rng([seed, index]))
     return BoardFinder(DEFAULT_BOARD).find(picture, f"picture {index}")
 
 
-def _seen(views: Sequence[View | None]) -> list[View]:
+def _observe(views: Sequence[View | None]) -> list[View]:
     return [view for view in views if view is not None]

@@ -15,7 +15,7 @@ CAMERA = CameraModel("front", 640, 480, 500.0, 500.0, 318.0, 242.0, "plumb_bob",
 PLAIN = CameraModel("front", 640, 480, 500.0, 500.0, 319.5, 239.5, "plumb_bob", (0.0,) * 5)
 
 
-def held(
+def hold_board(
     at: tuple[float, float] = (0.5, 0.5), share: float = 0.4, right_deg: float = 0.0, lower_deg: float = 0.0
 ) -> View:
     """The board held.
@@ -41,25 +41,25 @@ def held(
 def good_views() -> list[View]:
     """No more than it takes: into each corner tilted both ways, far and near."""
     corners = [((x, y), x - 0.5, y - 0.5) for x in (0.17, 0.83) for y in (0.25, 0.75)]
-    across = [held(at, 0.42, right_deg=np.copysign(20.0, -right)) for at, right, _ in corners]
-    down = [held(at, 0.42, lower_deg=np.copysign(22.0, -lower)) for at, _, lower in corners]
+    across = [hold_board(at, 0.42, right_deg=np.copysign(20.0, -right)) for at, right, _ in corners]
+    down = [hold_board(at, 0.42, lower_deg=np.copysign(22.0, -lower)) for at, _, lower in corners]
     return [
         *across,
         *down,
-        held((0.4, 0.5), 0.3),
-        held((0.6, 0.5), 0.3),
-        held(share=0.62),
-        held(share=0.6, right_deg=25.0),
+        hold_board((0.4, 0.5), 0.3),
+        hold_board((0.6, 0.5), 0.3),
+        hold_board(share=0.62),
+        hold_board(share=0.6, right_deg=25.0),
     ]
 
 
 @cache
-def rendered() -> tuple[NDArray[np.uint8], ...]:
+def render_views() -> tuple[NDArray[np.uint8], ...]:
     """Pictures of the good views."""
     painter, rng = BoardPainter(CAMERA, DEFAULT_BOARD), np.random.default_rng(1)
     return tuple(painter.picture(view, rng) for view in good_views())
 
 
-def projected(view: View) -> FloatArray:
+def project(view: View) -> FloatArray:
     """`[N, 2]` all inner corners, seen by a lens without distortion."""
     return corners_of(view, PLAIN, DEFAULT_BOARD)

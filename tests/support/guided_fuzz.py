@@ -56,19 +56,19 @@ def fuzz(
     chance = random.Random(seed)
     corpus, edges, n = list(seeds), set(), 0
     for each in corpus:
-        edges |= _traced(check, each, modules, findings_folder)
+        edges |= _trace(check, each, modules, findings_folder)
     end_s = time.monotonic() + seconds if seconds is not None else float("inf")
     while (runs is None or n < runs) and time.monotonic() < end_s:
         n += 1
-        data = _changed(corpus, chance, mutations)[:longest]
-        found = _traced(check, data, modules, findings_folder)
+        data = _change(corpus, chance, mutations)[:longest]
+        found = _trace(check, data, modules, findings_folder)
         if not found <= edges:
             edges |= found
             corpus.append(data)
     return Findings(n, corpus, len(edges))
 
 
-def _changed(corpus: Sequence[bytes], chance: random.Random, mutations: Sequence[Mutation]) -> bytes:
+def _change(corpus: Sequence[bytes], chance: random.Random, mutations: Sequence[Mutation]) -> bytes:
     data = chance.choice(corpus)
     for _ in range(1 << chance.randrange(4)):
         if mutations and chance.random() < 0.5:
@@ -99,7 +99,7 @@ def _common(data: bytes, corpus: Sequence[bytes], chance: random.Random) -> byte
     return data[:moved] + data[at : at + length] + data[moved:]
 
 
-def _traced(
+def _trace(
     check: Callable[[bytes], None], data: bytes, modules: Collection[str], findings_folder: Path | None
 ) -> set[tuple[object, int, int]]:
     edges: set[tuple[object, int, int]] = set()

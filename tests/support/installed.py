@@ -12,7 +12,7 @@ from tests.support.paths import ROOT
 
 def checkout_sources(folder: Path) -> Path:
     """What git would ship of the checkout as it stands, copied, so that a build leaves nothing behind in it."""
-    for name in printed(["git", "ls-files", "--cached", "--others", "--exclude-standard"], ROOT).splitlines():
+    for name in output_of(["git", "ls-files", "--cached", "--others", "--exclude-standard"], ROOT).splitlines():
         source, target = ROOT / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_symlink():
@@ -34,14 +34,14 @@ def install(sources: Path, target: Path) -> Path:
     """Builds a wheel of sources and installs it alone in the folder `target`; what it needs comes from this Python."""
     built = target.with_name(f"{target.name}-wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(built), str(sources)]
-    printed(build, sources.parent)
+    output_of(build, sources.parent)
     (wheel,) = built.glob("groundsbot-*.whl")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(target)]
-    printed([*pip, str(wheel)], sources.parent)
+    output_of([*pip, str(wheel)], sources.parent)
     return target
 
 
-def printed(command: list[str], folder: Path, first_on_path: Path | None = None) -> str:
+def output_of(command: list[str], folder: Path, first_on_path: Path | None = None) -> str:
     """What a command that succeeds prints, run in a folder."""
     environment = dict(os.environ)
     if first_on_path is not None:

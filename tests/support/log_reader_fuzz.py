@@ -73,7 +73,7 @@ def seeds() -> list[bytes]:
     return [packed, plain, bare, packed[: len(packed) // 2], plain[:1200] + bytes(300), b"", packed[:8]]
 
 
-def resealed(data: bytes, chance: random.Random) -> bytes:
+def reseal(data: bytes, chance: random.Random) -> bytes:
     """Changes the records in a chunk and gives it a new checksum, so that the change gets past."""
     chunks = whole_chunks(data)
     if not chunks:
@@ -93,7 +93,7 @@ def chunk_of(records: bytes, compression: bytes) -> bytes:
     return _CHUNK.pack(6, _CHUNK.size - 9 + len(tail), 0, 0, len(records), zlib.crc32(records), len(compression)) + tail
 
 
-def spliced(data: bytes, chance: random.Random) -> bytes:
+def splice(data: bytes, chance: random.Random) -> bytes:
     """Puts a whole chunk somewhere else, once more, or away."""
     chunks = whole_chunks(data)
     if not chunks:
@@ -105,7 +105,7 @@ def spliced(data: bytes, chance: random.Random) -> bytes:
     return rest[:at] + piece * chance.randrange(3) + rest[at:]
 
 
-def relengthened(data: bytes, chance: random.Random) -> bytes:
+def relengthen(data: bytes, chance: random.Random) -> bytes:
     """Changes a length of eight or four bytes, at or near the beginning of a chunk."""
     starts = [each.start for each in whole_chunks(data)] or [8]
     at = chance.choice(starts) + chance.choice((1, 1, 25, 33, 37, 41, 45))
@@ -115,7 +115,7 @@ def relengthened(data: bytes, chance: random.Random) -> bytes:
     return data[:at] + struct.pack("<Q", new % (1 << 64))[:size] + data[at + size :]
 
 
-MUTATIONS = (resealed, spliced, relengthened)
+MUTATIONS = (reseal, splice, relengthen)
 
 
 def check(data: bytes) -> None:

@@ -27,7 +27,7 @@ class ProcessorWait:
 
     def look(self) -> None:
         for pid in (str(self._pid), *_children(self._pid)):
-            for thread in _listed(Path(f"/proc/{pid}/task")):
+            for thread in _list(Path(f"/proc/{pid}/task")):
                 try:
                     self._waited_ns[thread.name] = int((thread / "schedstat").read_text().split()[1])
                 except (OSError, IndexError):
@@ -39,7 +39,7 @@ class ProcessorWait:
         return 1e-9 * sum(ns - self._at_start_ns.get(thread, 0) for thread, ns in self._waited_ns.items())
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError:
@@ -53,7 +53,7 @@ def _children(pid: int) -> list[str]:
         return []
 
 
-def ended_within(process: "subprocess.Popen[str]", limit_s: float) -> str:
+def wait_for_end(process: "subprocess.Popen[str]", limit_s: float) -> str:
     """Waits for the end of a process; fails where it takes longer than the limit, waits for a processor aside.
 
     It takes as long as it has been seen to run: whoever looks waits for a processor too, and a process that ended

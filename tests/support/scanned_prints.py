@@ -30,22 +30,22 @@ class Scan(NamedTuple):
         return int(y_mm / self.pixel_mm[1]), int(x_mm / self.pixel_mm[0])
 
 
-def scanned(pdf: Path, dpi: float, page: int = 0) -> Scan:
+def scan_page(pdf: Path, dpi: float, page: int = 0) -> Scan:
     """A page as a scanner sees it."""
-    with _opened(pdf) as document:
+    with _open_page(pdf) as document:
         picture = np.asarray(document[page].render(scale=dpi / 72.0, grayscale=True).to_numpy(), np.uint8).squeeze()
         size_mm = np.array(document[page].get_size()) * _MM_PER_POINT
     return Scan(picture, size_mm / picture.shape[::-1])
 
 
 def n_pages(pdf: Path) -> int:
-    with _opened(pdf) as document:
+    with _open_page(pdf) as document:
         return len(document)
 
 
 def words(pdf: Path, page: int = 0) -> str:
     """What a page says, one space between words."""
-    with _opened(pdf) as document:
+    with _open_page(pdf) as document:
         return " ".join(document[page].get_textpage().get_text_bounded().split())
 
 
@@ -71,7 +71,7 @@ def _peaks(line: FloatArray) -> FloatArray:
 
 
 @contextmanager
-def _opened(pdf: Path) -> Iterator[Any]:
+def _open_page(pdf: Path) -> Iterator[Any]:
     document = pypdfium2.PdfDocument(pdf)
     try:
         yield document

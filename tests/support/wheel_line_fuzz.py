@@ -29,7 +29,7 @@ def seeds() -> list[bytes]:
     return [*streams, b"\x05$GBW,1,9,1,2,3,-4,0*CF74\r\n$GBW,1$$\r\r\n\n*", b"\x03" + b"$" * 300, b""]
 
 
-def sealed(data: bytes, chance: random.Random) -> bytes:
+def seal(data: bytes, chance: random.Random) -> bytes:
     """Gives the lines new checksums, so that what was changed in them gets past."""
     del chance
     pieces = data.split(b"\n")
@@ -41,7 +41,7 @@ def sealed(data: bytes, chance: random.Random) -> bytes:
     return b"\n".join(pieces)
 
 
-def renumbered(data: bytes, chance: random.Random) -> bytes:
+def renumber(data: bytes, chance: random.Random) -> bytes:
     """Puts another number into one field of one line."""
     pieces = data.split(b",")
     at = chance.randrange(len(pieces))

@@ -77,15 +77,15 @@ def figures_of(seed: int, result: MapResult, truth: Truth) -> Figures:
     from_frame = [pair.vector_error_m for pair in errors.starts if pair.a == errors.frame_run]
     return Figures(
         seed,
-        _known(worst.percent),
+        _number(worst.percent),
         worst.vector_error_m,
         sigmas.get((worst.a, worst.b), float("nan")),
         float(np.sqrt(np.mean(np.square(from_frame)))),
-        _known(errors.tags_rmse_m),
-        _known(errors.tags_rmse_aligned_m),
-        _known(errors.trajectory_rmse_m),
-        _known(errors.nees_tags_per_dim),
-        _known(errors.nees_start_per_dim),
+        _number(errors.tags_rmse_m),
+        _number(errors.tags_rmse_aligned_m),
+        _number(errors.trajectory_rmse_m),
+        _number(errors.nees_tags_per_dim),
+        _number(errors.nees_start_per_dim),
     )
 
 
@@ -146,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return exit_code(missed_bounds(found, **how))
 
 
-def _known(value: float | None) -> float:
+def _number(value: float | None) -> float:
     return float("nan") if value is None else value
 
 

@@ -94,7 +94,7 @@ METHODS: Final[dict[str, Method]] = {
     "2D": Method(lambda drives: build_map(drives.runs)),
     "corners": Method(lambda drives: build_map(drives.runs, corners=True), most_times_bound=1.1),
     "corners from the truth": Method(lambda drives: most_likely_from_truth(drives.runs, drives.truth)),
-    "corners wide held": Method(lambda drives: build_map([held(run) for run in drives.runs], corners=True), wide=True),
+    "corners wide held": Method(lambda drives: build_map([exact(run) for run in drives.runs], corners=True), wide=True),
     "corners wide self-calibrated": Method(
         lambda drives: build_map(drives.runs, corners=True, calibrate=Calibrate(is_on=True)),
         most_times_bound=1.2,
@@ -145,7 +145,7 @@ class Tally:
         return found
 
 
-def missed_in_pairs(tallies: Sequence[Tally]) -> list[str]:
+def broken_pairs(tallies: Sequence[Tally]) -> list[str]:
     """A sentence for each figure of a world that is worse than the most likely map's, over the same seeds."""
     by = {(each.world, each.method): each for each in tallies if each.figures}
     sentences = []
@@ -198,7 +198,7 @@ def with_wide_priors(world: World) -> World:
     return world.model_copy(update={"robots": robots})
 
 
-def held(run: Run) -> Run:
+def exact(run: Run) -> Run:
     """The run of a robot whose file is taken for exact but for a 10,000th of its sigmas."""
 
     def sure(part: Model) -> Model:
@@ -260,7 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for each in tallies:
         row = each.row()
         say(_line(each.world, each.method, row["seeds"], list(row.values())[3:]))
-    return exit_code([sentence for each in tallies for sentence in each.missed()] + missed_in_pairs(tallies))
+    return exit_code([sentence for each in tallies for sentence in each.missed()] + broken_pairs(tallies))
 
 
 _COLUMNS: Final = ("start m", "tags m", "path m", "bound: start", "tags", "NEES: tags", "start")

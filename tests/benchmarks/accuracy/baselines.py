@@ -53,7 +53,7 @@ class _Drive:
 def dead_reckoning(runs: Sequence[Run]) -> MapResult:
     """Trajectories by the wheels alone; each tag at the mean of its readings, the first run's counting like any."""
     drives = [_keyframes(run) for run in runs]
-    transforms, places = _laid_out([drive.tag_places() for drive in drives])
+    transforms, places = _lay_out([drive.tag_places() for drive in drives])
     return _as_map(drives, [se2.compose(T, each.poses) for T, each in zip(transforms, drives, strict=True)], places)
 
 
@@ -61,7 +61,7 @@ def paper_scheme(runs: Sequence[Run]) -> MapResult:
     """The paper's: every fifth wheel reading, Euler steps, local maps, RANSAC, one solve, its fixed variances."""
     drives = [_states(run) for run in runs]
     alone = [_least_squares([drive], [drive.poses], drive.tag_places(), None) for drive in drives]
-    transforms, places = _laid_out([of_tags for _, of_tags in alone])
+    transforms, places = _lay_out([of_tags for _, of_tags in alone])
     start = [se2.compose(T, poses[0]) for T, (poses, _) in zip(transforms, alone, strict=True)]
     return _as_map(drives, *_least_squares(drives, start, places, transforms))
 
@@ -104,7 +104,7 @@ def _places_in_base(chain: Chain) -> FloatArray:
     return se2.apply(chain.T_base_camera, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
 
 
-def _laid_out(maps: Sequence[dict[TagKey, FloatArray]]) -> tuple[list[FloatArray], dict[TagKey, FloatArray]]:
+def _lay_out(maps: Sequence[dict[TagKey, FloatArray]]) -> tuple[list[FloatArray], dict[TagKey, FloatArray]]:
     """Places maps in the first one's frame, those that share most tags with what is there first.
 
     Returns:
@@ -124,10 +124,10 @@ def _laid_out(maps: Sequence[dict[TagKey, FloatArray]]) -> tuple[list[FloatArray
             return [placed[index] for index in range(len(maps))], places
         waiting = [index for index in range(len(maps)) if index not in placed]
         best = max(waiting, key=lambda index: len(set(maps[index]) & set(places)))
-        placed[best] = _laid_over(maps[best], places)
+        placed[best] = _lay_over(maps[best], places)
 
 
-def _laid_over(places: dict[TagKey, FloatArray], onto: dict[TagKey, FloatArray]) -> FloatArray:
+def _lay_over(places: dict[TagKey, FloatArray], onto: dict[TagKey, FloatArray]) -> FloatArray:
     """(3,) of the transforms by two shared tags that which leaves the least distance between all of them.
 
     This is the paper's RANSAC with every pair drawn.
@@ -158,7 +158,7 @@ def _least_squares(
     first = np.concatenate([[0], np.cumsum([3 * len(each) for each in poses])])
     x = np.concatenate([np.concatenate(list(poses)).ravel(), np.concatenate([places[name] for name in names])])
     for _ in range(_ROUNDS):
-        J, r = _linearised(drives, x, first, names, transforms)
+        J, r = _linearise(drives, x, first, names, transforms)
         step = splu((J.T @ J).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(J.T @ r)
         x = x - step
         if np.abs(step).max() < _ARRIVED:
@@ -167,7 +167,7 @@ def _least_squares(
     return parts, dict(zip(names, x[first[-1] :].reshape(-1, 2), strict=True))
 
 
-def _linearised(
+def _linearise(
     drives: Sequence[_Drive], x: FloatArray, first: IntArray, names: Sequence[TagKey],
     transforms: Sequence[FloatArray] | None,
 ) -> tuple[sparse.csr_array, FloatArray]:  # fmt: skip
@@ -193,11 +193,11 @@ def _linearised(
         block = np.concatenate([-np.diag(weights), np.diag(weights)], axis=1)
         add(
             np.tile(block, (len(told), 1, 1)), np.hstack([own[:-1], own[1:]]),
-            _wrapped(np.diff(poses, axis=0) - told) * weights,
+            _wrap(np.diff(poses, axis=0) - told) * weights,
         )  # fmt: skip
         held = np.zeros(3) if transforms is None else transforms[index]
         weight = weights if index else np.full(3, 1e6)
-        add(np.diag(weight)[None], own[:1], _wrapped(poses[:1] - held) * weight)
+        add(np.diag(weight)[None], own[:1], _wrap(poses[:1] - held) * weight)
         at_tag = first[-1] + 2 * np.array([names.index(tag) for tag in drive.tags])[drive.tag]
         place, (cos, sin) = x[at_tag[:, None] + [0, 1]], ahead[drive.at].T
         dx, dy = (place - poses[drive.at, :2]).T
@@ -211,7 +211,7 @@ def _linearised(
     return J.tocsr(), np.concatenate(residuals)
 
 
-def _wrapped(differences: FloatArray) -> FloatArray:
+def _wrap(differences: FloatArray) -> FloatArray:
     return np.column_stack([differences[:, :2], se2.wrap_angle(differences[:, 2])])
 
 

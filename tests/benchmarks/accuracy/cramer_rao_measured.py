@@ -93,20 +93,20 @@ def motion_jacobian(run: TrueRun) -> FloatArray:
     """[P - 1, 3, 9] of what motions between poses are off: by the first pose, the second, and the wheels' shares."""
     place, heading = run.place[run.pose], run.heading_rad[run.pose]
     measured = _between(place[:-1], heading[:-1], place[1:], heading[1:])
-    rolled = _rolled(run, np.zeros(N_WHEELS))
+    rolled = _roll(run, np.zeros(N_WHEELS))
 
     def off(by: FloatArray) -> FloatArray:
         first = place[:-1] + complex(by[0], by[1]), heading[:-1] + by[2]
         second = place[1:] + complex(by[3], by[4]), heading[1:] + by[5]
         moved = _between(*measured, *_between(*first, *second))
-        more_rolled = _between(*rolled, *_rolled(run, by[6:]))
+        more_rolled = _between(*rolled, *_roll(run, by[6:]))
         place_off, turned_off = _between(*more_rolled, *moved)
         return np.stack([place_off.real, place_off.imag, turned_off], axis=-1)
 
     return _quotients(off, 6 + N_WHEELS)
 
 
-def _rolled(run: TrueRun, shares: FloatArray) -> tuple[ComplexArray, FloatArray]:
+def _roll(run: TrueRun, shares: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Motions from pose to pose as the wheels alone tell them, radii and track being off by these shares."""
     left_m, right_m = (run.rolled_m * (1.0 + shares[:2])).T
     turn_rad = (right_m - left_m) / (run.track_m * (1.0 + shares[2]))

@@ -80,7 +80,7 @@ def shape_bound_m(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) ->
     """
     told: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
     places = {(tag["family"], tag["tag_id"]): np.array(tag["position_m"][:2]) for tag in told["tags"]}
-    seen = sorted({key for run in runs for key in _seen(run, told)})
+    seen = sorted({key for run in runs for key in _tags_seen(run, told)})
     index = {key: i for i, key in enumerate(seen)}
     tags_m = np.array([places[key] for key in seen])
     return _rmse_of_shape(_tag_covariance(runs, told, harsh, [index] * len(runs), tags_m), tags_m)
@@ -107,9 +107,9 @@ def shift_sigmas(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) -> 
     def named(run: Run, key: tuple[str, int]) -> tuple[str, int, str]:
         return (*key, ("a" if run is first else "b") if (*key, "b") in places else "")
 
-    seen = sorted({named(run, key) for run in runs for key in _seen(run, told)})
+    seen = sorted({named(run, key) for run in runs for key in _tags_seen(run, told)})
     index = {name: i for i, name in enumerate(seen)}
-    of_runs = [{key: index[named(run, key)] for key in _seen(run, told)} for run in runs]
+    of_runs = [{key: index[named(run, key)] for key in _tags_seen(run, told)} for run in runs]
     tags_m = np.array([places[name] for name in seen])
     covariance = _tag_covariance(runs, told, harsh, of_runs, tags_m)
     found = {}
@@ -124,7 +124,7 @@ def shift_sigmas(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) -> 
     return found
 
 
-def _seen(run: Run, told: dict[str, Any]) -> set[tuple[str, int]]:
+def _tags_seen(run: Run, told: dict[str, Any]) -> set[tuple[str, int]]:
     """Family and id of the tags that a run read rightly."""
     return {(run.tags[t].family, run.tags[t].tag_id) for t in _true_readings(run, told["runs"][run.name])[1].tolist()}
 

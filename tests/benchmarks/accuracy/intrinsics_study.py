@@ -36,7 +36,7 @@ from groundsbot.calib.intrinsics.projection_uncertainty import (
     rms_px,
 )
 from tests.benchmarks.command_line import seeds_of
-from tests.support.board_cases import CASES, taken_views, taken_with_and_without
+from tests.support.board_cases import CASES, take_with_and_without, taken_views
 
 REGION: Final = 0.99
 
@@ -54,7 +54,7 @@ class Outcome:
     corner_sigma_px: float
 
 
-def judged(truth: CameraModel, views: Sequence[View]) -> Outcome:
+def judge(truth: CameraModel, views: Sequence[View]) -> Outcome:
     """One calibration with the model given."""
     lens = calibrate_camera(views, BoardFinder(DEFAULT_BOARD), truth.name, [truth.distortion_model]).lens
     covariance, off = lens.covariance(), parameters_of(lens.fit.model) - parameters_of(truth)
@@ -140,7 +140,7 @@ def study(case: str, seeds: Sequence[int], parts: Sequence[str]) -> None:
         line = f"{case} seed {seed}:"
         good, mixed = _views(CASES[case], seed, parts)
         if "given" in parts:
-            each = judged(CASES[case], good)
+            each = judge(CASES[case], good)
             given.append(each)
             line += (
                 f" chi2 {each.chi2:.1f} {'inside' if each.inside else 'OUTSIDE'}, error {each.error_px:.4f} px, "
@@ -164,7 +164,7 @@ def study(case: str, seeds: Sequence[int], parts: Sequence[str]) -> None:
 def _views(truth: CameraModel, seed: int, parts: Sequence[str]) -> tuple[list[View], list[View]]:
     if "plain" not in parts:
         return taken_views(truth, seed), []
-    return taken_with_and_without(truth, seed) if "given" in parts else ([], taken_views(truth, seed, spoilt_share=0.1))
+    return take_with_and_without(truth, seed) if "given" in parts else ([], taken_views(truth, seed, spoilt_share=0.1))
 
 
 def _sum_up(case: str, outcomes: Sequence[Outcome]) -> None:

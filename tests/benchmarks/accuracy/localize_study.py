@@ -47,7 +47,7 @@ from groundsbot.offline.localization.result import LocatedRun
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.measurements.chain import Chain
 from tests.benchmarks.command_line import exit_code, say, seeds_of
-from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town
+from tests.support.data.long_drives import LongDrive, Town, make_long_drive, make_town
 
 NEES: Final = (0.85, 1.15)
 ONLINE_SHARE: Final = 0.02
@@ -116,14 +116,14 @@ class Told:
         return self.found and square > _WRONG and error_m > _WRONG_M
 
 
-def made_scene(seed: int) -> Scene | None:
+def make_scene(seed: int) -> Scene | None:
     """None where the drives that should make the map share too little to be joined."""
     rng = np.random.default_rng(seed)
-    town = made_town(seed, TAG_SPACING_M, N_CROSSINGS)
+    town = make_town(seed, TAG_SPACING_M, N_CROSSINGS)
     first = _SEEDS_A_TOWN * seed
     map_drives = tuple(_drive(first + i, town, MAP_LENGTH_M) for i in range(2))
     maps = [solve_local_map(each.chain) for each in map_drives]
-    component = _joined(maps)
+    component = _join(maps)
     if component is None:
         return None
     known = MapResult((component,), (), NoiseParameters(), kept=tuple(archive_map(each) for each in maps))
@@ -136,7 +136,7 @@ def made_scene(seed: int) -> Scene | None:
 
 
 def _drive(seed: int, town: Town, length_m: float) -> LongDrive:
-    return made_long_drive(seed, length_m, town=town, noise=NoiseParameters(), noise_factors=(1.0, 1.0))
+    return make_long_drive(seed, length_m, town=town, noise=NoiseParameters(), noise_factors=(1.0, 1.0))
 
 
 def _with_moved_tags(town: Town, rng: np.random.Generator) -> tuple[Town, frozenset[int]]:
@@ -147,14 +147,14 @@ def _with_moved_tags(town: Town, rng: np.random.Generator) -> tuple[Town, frozen
     return replace(town, tags_m=tags_m), frozenset(which.tolist())
 
 
-def _joined(maps: Sequence[LocalMap]) -> Component | None:
+def _join(maps: Sequence[LocalMap]) -> Component | None:
     merged = merge(maps)
     if len(merged.groups) > 1:
         return None
     return component_of(*solve_global_map(maps, merged.groups[0], Stages()))
 
 
-def judged(seed: int, scene: Scene) -> Told:
+def judge(seed: int, scene: Scene) -> Told:
     """Localises the run of a scene, and compares."""
     in_map = {tag.tag_id for tag in scene.known.components[0].tags}
     told = Told(seed, len({tag.tag_id for tag in scene.drive.chain.tags} & in_map - scene.moved))
@@ -168,9 +168,9 @@ def judged(seed: int, scene: Scene) -> Told:
     off = run.T_map_base - scene.T_map_base
     off[:, 2] = se2.wrap_angle(off[:, 2])
     squares = (off[:, :2] * np.linalg.solve(run.covariance[:, :2, :2], off[:, :2, None])[..., 0]).sum(axis=1)
-    online, *milliseconds = filtered(scene)
+    online, *milliseconds = filter_online(scene)
     for _ in range(_REPEATS - 1):
-        milliseconds.append(filtered(scene)[1])
+        milliseconds.append(filter_online(scene)[1])
     calls_ms = np.array(milliseconds).min(axis=0)
     online_off, online_sigma = against(run, online)
     reason = online.reason
@@ -201,7 +201,7 @@ def judged(seed: int, scene: Scene) -> Told:
     )
 
 
-def filtered(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
+def filter_online(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
     """The run's motions and readings, one by one, and the processor time that each took, in ms."""
     chain = scene.drive.chain
     online = OnlineLocalizer(scene.known, chain.run.robot)
@@ -245,8 +245,8 @@ def against(run: LocatedRun, online: OnlineLocalizer) -> tuple[float | None, flo
 
 def extended_against(scene: Scene) -> tuple[float | None, float | None]:
     """The kept map solved with the run against all runs solved at once: places in sigmas, and sigmas; the worst."""
-    at_once = _joined([*(solve_local_map(each.chain) for each in scene.map_drives), scene.local_map])
-    extended = _joined([*(local_map_of(each) for each in scene.known.kept), scene.local_map])
+    at_once = _join([*(solve_local_map(each.chain) for each in scene.map_drives), scene.local_map])
+    extended = _join([*(local_map_of(each) for each in scene.known.kept), scene.local_map])
     if at_once is None or extended is None:
         return None, None
     sigmas, own = (np.sqrt(np.diag(each.joint_covariance)[3:]) for each in (at_once, extended))
@@ -257,7 +257,7 @@ def extended_against(scene: Scene) -> tuple[float | None, float | None]:
     return float(np.abs((others - places) / sigmas).max()), float(np.abs(own / sigmas - 1.0).max())
 
 
-def missed(rows: Sequence[Told]) -> list[str]:
+def broken_bounds(rows: Sequence[Told]) -> list[str]:
     """A sentence for each bound that is missed; the figures, too."""
     found = [row for row in rows if row.found]
     nees = float(np.mean([row.nees for row in found if row.nees is not None]))
@@ -303,11 +303,11 @@ def study(seeds: Sequence[int]) -> list[Told]:
     """All seeds that give a map; a row as each is done."""
     rows = []
     for seed in seeds:
-        scene = made_scene(seed)
+        scene = make_scene(seed)
         if scene is None:
             say(f"seed {seed}: no map, its drives share too little")
             continue
-        rows.append(judged(seed, scene))
+        rows.append(judge(seed, scene))
         say(json.dumps(asdict(rows[-1])))
     return rows
 
@@ -321,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = study(given.seeds)
     if given.output is not None:
         given.output.write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows), encoding="utf-8")
-    return exit_code(missed(rows))
+    return exit_code(broken_bounds(rows))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from tests.support.guided_fuzz import Findings, fuzz, fuzz_for_minutes
-from tests.support.wheel_line_fuzz import MODULES, check, renumbered, sealed, seeds
+from tests.support.wheel_line_fuzz import MODULES, check, renumber, seal, seeds
 
 
 def run(seed: int, seconds: float) -> Findings:
@@ -20,7 +20,7 @@ def run(seed: int, seconds: float) -> Findings:
         MODULES,
         seed=seed,
         seconds=seconds,
-        mutations=(sealed, renumbered),
+        mutations=(seal, renumber),
         findings_folder=Path("build/fuzz"),
     )
 

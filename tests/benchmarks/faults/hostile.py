@@ -55,11 +55,11 @@ def _cases(folder: Path, commands: list[str], only: str) -> Iterator[tuple[str, 
                 continue
             if kind not in files:
                 (folder / kind).mkdir()
-                files[kind] = dict(_written(folder / kind, kinds[kind], only))
+                files[kind] = dict(_write_files(folder / kind, kinds[kind], only))
             yield command, forms[command], files[kind]
 
 
-def _written(folder: Path, makers: Mapping[str, Callable[[Path], Path]], only: str) -> Iterator[tuple[str, Path]]:
+def _write_files(folder: Path, makers: Mapping[str, Callable[[Path], Path]], only: str) -> Iterator[tuple[str, Path]]:
     for name, make in makers.items():
         if only not in name:
             continue

@@ -58,7 +58,7 @@ def with_results(page: str, results: Results) -> str:
         if found:
             tests = results.get(found[1], {})
             names = "<br>".join(f"`{test.removeprefix('tests/').replace('.py::', ' ')}`" for test in sorted(tests))
-            ends = "<br>".join(_told(tests[test]) for test in sorted(tests))
+            ends = "<br>".join(_lines(tests[test]) for test in sorted(tests))
             line = f"| {' | '.join((*found.groups()[:3], names or 'none', ends or 'missing', found[6]))} |"
         lines.append(line)
     return "\n".join(lines) + "\n"
@@ -75,7 +75,7 @@ def with_proofs(page: str, proofs: Mapping[str, Sequence[str]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _told(outcomes: Sequence[str]) -> str:
+def _lines(outcomes: Sequence[str]) -> str:
     count = f" ({len(outcomes)} forms)" if len(outcomes) > 1 else ""
     worst = next((each for each in ("failed", "skipped") if each in outcomes), "passed")
     return f"{worst}{count}"

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for world in given.worlds.split(","):
         with tempfile.TemporaryDirectory() as folder:
             simulate(world, given.seed, Path(folder) / "drives", render=False)
-            lines.append({"world": world, **measured(read_runs(find_logs([Path(folder) / "drives"])), given.repeats)})
+            lines.append({"world": world, **measure(read_runs(find_logs([Path(folder) / "drives"])), given.repeats)})
         for text in table(lines[-1]):
             say(text)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if all(line["solves"] <= MOST_SOLVES for line in lines) else 1
 
 
-def measured(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
+def measure(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
     """Processor seconds of each part, the floor's solve, and how many of these the whole comes to."""
     floor, workings = [], Workings()
     for _ in range(1 + repeats):

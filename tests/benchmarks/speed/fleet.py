@@ -48,8 +48,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     logs = simulated_fleet(arguments.robots, arguments.keyframes, arguments.tags, arguments.seed)
-    measured(simulated_fleet(2, 500, 40, 1))  # compiles what is not compiled yet
-    line = measured(logs) | {"seed": arguments.seed}
+    measure(simulated_fleet(2, 500, 40, 1))  # compiles what is not compiled yet
+    line = measure(logs) | {"seed": arguments.seed}
     REPORT.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(REPORT) as partial:
         partial.write_text(json.dumps(line) + "\n", encoding="utf-8")
@@ -83,7 +83,7 @@ def world_yaml(n_robots: int, n_keyframes: int, n_tags: int, seed: int) -> str:
     return yaml.safe_dump(world, sort_keys=False)
 
 
-def measured(logs: Path) -> dict[str, Any]:
+def measure(logs: Path) -> dict[str, Any]:
     """One run of `map`: what it took as a whole and by stage."""
     n_messages = _n_messages(logs)
     with tempfile.TemporaryDirectory() as folder:

@@ -21,7 +21,7 @@ def main() -> int:
     if not (LOGS / "truth.json").is_file():
         say(f"no demo in {LOGS.parent}; making it first")
         subprocess.run(["make", "demo"], cwd=ROOT, check=True)
-    seconds = [_timed() for _ in range(REPEATS)]
+    seconds = [_time_run() for _ in range(REPEATS)]
     fastest = min(seconds)
     REPORT.parent.mkdir(parents=True, exist_ok=True)
     REPORT.write_text(json.dumps({"benchmark": "map_process", "seconds": seconds, "bound_s": BOUND_S}) + "\n")
@@ -36,7 +36,7 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def _timed() -> float:
+def _time_run() -> float:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "groundsbot.offline.cli", "map", str(LOGS), "-o", str(Path(folder) / "map")]

@@ -48,8 +48,8 @@ def plain_normal_equations(
 ) -> tuple[sparse.csc_array, FloatArray]:
     """H = J^T J (n, n) and g = J^T r (n,) at a state, robust weights included, from the factors' classes alone."""
     kinds = (
-        _reweighted(problem.odometry.linearise(state, problem.columns), losses.odometry),
-        _reweighted(problem.readings.linearise(state, problem.columns), losses.readings),
+        _reweight(problem.odometry.linearise(state, problem.columns), losses.odometry),
+        _reweight(problem.readings.linearise(state, problem.columns), losses.readings),
         problem.prior.linearise(state, problem.columns),
         *problem.measured.linearise(state, problem.columns),
     )
@@ -57,7 +57,7 @@ def plain_normal_equations(
     return sparse.csc_array(jacobian.T @ jacobian), jacobian.T @ residual
 
 
-def _reweighted(kind: Linearised, loss: Loss) -> Linearised:
+def _reweight(kind: Linearised, loss: Loss) -> Linearised:
     """Factors under a robust loss as plain squares with the same gradient."""
     if loss == SQUARES:
         return kind

@@ -205,14 +205,14 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
         "cpu_total": round(own + sum(shares.values()), 3),
         "memory_mb": round(memory_mb),
         "refused_bytes": refused,
-        **_judged(folder / "logs", measured_ns, n_shown, load),
+        **_judge(folder / "logs", measured_ns, n_shown, load),
     }
     if recorder.returncode:
         found["said"] = said[-400:]
     return found
 
 
-def _judged(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict[str, Any]:
+def _judge(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict[str, Any]:
     (log,) = find_logs([logs])
     epoch_ns = run_info_of(log).run_epoch_ns
     wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]

@@ -33,7 +33,7 @@ from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations, plain_solve, plain_step
-from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet
+from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, make_fleet
 
 TAGS: Final = {"2x1000": 50, "10x1000": 100, "2x10000": 200, "10x10000": 500, "50x2000": 500}
 _Result = TypeVar("_Result")
@@ -66,7 +66,7 @@ def ours(fleet: Fleet) -> tuple[float, float, int, State]:
             relaxed_steps=_RELAXED_STEPS,
         )
 
-    seconds, solution = _timed(run)
+    seconds, solution = _time_run(run)
     start = our_start(fleet)
     arrowhead = fleet.problem.arrowhead
     blocks, rows = arrowhead.empty_system(), arrowhead.empty_rows()
@@ -82,7 +82,7 @@ def ours(fleet: Fleet) -> tuple[float, float, int, State]:
 def splu(fleet: Fleet) -> tuple[float, float, int, State]:
     """The plain way from our start."""
     start = our_start(fleet)
-    seconds, (state, iterations) = _timed(lambda: plain_solve(fleet.problem, start, _RELATIVE_TOLERANCE))
+    seconds, (state, iterations) = _time_run(lambda: plain_solve(fleet.problem, start, _RELATIVE_TOLERANCE))
     each = least_seconds(lambda: plain_step(*plain_normal_equations(fleet.problem, start), 0.0), 1)
     return seconds, each, iterations, state
 
@@ -97,7 +97,7 @@ def gtsam(fleet: Fleet, start: State) -> tuple[float, float, int, State]:
         optimizer = library.LevenbergMarquardtOptimizer(graph, values, library.LevenbergMarquardtParams())
         return optimizer.optimize(), optimizer.iterations()
 
-    seconds, (result, iterations) = _timed(run)
+    seconds, (result, iterations) = _time_run(run)
     ordering = library.Ordering.ColamdNonlinearFactorGraph(graph)
     each = least_seconds(lambda: graph.linearize(values).optimize(ordering), 1)
     poses = np.array([_pose(result.atPose2(i)) for i in range(len(start.poses))])
@@ -143,7 +143,7 @@ def _pose(pose: Any) -> FloatArray:
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
-def _timed(run: Callable[[], _Result]) -> tuple[float, _Result]:
+def _time_run(run: Callable[[], _Result]) -> tuple[float, _Result]:
     """Least seconds of three runs, or of one that takes a second; and what came out."""
     began = time.process_time()
     result = run()
@@ -168,7 +168,7 @@ def measure(case: str, solver: str, seed: int) -> dict[str, Any]:
         import_module("gtsam")  # imports are not counted as memory
     before_mib = memory_mib("VmRSS")
     n_robots, n_keyframes = map(int, case.split("x"))
-    fleet = made_fleet(seed, n_robots, n_keyframes, TAGS[case])
+    fleet = make_fleet(seed, n_robots, n_keyframes, TAGS[case])
     run: dict[str, Callable[[], tuple[float, float, int, State]]] = {
         "ours": lambda: ours(fleet),
         "splu": lambda: splu(fleet),
@@ -200,7 +200,7 @@ def measure(case: str, solver: str, seed: int) -> dict[str, Any]:
 def warm_up() -> float:
     """Loads or compiles what is compiled; returns the seconds that took."""
     began = time.perf_counter()
-    ours(made_fleet(0, 2, 100, 20))
+    ours(make_fleet(0, 2, 100, 20))
     return time.perf_counter() - began
 
 

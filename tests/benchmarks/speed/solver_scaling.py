@@ -13,7 +13,7 @@ import numpy as np
 from groundsbot.offline.sam.factors.robust_losses import SQUARES
 from groundsbot.offline.sam.solver import Losses, solve
 from tests.benchmarks.speed.solver_bench import least_seconds, memory_mib, our_start, reset_peak, warm_up
-from tests.benchmarks.speed.solver_world import made_fleet
+from tests.benchmarks.speed.solver_world import make_fleet
 
 KEYFRAMES: Final = (500, 1500, 5000, 15000, 50000)  # of each of two robots
 N_TAGS: Final = 100
@@ -24,7 +24,7 @@ def growth() -> None:
     """Prints seconds and memory of an iteration for each size, and their slopes."""
     seconds, memory = [], []
     for n in KEYFRAMES:
-        fleet = made_fleet(1, 2, n, N_TAGS)
+        fleet = make_fleet(1, 2, n, N_TAGS)
         arrowhead = fleet.problem.arrowhead
         blocks, rows = arrowhead.empty_system(), arrowhead.empty_rows()
 
@@ -44,7 +44,7 @@ def growth() -> None:
 
 def many_tags() -> None:
     """Prints what 2,000 tags and 20,000 keyframes take."""
-    fleet = made_fleet(1, 10, 2000, 2600, n_crossings=14)
+    fleet = make_fleet(1, 10, 2000, 2600, n_crossings=14)
     _ = fleet.problem.skeleton
     before = memory_mib("VmRSS")
     reset_peak()

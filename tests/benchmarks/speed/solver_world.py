@@ -45,7 +45,7 @@ class Fleet:
     n_robots: int
 
 
-def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossings: int | None = None) -> Fleet:
+def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossings: int | None = None) -> Fleet:
     """Robots that drive at random over roads with tags.
 
     Args:
@@ -58,7 +58,7 @@ def made_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
     rng = np.random.default_rng(seed)
     n_crossings = n_crossings or max(3, round(np.sqrt(n_tags / 3.0)) + 1)
     tags = _placed_tags(rng, n_crossings, n_tags)
-    poses = np.concatenate([_driven(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
+    poses = np.concatenate([_drive(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
     first = np.flatnonzero(np.arange(len(poses)) % n_keyframes != n_keyframes - 1)
     motion, root = _noisy_motion(rng, poses, first)
     pose, tag, value = _readings(rng, poses, tags)
@@ -90,7 +90,7 @@ def _placed_tags(rng: np.random.Generator, n_crossings: int, n_tags: int) -> Flo
     return np.where(rng.random(n_tags)[:, None] < 0.5, places, places[:, ::-1])
 
 
-def _driven(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> FloatArray:
+def _drive(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> FloatArray:
     """(K, 3) true poses of one robot: from crossing to crossing, turning on the spot."""
     steps = round(ROAD_M / STEP_M)
     place, quarter = rng.integers(0, n_crossings, 2), int(rng.integers(0, 4))

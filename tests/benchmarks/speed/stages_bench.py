@@ -37,7 +37,7 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--logs", type=Path, help="of these alone")
     given = parser.parse_args()
-    lines = [measured(logs, given.repeats) for logs in ([given.logs] if given.logs else [_nsh(), _fleet()])]
+    lines = [measure(logs, given.repeats) for logs in ([given.logs] if given.logs else [_nsh(), _fleet()])]
     REPORT.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(REPORT) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
@@ -47,7 +47,7 @@ def main() -> int:
     return 0 if all(line["solves"] <= MOST_SOLVES for line in lines) else 1
 
 
-def measured(logs: Path, repeats: int) -> dict[str, Any]:
+def measure(logs: Path, repeats: int) -> dict[str, Any]:
     """Processor seconds of each stage, and how many solves the stages come to."""
     runs = read_runs(find_logs([logs]))
     costs = [_costs(runs) for _ in range(1 + repeats)][1:]  # the first compiles

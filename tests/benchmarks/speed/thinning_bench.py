@@ -49,21 +49,21 @@ def every_picture_a_keyframe() -> Iterator[None]:
         keyframes.KEYFRAME_DISTANCE_M, keyframes.KEYFRAME_TURN_RAD = before  # type: ignore[misc]
 
 
-def lost(runs: Sequence[Run], *, corners: bool) -> dict[str, Any]:
+def loss(runs: Sequence[Run], *, corners: bool) -> dict[str, Any]:
     """Keyframes with and without thinning, and the share of the information that is lost.
 
     Raises:
         ValueError: a map is in parts, so that there is nothing to compare.
     """
-    thinned = _mapped(runs, corners=corners)
+    thinned = _map_runs(runs, corners=corners)
     with every_picture_a_keyframe():
-        whole = _mapped(runs, corners=corners)
+        whole = _map_runs(runs, corners=corners)
     (_, log_thinned), (_, log_whole) = (np.linalg.slogdet(each.tag_covariance) for each in (thinned, whole))
     share = 1.0 - np.exp((log_whole - log_thinned) / len(whole.tag_covariance))
     return {"keyframes": _keyframes(thinned), "pictures": _keyframes(whole), "lost": float(share)}
 
 
-def _mapped(runs: Sequence[Run], *, corners: bool) -> Component:
+def _map_runs(runs: Sequence[Run], *, corners: bool) -> Component:
     components = build_map(runs, NoiseParameters(), corners=corners).components
     if len(components) > 1:
         raise ValueError(f"{len(components)} components")
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             simulate(world, given.seed, Path(folder) / "drives", render=False)
             runs = read_runs(find_logs([Path(folder) / "drives"]))
             for corners in (False, True):
-                line = {"world": world, "model": "corners" if corners else "2d", **lost(runs, corners=corners)}
+                line = {"world": world, "model": "corners" if corners else "2d", **loss(runs, corners=corners)}
                 say(
                     f"{world:<10}{line['model']:<8} {line['keyframes']:6d} keyframes of {line['pictures']} pictures "
                     f"lose {100.0 * line['lost']:.2f} % of the information (at most {100.0 * MOST_LOST:g})"

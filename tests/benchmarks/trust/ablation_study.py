@@ -44,7 +44,7 @@ from tests.benchmarks.command_line import say, seeds_of
 VARIANTS: Final = ("nothing", "systematic errors", "overruling", "lasting noise", "outliers last")
 
 
-def mapped(runs: Sequence[Run], without: str) -> MapResult:
+def map_runs(runs: Sequence[Run], without: str) -> MapResult:
     """The map of runs with one part left out."""
     calibrate = Calibrate(is_on=without not in ("overruling", "systematic errors"))
     if without == "systematic errors":
@@ -93,7 +93,7 @@ def landmarks_rms_m(result: MapResult, survey: Path) -> tuple[float, float]:
     return float(np.sqrt((off**2).sum(axis=1).mean())), nees
 
 
-def _named(result: MapResult) -> int:
+def _n_named(result: MapResult) -> int:
     return sum(each.kind != PHANTOM for each in result.suspects)
 
 
@@ -107,7 +107,7 @@ def real(data: Path) -> None:
                 import_folder(run, Path(folder) / "logs", options)
             runs = read_runs(find_logs([Path(folder) / "logs"]))
             for without in VARIANTS:
-                result = mapped(runs, without)
+                result = map_runs(runs, without)
                 row = f"{name} without {without}: {len(result.components)} components, {_tags(result)} tags, "
                 if name == "paper":
                     pairs = result.components[0].start_to_start
@@ -115,7 +115,7 @@ def real(data: Path) -> None:
                 else:
                     rms_m, nees = landmarks_rms_m(result, source / "survey.csv")
                     row += f"RMS {rms_m:.3f} m, NEES {nees:.2f}"
-                say(f"{row}, {_named(result)} named")
+                say(f"{row}, {_n_named(result)} named")
 
 
 def _tags(result: MapResult) -> int:
@@ -131,10 +131,10 @@ def harsh(seeds: Sequence[int]) -> None:
             simulate("nsh", seed, drives, render=False, harsh=list(Harsh))
             runs, truth = read_runs(find_logs([drives])), read_truth(drives / TRUTH_FILE)
             for without, found in rows.items():
-                result = mapped(runs, without)
+                result = map_runs(runs, without)
                 errors = evaluate(result, truth).components[0]
                 shape_m, nees = errors.tags_rmse_aligned_m or np.nan, errors.nees_tags_per_dim or np.nan
-                found.append((len(result.components), shape_m, nees, _named(result)))
+                found.append((len(result.components), shape_m, nees, _n_named(result)))
     for without, found in rows.items():
         n, shape_m, nees, named = np.array(found, dtype=np.float64).T
         say(

@@ -37,7 +37,7 @@ from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import say, seeds_of
 from tests.support.data.drives import FAMILY
-from tests.support.data.long_drives import READ_SHARE, SIGMA_READING, LongDrive, made_long_drive, made_town
+from tests.support.data.long_drives import READ_SHARE, SIGMA_READING, LongDrive, make_long_drive, make_town
 
 N_DRIVES: Final = 3
 LENGTH_M: Final = 200.0
@@ -64,21 +64,21 @@ class Scene:
         return next(drive for drive in self.drives if drive.chain.name == name)
 
 
-def made_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) -> Scene:
+def make_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) -> Scene:
     """Drives through one town, mapped."""
-    town = made_town(seed, n_crossings=N_CROSSINGS)
+    town = make_town(seed, n_crossings=N_CROSSINGS)
     drives = [
-        made_long_drive(100 * seed + i, length_m, _EVERY, town=town, noise=NOISE, noise_factors=(1.0, 1.0))
+        make_long_drive(100 * seed + i, length_m, _EVERY, town=town, noise=NOISE, noise_factors=(1.0, 1.0))
         for i in range(n_drives)
     ]
     maps = [solve_local_map(drive.chain) for drive in drives]
-    graph, solution = _mapped(maps, None)
+    graph, solution = _map_runs(maps, None)
     return Scene(drives, maps, graph, solution, candidates_of(graph, solution.state))
 
 
 def largest_sigma_m(scene: Scene, maps: Sequence[LocalMap]) -> float:
     """Of the scene's tags, in a map of these; infinite where one of them is no longer in it."""
-    graph, solution = _mapped(maps, scene.graph)
+    graph, solution = _map_runs(maps, scene.graph)
     sigmas_m = dict(zip(graph.tags, joint_covariance_of(solution, []).sigmas_m().tolist(), strict=True))
     return max(float(sigmas_m.get(tag, np.inf)) for tag in scene.graph.tags)
 
@@ -87,7 +87,7 @@ def with_candidate(scene: Scene, wanted: Pass | Place, seed: int) -> list[LocalM
     """The local maps after what was wanted has been done."""
     rng = np.random.default_rng([seed, 7])
     if isinstance(wanted, Pass):
-        return [*scene.maps, solve_local_map(_driven_again(rng, scene.drive(wanted.chain), wanted))]
+        return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.chain), wanted))]
     true_m = se2.apply(_T_town_map_at(scene, wanted), wanted.position_m)
     face = se2.apply(_T_town_map_at(scene, wanted), _sensor(scene, wanted)[:2]) - true_m
     chains = [_past_new_tag(rng, scene, drive, true_m, face) for drive in scene.drives]
@@ -126,7 +126,7 @@ def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pa
     return passes + places
 
 
-def _mapped(maps: Sequence[LocalMap], before: Graph | None) -> tuple[Graph, Solution]:
+def _map_runs(maps: Sequence[LocalMap], before: Graph | None) -> tuple[Graph, Solution]:
     """The largest component; or that which holds the first run of an earlier map."""
     groups = merge(maps).groups
     first = None if before is None else before.chains[0].name
@@ -134,7 +134,7 @@ def _mapped(maps: Sequence[LocalMap], before: Graph | None) -> tuple[Graph, Solu
     return solve_global_map(maps, group, Stages())
 
 
-def _driven_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Chain:
+def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Chain:
     """That part of a chain with other errors, as a run of its own."""
     part = drive.chain.part(wanted.first, wanted.last + 1)
     part = replace(part, name=f"{part.name}_again", run=replace(part.run, name=f"{part.run.name}_again"))
@@ -243,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outcomes = []
     began_s = time.process_time()
     for seed in given.seeds:
-        outcomes.append(trial(made_scene(seed), seed, given.draws))
+        outcomes.append(trial(make_scene(seed), seed, given.draws))
         say(line(seed, outcomes[-1]))
     share = float(np.mean([each.n_beaten(0, ["pass", "tag"]) / (2 * given.draws) for each in outcomes]))
     n_maps = sum(each.n_beaten(0, ["pass", "tag"]) >= ASKED_SHARE * 2 * given.draws for each in outcomes)

@@ -31,7 +31,7 @@ from groundsbot.offline.alignment.pairwise import Alignment, align
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.tags import TagKey
 from tests.benchmarks.command_line import say
-from tests.support.data.long_drives import Town, made_long_drive, made_town
+from tests.support.data.long_drives import Town, make_long_drive, make_town
 
 N_SHARED: Final = (6, 20)
 N_TRUE: Final = 4
@@ -129,7 +129,7 @@ def solved_drive(
     """Drives through the town after some of its tags were moved, and solves that alone."""
     places = np.where(moved[:, None], se2.apply(T_moved, town.tags_m), town.tags_m)
     noise = NoiseParameters()
-    drive = made_long_drive(seed, length_m, town=replace(town, tags_m=places), noise=noise, noise_factors=(1.0, 1.0))
+    drive = make_long_drive(seed, length_m, town=replace(town, tags_m=places), noise=noise, noise_factors=(1.0, 1.0))
     local_map = solve_local_map(drive.chain)
     condensed = condense(local_map, local_map.graph.tags)
     root = condensed.T_start_anchor[condensed.root]
@@ -142,7 +142,7 @@ class Pool:
 
     def __init__(self, n_each: int, seed: int, length_m: float = LENGTH_M) -> None:
         rng = np.random.default_rng(seed)
-        town = made_town(seed, TAG_SPACING_M)
+        town = make_town(seed, TAG_SPACING_M)
         n = len(town.tags_m)
         still = np.zeros((n, 3)), np.zeros(n, dtype=np.bool_)
         seeds = iter(range(1000 * seed, 1000 * seed + 3 * n_each))
@@ -189,7 +189,7 @@ def trial(
     # Where the town lies in frame b as a moved tag has it.
     T_moved = b.T_town_moved[wrong[0]] if n_wrong else np.zeros(3)
     moved = se2.compose(se2.compose(se2.inverse(a.T_town_frame), se2.inverse(T_moved)), b.T_town_frame)
-    return Trial(restricted(a.condensed, chosen), restricted(b.condensed, chosen), b.moved[chosen], T_a_b, moved)
+    return Trial(restrict(a.condensed, chosen), restrict(b.condensed, chosen), b.moved[chosen], T_a_b, moved)
 
 
 def _each_moved(town: Town, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
@@ -219,7 +219,7 @@ def _shelves_moved(town: Town, rng: np.random.Generator) -> tuple[FloatArray, Bo
     return T, moved
 
 
-def restricted(condensed: CondensedMap, tag_ids: IntArray) -> CondensedMap:
+def restrict(condensed: CondensedMap, tag_ids: IntArray) -> CondensedMap:
     """With some of its tags only, and its root."""
     which = keep = np.flatnonzero(np.isin([tag.tag_id for tag in condensed.tags], tag_ids))
     root = condensed.root

@@ -3,8 +3,8 @@
     nice python -m tests.benchmarks.trust.breaks_study --seeds 0-99
 
 A quarter of a kilometre past tags 3 to 8 m apart; calibration drawn from its priors, noise as told. After 55 % of the
-way the robot is carried on by 2 m (`carried`) or round a corner (`turned`), or its wheels turn on the spot for 3 m
-(`slipped`); or nothing of the kind happens (`clean`). A break can be told by the drive's own tags where two of them are
+way the robot is carried on by 2 m (`carry`) or round a corner (`turned`), or its wheels turn on the spot for 3 m
+(`slip`); or nothing of the kind happens (`clean`). A break can be told by the drive's own tags where two of them are
 on both sides and agree, and contradict the wheels: where the two parts, cut at the true place, align for sure, and
 believing the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom, all
 readings counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
@@ -33,7 +33,7 @@ from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.command_line import seeds_of
-from tests.support.data.broken_odometry import BrokenDrive, carried, made_clean_drive, slipped
+from tests.support.data.broken_odometry import BrokenDrive, carry, make_clean_drive, slip
 
 _FREED: Final = 1e-4  # of a motion's whitening
 KINDS: Final = ("clean", "carried", "turned", "slipped")
@@ -61,13 +61,13 @@ class Outcome:
 
 def broken_drive(kind: str, seed: int) -> BrokenDrive:
     """A drive of a kind."""
-    drive = made_clean_drive(seed)
+    drive = make_clean_drive(seed)
     if kind == "carried":
-        return carried(drive, 0.55, 2.0)
+        return carry(drive, 0.55, 2.0)
     if kind == "turned":
-        return carried(drive, 0.496, 2.0)  # a crossing is at 125 m
+        return carry(drive, 0.496, 2.0)  # a crossing is at 125 m
     if kind == "slipped":
-        return slipped(drive, 0.55, 3.0)
+        return slip(drive, 0.55, 3.0)
     return BrokenDrive(drive, len(drive.chain.stamps_ns))
 
 

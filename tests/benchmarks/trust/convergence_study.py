@@ -24,7 +24,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.benchmarks.command_line import exit_code, say, seeds_of
-from tests.support.data.long_drives import made_long_drive
+from tests.support.data.long_drives import make_long_drive
 
 COST_TOLERANCE: Final = 1e-6  # relative
 PLACE_TOLERANCE_M: Final = 1e-3
@@ -54,7 +54,7 @@ class Figures:
 
 def study_seed(seed: int) -> Figures:
     """Drives, solves and checks one seed."""
-    drive = made_long_drive(seed)
+    drive = make_long_drive(seed)
     chain = drive.chain
     dead_reckoned = chain.odometry.dead_reckon()
     turned = se2.between(drive.T_start_base[:-1], drive.T_start_base[1:])[:, 2].sum()

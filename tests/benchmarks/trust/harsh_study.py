@@ -80,7 +80,7 @@ def study_seed(
         moved, swapped = {}, []
         if changes:
             make(Path(name) / "before")
-            shared = _seen_by_all(Path(name) / "before")
+            shared = _tags_of_all(Path(name) / "before")
             rng = np.random.default_rng(seed)
             one, *two = rng.choice(shared, 3, replace=False).tolist()
             moved, swapped = {one: _MOVED_M}, [(two[0], two[1])]
@@ -104,7 +104,7 @@ def study_seed(
         ]
 
 
-def _seen_by_all(folder: Path) -> list[int]:
+def _tags_of_all(folder: Path) -> list[int]:
     runs = read_runs(find_logs([folder]))
     seen = [{tag.tag_id for tag in run.tags} for run in runs]
     return sorted(set.intersection(*seen))
@@ -119,16 +119,16 @@ def _row(
         seed,
         calibrate,
         len(result.components),
-        _known(errors.tags_rmse_aligned_m),
+        _number(errors.tags_rmse_aligned_m),
         bound_m,
-        _known(errors.nees_tags_per_dim),
+        _number(errors.nees_tags_per_dim),
         len(named - changed),
         len(clear),
         len(named & clear),
     )
 
 
-def _known(value: float | None) -> float:
+def _number(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
@@ -136,7 +136,7 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def missed(rows: Sequence[Row]) -> Iterator[str]:
+def broken_bounds(rows: Sequence[Row]) -> Iterator[str]:
     """Says the figures of each way to map, and yields a sentence for each bound that is missed."""
     rmse: dict[str, float] = {}
     for calibrate in dict.fromkeys(each.calibrate for each in rows):
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows += found
             for row in found:
                 say(str(row))
-    return exit_code(list(missed(rows)))
+    return exit_code(list(broken_bounds(rows)))
 
 
 if __name__ == "__main__":

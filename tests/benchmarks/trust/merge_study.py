@@ -27,7 +27,7 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import merge_warnings
 from groundsbot.offline.measurements.tags import TagKey
 from tests.benchmarks.command_line import say
-from tests.support.data.long_drives import ROAD_M, LongDrive, Town, made_long_drive, made_town
+from tests.support.data.long_drives import ROAD_M, LongDrive, Town, make_long_drive, make_town
 
 SAME_M: Final = 1e-6
 LENGTH_M: Final = 500.0
@@ -37,7 +37,7 @@ _OTHER_BUILDING: Final = 1000
 
 def drives_of(n: int, seed: int, length_m: float = LENGTH_M) -> list[LongDrive]:
     """Through one town, the noise as the estimate is told."""
-    town = made_town(seed, TAG_SPACING_M)
+    town = make_town(seed, TAG_SPACING_M)
     return [_drive(100 * seed + i, town, length_m) for i in range(n)]
 
 
@@ -82,7 +82,7 @@ def corridor(seed: int, length_m: float = LENGTH_M) -> list[LocalMap]:
 
 
 def _drive(seed: int, town: Town, length_m: float) -> LongDrive:
-    return made_long_drive(seed, length_m, town=town, noise=NoiseParameters(), noise_factors=(1.0, 1.0))
+    return make_long_drive(seed, length_m, town=town, noise=NoiseParameters(), noise_factors=(1.0, 1.0))
 
 
 def _places(maps: Sequence[LocalMap]) -> dict[object, FloatArray]:

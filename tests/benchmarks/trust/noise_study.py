@@ -94,7 +94,9 @@ def study_seed(world: str, seed: int, factors: Sequence[float]) -> list[Mapped |
                 Found(each, getattr(true, each.name)) for each in result.noise_fit.parameters if each.kept != NOT_NEEDED
             )
             rows.append(
-                Mapped(world, seed, factor, found, _known(errors.nees_tags_per_dim), _known(errors.nees_start_per_dim))
+                Mapped(
+                    world, seed, factor, found, _number(errors.nees_tags_per_dim), _number(errors.nees_start_per_dim)
+                )
             )
     return rows
 
@@ -152,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if all_good else 1
 
 
-def _known(value: float | None) -> float:
+def _number(value: float | None) -> float:
     return float("nan") if value is None else value
 
 

@@ -36,7 +36,7 @@ from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say
 from tests.benchmarks.trust.outlier_power_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
-from tests.support.data.moved_tags import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, gain_of, made_scene, without
+from tests.support.data.moved_tags import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, gain_of, make_scene, without
 
 KINDS: Final = (CLEAN, MOVED, MOVING, SWAPPED, DUPLICATED)
 Case = tuple[str, float]  # kind and shift in metres, 0 where the kind has none
@@ -80,7 +80,7 @@ class Counts:
         return float(np.sqrt(np.sum(self.squares_m2) / np.sum(self.squares_without_m2)))
 
 
-def mapped(maps: Sequence[LocalMap]) -> Searched | None:
+def map_runs(maps: Sequence[LocalMap]) -> Searched | None:
     """The map under fitted noise and what was found in it; None where the runs do not hang together."""
     alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
     merged = merge(alone)
@@ -93,7 +93,7 @@ def mapped(maps: Sequence[LocalMap]) -> Searched | None:
 def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
     """Maps a scene and adds what came of it; `compare`: also with the map without the tags in question."""
     counts.n_maps += 1
-    searched = mapped([solve_local_map(drive.chain) for drive in scene.drives])
+    searched = map_runs([solve_local_map(drive.chain) for drive in scene.drives])
     if searched is None:
         counts.n_apart += 1
         counts.told += [Told(0.0, named=False, right=False) for _ in scene.ids]
@@ -186,11 +186,11 @@ def map_error_m2(scene: Scene, graph: Graph, solution: Solution) -> float:
     return float((left**2).sum(axis=1).mean())
 
 
-def made_case(case: Case, number: int, seed: int) -> Scene:
+def make_case(case: Case, number: int, seed: int) -> Scene:
     """The scene of a trial: one to five tags, in turn."""
     kind, shift_m = case
     first = seed + 100_000 * KINDS.index(kind) + round(10_000 * shift_m)
-    return made_scene(first + number, kind, 0 if kind == CLEAN else 1 + number % MOST_TAGS, shift_m)
+    return make_scene(first + number, kind, 0 if kind == CLEAN else 1 + number % MOST_TAGS, shift_m)
 
 
 def study(cases: Sequence[Case], n_trials: int, seed: int, compare_every: int) -> dict[Case, Counts]:
@@ -200,7 +200,7 @@ def study(cases: Sequence[Case], n_trials: int, seed: int, compare_every: int) -
         for case, counts in table.items():
             for number in range(begin, min(begin + IN_TURN, n_trials)):
                 n_told, n_false = len(counts.told), counts.n_false
-                suspects = trial(made_case(case, number, seed), counts, compare=number % compare_every == 0)
+                suspects = trial(make_case(case, number, seed), counts, compare=number % compare_every == 0)
                 clear = [each for each in counts.told[n_told:] if each.sigmas > CLEAR_SIGMAS]
                 say(
                     f"{title(case)} {number}: {sum(each.right for each in clear)} of {len(clear)} right, "

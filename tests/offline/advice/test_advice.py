@@ -18,14 +18,14 @@ from groundsbot.offline.report.sentences import advice_sentence
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
-from tests.benchmarks.trust.advice_study import Scene, made_scene, trial
+from tests.benchmarks.trust.advice_study import Scene, make_scene, trial
 
 NEW = TagKey("tag36h11", 500)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return made_scene(0)
+    return make_scene(0)
 
 
 def sigmas_at(graph: Graph, state: State) -> dict[TagKey, float]:
@@ -65,7 +65,7 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
             like,
             keyframe=keyframe,
             tag=np.full(len(keyframe), len(chain.tags)),
-            value=_seen(found.drives.sensors[first + keyframe], place),
+            value=_tags_seen(found.drives.sensors[first + keyframe], place),
             covariance=like.covariance / n_each,  # all readings of these drives have the same
         )
         both = concatenate_observations(chain.readings, new)
@@ -90,7 +90,7 @@ def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
     assert not len(place_beside(drives, found.view, place.chain, place.keyframe, 1.0).viewers)
 
 
-def _seen(sensors: FloatArray, place: Place) -> FloatArray:
+def _tags_seen(sensors: FloatArray, place: Place) -> FloatArray:
     away = place.position_m - sensors[:, :2]
     return np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0]) - sensors[:, 2]])
 

@@ -15,13 +15,13 @@ from groundsbot.offline.alignment.pairwise import align
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from tests.support.data.long_drives import NOISE, made_long_drive, made_town
+from tests.support.data.long_drives import NOISE, make_long_drive, make_town
 
 
 @cache
-def solved(seed: int, noise: NoiseParameters = NOISE) -> LocalMap:
+def solve_town(seed: int, noise: NoiseParameters = NOISE) -> LocalMap:
     """Through one town; by default with a heading that wanders by 2 degrees a metre's root."""
-    drive = made_long_drive(seed, 300.0, town=made_town(7, (2.0, 8.0)), noise=noise, noise_factors=(1.0, 1.0))
+    drive = make_long_drive(seed, 300.0, town=make_town(7, (2.0, 8.0)), noise=noise, noise_factors=(1.0, 1.0))
     return solve_local_map(drive.chain)
 
 
@@ -33,7 +33,7 @@ def fit_of(a: LocalMap, b: LocalMap, unmodelled_sigma_m: float = 0.0) -> JointFi
 
 @pytest.mark.parametrize(("a", "b"), [(1, 2), (4, 5)])
 def test_the_rise_is_that_of_the_joint_solve_though_the_maps_are_bent(a: int, b: int) -> None:
-    maps = [solved(a), solved(b)]
+    maps = [solve_town(a), solve_town(b)]
     fit = fit_of(maps[0], maps[1])
     sure = align(condense(maps[0], maps[0].graph.tags), condense(maps[1], maps[1].graph.tags))
     assert sure is not None
@@ -48,7 +48,7 @@ def test_the_rise_is_that_of_the_joint_solve_though_the_maps_are_bent(a: int, b:
 
 
 def test_a_condensed_map_has_the_places_and_the_covariance_of_the_solve() -> None:
-    local_map = solved(1)
+    local_map = solve_town(1)
     tags = local_map.graph.tags
     condensed = condense(local_map, tags, variance_factor=4.0)
     np.testing.assert_allclose(condensed.tags_m, local_map.solution.state.tags, atol=1e-12)
@@ -67,7 +67,7 @@ def test_a_condensed_map_has_the_places_and_the_covariance_of_the_solve() -> Non
 
 
 def test_derivatives_of_the_tree_are_the_finite_differences_where_it_is_bent() -> None:
-    local_map = solved(1)
+    local_map = solve_town(1)
     tree = condense(local_map, local_map.graph.tags).tree(local_map.graph.tags[:6])
     xi = 0.1 * np.random.default_rng(0).standard_normal(30)
     _, jacobian = tree.jacobian(xi)
@@ -78,12 +78,12 @@ def test_derivatives_of_the_tree_are_the_finite_differences_where_it_is_bent() -
 
 def test_a_tag_a_metre_off_is_noticed_where_its_own_sigma_is_larger() -> None:
     """What a tag's own covariance would let pass, its neighbours do not."""
-    a, b = (condense(each, each.graph.tags) for each in (solved(4), solved(5)))
+    a, b = (condense(each, each.graph.tags) for each in (solve_town(4), solve_town(5)))
     clean = align(a, b)
     assert clean is not None
     assert len(clean.outliers) == 0
-    columns = solved(5).graph.problem.columns.tags
-    variance_m2 = {tag: np.trace(solved(5).solution.covariance(columns[i])) for i, tag in enumerate(b.tags)}
+    columns = solve_town(5).graph.problem.columns.tags
+    variance_m2 = {tag: np.trace(solve_town(5).solution.covariance(columns[i])) for i, tag in enumerate(b.tags)}
     wrong = max(clean.inliers, key=lambda tag: variance_m2[tag])
     assert variance_m2[wrong] > 1.0
     tag_m = b.tag_m.copy()

@@ -16,7 +16,7 @@ from groundsbot.offline.mapping.merge_report import alignment_results, merge_war
 from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import Placement
-from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
+from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
 
 HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(12)}
 
@@ -29,14 +29,14 @@ def local_map(
     places: dict[int, FloatArray] | None = None,
 ) -> LocalMap:
     """One robot standing somewhere in the hall that sees some of its tags exactly."""
-    drive = made_drive(T_world_start, [(0.5, 0.5, 1.0)])
+    drive = make_drive(T_world_start, [(0.5, 0.5, 1.0)])
     stamps_ns = np.full(len(tag_ids), drive.stamps_ns[0], dtype=np.int64)
     hall = HALL | (places or {})
     found = np.array([hall[i] + shift_m * np.random.default_rng(i).standard_normal(2) for i in tag_ids]).reshape(-1, 2)
     seen = se2.apply(se2.inverse(np.array(T_world_start)), found)
-    positions = made_positions(stamps_ns, np.arange(len(tag_ids)), seen, 0.05)
-    run = made_run(
-        [drive.track], robot=made_robot(name), tags=[TagKey(FAMILY, i) for i in tag_ids], positions=positions
+    positions = make_positions(stamps_ns, np.arange(len(tag_ids)), seen, 0.05)
+    run = make_run(
+        [drive.track], robot=make_robot(name), tags=[TagKey(FAMILY, i) for i in tag_ids], positions=positions
     )
     (chain,) = chains_of(run, NoiseParameters())
     return solve_local_map(chain)
@@ -55,13 +55,13 @@ def chain_of_maps() -> list[LocalMap]:
     ]
 
 
-def joined(maps: list[LocalMap], merged: Merge | None = None) -> list[tuple[tuple[str, ...], FloatArray]]:
+def join_maps(maps: list[LocalMap], merged: Merge | None = None) -> list[tuple[tuple[str, ...], FloatArray]]:
     merged = merged or merge(maps)
     return [(tuple(maps[m].chain.run.robot_id for m in g.members), g.T_frame_start) for g in merged.groups]
 
 
 def test_maps_are_joined_through_others() -> None:
-    ((names, starts),) = joined(chain_of_maps())
+    ((names, starts),) = join_maps(chain_of_maps())
     assert names == ("a", "b", "c", "d")
     np.testing.assert_allclose(starts, [STARTS[name] for name in names], atol=1e-6)
 
@@ -69,7 +69,7 @@ def test_maps_are_joined_through_others() -> None:
 @pytest.mark.parametrize("order", [[3, 2, 1, 0], [1, 3, 0, 2], [2, 0, 3, 1]])
 def test_the_order_changes_the_frame_only(order: list[int]) -> None:
     maps = chain_of_maps()
-    ((names, starts),) = joined([maps[i] for i in order])
+    ((names, starts),) = join_maps([maps[i] for i in order])
     in_frame = se2.between(np.array(STARTS[names[0]]), np.array([STARTS[name] for name in names]))
     assert names == tuple("abcd"[i] for i in order)
     np.testing.assert_allclose(se2.log(se2.between(starts, in_frame)), 0.0, atol=1e-6)
@@ -79,7 +79,7 @@ def test_what_nothing_joins_stays_apart_largest_first() -> None:
     lone = local_map("e", [0.0, 0.0, 0.0], [10])
     blind = local_map("f", [0.0, 0.0, 0.0], [])
     maps = [lone, *chain_of_maps()[:2], blind, *chain_of_maps()[3:]]
-    assert [names for names, _ in joined(maps)] == [("a", "b"), ("d",), ("e",), ("f",)]
+    assert [names for names, _ in join_maps(maps)] == [("a", "b"), ("d",), ("e",), ("f",)]
 
 
 def test_starts_follow_from_the_strongest_alignments() -> None:
@@ -90,7 +90,7 @@ def test_starts_follow_from_the_strongest_alignments() -> None:
         local_map("c", STARTS["c"], [2, 3, 4, 5, 8, 9, 10, 11]),
         local_map("d", STARTS["d"], [0, 1, 10, 11, 8, 9], shift_m=0.03),
     ]
-    ((_, starts),) = joined(maps)
+    ((_, starts),) = join_maps(maps)
     np.testing.assert_allclose(starts[:3], [STARTS[name] for name in "abc"], atol=1e-6)
 
 
@@ -117,10 +117,10 @@ def test_logs_are_worth_more_the_larger_they_are() -> None:
 def test_a_measured_start_joins_what_no_tag_joins() -> None:
     maps = [local_map("a", STARTS["a"], [0, 1, 2, 3]), local_map("b", STARTS["b"], [7, 8])]
     measured = Placement(np.array([5.1, 0.9, 2.0]), np.diag([0.1, 0.1, 0.05]) ** 2)
-    ((names, starts),) = joined(maps, merge(maps, {(0, 1): measured}))
+    ((names, starts),) = join_maps(maps, merge(maps, {(0, 1): measured}))
     assert names == ("a", "b")
     np.testing.assert_allclose(starts[1], measured.T_a_b)
-    ((_, turned),) = joined(maps[::-1], merge(maps[::-1], {(1, 0): measured}))
+    ((_, turned),) = join_maps(maps[::-1], merge(maps[::-1], {(1, 0): measured}))
     np.testing.assert_allclose(turned[1], se2.inverse(measured.T_a_b))
 
 
@@ -152,7 +152,7 @@ def test_tags_that_moved_as_one_make_it_ambiguous_and_both_ways_are_told() -> No
 def test_a_small_group_that_moved_as_one_is_named_tag_by_tag() -> None:
     maps = shelf_moved(3, 8)
     merged = merge(maps)
-    ((names, starts),) = joined(maps, merged)
+    ((names, starts),) = join_maps(maps, merged)
     assert names == ("a", "b")
     np.testing.assert_allclose(starts[1], STARTS["b"], atol=1e-3)
     warnings = merge_warnings(maps, merged)
@@ -165,7 +165,7 @@ def test_a_small_group_that_moved_as_one_is_named_tag_by_tag() -> None:
 def test_a_third_run_settles_what_two_leave_open() -> None:
     maps = [*shelf_moved(5, 5), local_map("c", STARTS["c"], [5, 6, 7, 8, 9, 10])]
     merged = merge(maps)
-    ((names, starts),) = joined(maps, merged)
+    ((names, starts),) = join_maps(maps, merged)
     assert names == ("a", "b", "c")
     np.testing.assert_allclose(starts[1], STARTS["b"], atol=1e-3)
     assert any("ambiguous" in warning and "other runs join them" in warning for warning in merge_warnings(maps, merged))
@@ -180,7 +180,7 @@ def test_alignments_that_do_not_close_a_ring_are_told_and_the_weakest_goes() -> 
         local_map("c", STARTS["c"], [0, 1, 6, 7, 8, 9], places=away),
     ]
     merged = merge(maps)
-    ((names, starts),) = joined(maps, merged)
+    ((names, starts),) = join_maps(maps, merged)
     assert names == ("a", "b", "c")
     np.testing.assert_allclose(starts, [STARTS[name] for name in names], atol=1e-3)
     (told,) = [warning for warning in merge_warnings(maps, merged) if "contradict" in warning]

@@ -27,11 +27,11 @@ def places(n: int, seed: int = 0) -> FloatArray:
     return np.random.default_rng(seed).uniform(-15.0, 15.0, (n, 2))
 
 
-def named(points: FloatArray, first_id: int = 0) -> dict[TagKey, FloatArray]:
+def name_points(points: FloatArray, first_id: int = 0) -> dict[TagKey, FloatArray]:
     return {TagKey("tag36h11", first_id + i): point for i, point in enumerate(points)}
 
 
-def seen(tags: Mapping[TagKey, FloatArray], name: str = "a", sigma_m: float = SIGMA_M) -> CondensedMap:
+def observe(tags: Mapping[TagKey, FloatArray], name: str = "a", sigma_m: float = SIGMA_M) -> CondensedMap:
     """A map whose tags were all read from its start, each with the same noise."""
     n = len(tags)
     keys = tuple(sorted(tags))
@@ -42,8 +42,8 @@ def seen(tags: Mapping[TagKey, FloatArray], name: str = "a", sigma_m: float = SI
     )
 
 
-def found(tags_a: Mapping[TagKey, FloatArray], tags_b: Mapping[TagKey, FloatArray]) -> Alignment:
-    alignment = align(seen(tags_a), seen(tags_b, "b"))
+def align_points(tags_a: Mapping[TagKey, FloatArray], tags_b: Mapping[TagKey, FloatArray]) -> Alignment:
+    alignment = align(observe(tags_a), observe(tags_b, "b"))
     assert alignment is not None
     return alignment
 
@@ -56,7 +56,7 @@ def assert_same_transform(a: FloatArray, b: FloatArray, atol: float) -> None:
 @given(ANY, st.integers(0, 1000))
 def test_any_transform_is_found(T_a_b: FloatArray, seed: int) -> None:
     b = places(6, seed)
-    alignment = found(named(se2.apply(T_a_b, b)), named(b))
+    alignment = align_points(name_points(se2.apply(T_a_b, b)), name_points(b))
     assert_same_transform(alignment.T_a_b, T_a_b, atol=1e-7)
     assert alignment.n_inliers == 6
     assert alignment.is_sure
@@ -68,16 +68,16 @@ def test_any_transform_is_found(T_a_b: FloatArray, seed: int) -> None:
 def test_half_a_turn_is_no_special_case(theta: float) -> None:
     T_a_b, b = np.array([3.0, -2.0, theta]), places(8)
     noisy = se2.apply(T_a_b, b) + 0.05 * np.random.default_rng(1).standard_normal(b.shape)
-    assert_same_transform(found(named(noisy), named(b)).T_a_b, T_a_b, atol=0.05)
+    assert_same_transform(align_points(name_points(noisy), name_points(b)).T_a_b, T_a_b, atol=0.05)
 
 
 def test_outliers_are_named_and_do_not_bend_the_transform() -> None:
     T_a_b, b = np.array([12.0, 5.0, 2.5]), places(12)
     a = se2.apply(T_a_b, b) + 0.05 * np.random.default_rng(3).standard_normal(b.shape)
-    clean = found(named(a[5:]), named(b[5:], 0)).T_a_b
+    clean = align_points(name_points(a[5:]), name_points(b[5:], 0)).T_a_b
     shift = np.random.default_rng(4).uniform(2.0, 9.0, (5, 2))
     a[:5] += shift
-    alignment = found(named(a), named(b))
+    alignment = align_points(name_points(a), name_points(b))
     assert alignment.is_sure
     assert alignment.inlier.tolist() == 5 * [False] + 7 * [True]
     np.testing.assert_allclose(alignment.T_a_b, clean, atol=1e-9)
@@ -90,22 +90,22 @@ def test_outliers_are_named_and_do_not_bend_the_transform() -> None:
 def test_only_shared_tags_count() -> None:
     b = places(5)
     T_a_b = np.array([1.0, 2.0, 0.3])
-    tags_a = named(se2.apply(T_a_b, b)) | named(places(4, 9), first_id=100)
-    alignment = found(tags_a, named(b) | named(places(3, 8), first_id=200))
+    tags_a = name_points(se2.apply(T_a_b, b)) | name_points(places(4, 9), first_id=100)
+    alignment = align_points(tags_a, name_points(b) | name_points(places(3, 8), first_id=200))
     assert [tag.tag_id for tag in alignment.shared] == [0, 1, 2, 3, 4]
     assert_same_transform(alignment.T_a_b, T_a_b, atol=1e-9)
 
 
 def test_one_id_in_two_families_is_two_tags() -> None:
     b = places(3)
-    tags_a = named(se2.apply(np.array([1.0, 2.0, 0.3]), b))
-    others = {TagKey("tag25h9", key.tag_id): place for key, place in named(b).items()}
-    assert align(seen(tags_a), seen(others)) is None
+    tags_a = name_points(se2.apply(np.array([1.0, 2.0, 0.3]), b))
+    others = {TagKey("tag25h9", key.tag_id): place for key, place in name_points(b).items()}
+    assert align(observe(tags_a), observe(others)) is None
 
 
 def test_two_shared_tags_are_enough_where_no_other_contradicts() -> None:
     T_a_b, b = np.array([4.0, -3.0, -1.2]), np.array([[0.0, 0.0], [6.0, 1.0]])
-    alignment = found(named(se2.apply(T_a_b, b)), named(b))
+    alignment = align_points(name_points(se2.apply(T_a_b, b)), name_points(b))
     assert_same_transform(alignment.T_a_b, T_a_b, atol=1e-9)
     assert alignment.n_inliers == 2
     assert alignment.is_sure
@@ -114,33 +114,33 @@ def test_two_shared_tags_are_enough_where_no_other_contradicts() -> None:
 def test_two_that_fit_among_others_that_do_not_may_be_chance() -> None:
     b = np.array([[0.0, 0.0], [6.0, 1.0], [3.0, 9.0], [-5.0, 4.0]])
     a = b + np.array([[0.0, 0.0], [0.0, 0.0], [7.0, 3.0], [-2.0, -6.0]])
-    alignment = found(named(a), named(b))
+    alignment = align_points(name_points(a), name_points(b))
     assert alignment.inlier.tolist() == [True, True, False, False]
     assert not alignment.is_sure
 
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_fewer_than_two_shared_tags_say_nothing(n: int) -> None:
-    other = named(places(2), first_id=50)
-    assert align(seen(named(places(n)) | other), seen(named(places(n)))) is None
+    other = name_points(places(2), first_id=50)
+    assert align(observe(name_points(places(n)) | other), observe(name_points(places(n)))) is None
 
 
 def test_two_tags_at_another_distance_do_not_fit() -> None:
     b = np.array([[0.0, 0.0], [6.0, 1.0]])
-    assert align(seen(named(1.5 * b)), seen(named(b))) is None
+    assert align(observe(name_points(1.5 * b)), observe(name_points(b))) is None
 
 
 def test_two_tags_on_one_spot_give_no_heading() -> None:
     b = np.array([[0.0, 0.0], [0.3, 0.0]])
-    assert align(seen(named(b)), seen(named(b))) is None
+    assert align(observe(name_points(b)), observe(name_points(b))) is None
 
 
 def test_the_result_neither_depends_on_the_order_of_tags_nor_on_the_call() -> None:
     T_a_b, b = np.array([7.0, 1.0, 0.4]), places(60)
     a = se2.apply(T_a_b, b) + 0.05 * np.random.default_rng(3).standard_normal(b.shape)
     a[::4] += 5.0 * np.random.default_rng(4).standard_normal(a[::4].shape)
-    first = found(named(a), named(b))
-    again = found(dict(reversed(named(a).items())), dict(reversed(named(b).items())))
+    first = align_points(name_points(a), name_points(b))
+    again = align_points(dict(reversed(name_points(a).items())), dict(reversed(name_points(b).items())))
     np.testing.assert_array_equal(first.T_a_b, again.T_a_b)
     np.testing.assert_array_equal(first.inlier, again.inlier)
     assert first.n_inliers > 43
@@ -151,7 +151,7 @@ def test_there_and_back_are_inverse() -> None:
     # What differs is of second order in the noise: other choices of tags are weighed about where all put map b.
     a = se2.apply(T_a_b, b) + 0.001 * np.random.default_rng(3).standard_normal(b.shape)
     a[:3] -= 4.0 * np.array([[1.0, 0.5], [-0.3, 1.0], [1.0, -1.0]])
-    there, back = found(named(a), named(b)), found(named(b), named(a))
+    there, back = align_points(name_points(a), name_points(b)), align_points(name_points(b), name_points(a))
     assert_same_transform(there.T_a_b, se2.inverse(back.T_a_b), atol=1e-6)
     np.testing.assert_array_equal(there.inlier, back.inlier)
     turned = se2.adjoint(there.T_a_b)
@@ -164,7 +164,7 @@ def test_a_symmetric_layout_is_ambiguous() -> None:
     b = np.concatenate([b, -b])
     a = b.copy()
     a[[0, 1, 4, 5]] *= -1.0
-    alignment = found(named(a), named(b))
+    alignment = align_points(name_points(a), name_points(b))
     assert not alignment.is_sure
     (rival,) = alignment.rivals
     stayed = (a == b).all(axis=1)
@@ -178,7 +178,7 @@ def test_a_loose_group_is_a_rival_where_the_others_may_have_moved_as_one() -> No
     moved = np.concatenate([se2.apply([2.0, -3.0, 0.3], near), far])
 
     def loose(points: FloatArray, name: str) -> CondensedMap:
-        tight = seen(named(points), name)
+        tight = observe(name_points(points), name)
         covariance = tight.covariance.copy()
         covariance[-8:, -8:] = 0.4**2 * np.eye(8)
         return replace(tight, covariance=covariance)
@@ -195,7 +195,7 @@ def test_a_corridor_with_a_pattern_that_repeats_and_ids_put_up_anew_is_ambiguous
     """Door posts every 4 m on both sides; every other tag was put up again one pair of doors further."""
     b = np.array([[4.0 * door, side] for door in range(7) for side in (-1.0, 1.0)])
     a = b + np.where(np.arange(14)[:, None] % 4 < 2, [4.0, 0.0], [0.0, 0.0])
-    alignment = found(named(a), named(b))
+    alignment = align_points(name_points(a), name_points(b))
     assert not alignment.is_sure
     ways = [alignment.T_a_b, *(rival.T_a_b for rival in alignment.rivals)]
     for shift_m in (0.0, 4.0):
@@ -207,7 +207,7 @@ def test_a_measured_start_settles_what_tags_leave_open() -> None:
     a = b + np.where(np.arange(14)[:, None] % 4 < 2, [4.0, 0.0], [0.0, 0.0])
     for shift_m in (0.0, 4.0):
         measured = Placement(np.array([shift_m + 0.1, 0.05, 0.02]), np.diag([0.1, 0.1, 0.03]) ** 2)
-        alignment = align(seen(named(a)), seen(named(b), "b"), measured)
+        alignment = align(observe(name_points(a)), observe(name_points(b), "b"), measured)
         assert alignment is not None
         assert alignment.is_sure
         assert_same_transform(alignment.T_a_b, np.array([shift_m, 0.0, 0.0]), atol=1e-6)
@@ -218,7 +218,7 @@ def two_moved_as_one(shift_m: float) -> Alignment:
     b = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0], [15.0, 0.0], [16.0, 2.0]])
     a = b.copy()
     a[5:] += [0.0, shift_m]
-    alignment = align(seen(named(a), sigma_m=0.4), seen(named(b), "b", sigma_m=0.4))
+    alignment = align(observe(name_points(a), sigma_m=0.4), observe(name_points(b), "b", sigma_m=0.4))
     assert alignment is not None
     return alignment
 
@@ -237,7 +237,7 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
     near = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [5.0, 9.0], [8.0, -7.0]])
     far = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0]])
     n_near, n_far = len(near), len(far)
-    straight = seen(named(np.concatenate([near, far])), "b")
+    straight = observe(name_points(np.concatenate([near, far])), "b")
     T_start_far = np.array([40.0, 0.0, 0.0])
     b = replace(straight, T_start_anchor=np.concatenate([np.zeros((n_near, 3)), np.tile(T_start_far, (n_far, 1))]))
     bend = np.array([6.0, -9.0, 0.6])
@@ -254,7 +254,7 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
         tag_m=np.concatenate([moved, far]),
         covariance=covariance,
     )
-    alignment, by_near_end = align(a, b), align(seen(named(moved)), seen(named(near), "b"))
+    alignment, by_near_end = align(a, b), align(observe(name_points(moved)), observe(name_points(near), "b"))
     assert alignment is not None
     assert by_near_end is not None
     assert alignment.evidence_nats > by_near_end.evidence_nats + MARGIN_NATS
@@ -264,7 +264,7 @@ def test_a_part_that_hangs_loosely_may_have_moved_as_one() -> None:
     """Two rooms that the drives place to 2 m; one room was moved by 5.5 m, which a bend explains."""
     one = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0]])
     other = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0], [-2.0, 2.0]])
-    straight = seen(named(np.concatenate([one, other])), "b")
+    straight = observe(name_points(np.concatenate([one, other])), "b")
     in_other = np.repeat([0.0, 1.0], [len(one), len(other)])
     T_start_other = np.array([12.0, 0.0, 0.0])
     covariance = straight.covariance.copy()

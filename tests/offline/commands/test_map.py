@@ -10,9 +10,9 @@ import pytest
 from groundsbot.offline.commands.map_drives import summary
 from groundsbot.offline.maps.files import read_map
 from groundsbot.offline.maps.result import MapResult
-from tests.support.data.drives import made_robot, write_drive
+from tests.support.data.drives import make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
 
 
@@ -50,7 +50,7 @@ def test_a_terminal_shows_five_lines_that_ask_for_action(made_map_with_warnings:
 
 @pytest.fixture
 def made_map_with_warnings() -> MapResult:
-    return replace(made_map(made_component()), warnings=tuple(f"w{i}" for i in range(9)), advice=())
+    return replace(make_map(make_component()), warnings=tuple(f"w{i}" for i in range(9)), advice=())
 
 
 def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tm
 
 def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
-    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
+    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, make_robot("c"))
     outcome = map_to(logs["a"], logs["b"], alone)
     assert outcome.code == 3
     assert "c_one shares no tag with the others" in outcome.out

@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from groundsbot.calib.foundation.command_line import EXIT_WITH_LOSSES
 from groundsbot.offline.maps.files import read_map
 from groundsbot.onboard.log.messages import RunInfo, TagDetections, WheelEncoders
-from tests.support.data.drives import FAMILY, START_NS, MadeTag, made_drive, made_robot, write_drive
-from tests.support.data.map_cases import DRIVES, TAGS, imported_log, rewritten, spliced
+from tests.support.data.drives import FAMILY, START_NS, MadeTag, make_drive, make_robot, write_drive
+from tests.support.data.map_cases import DRIVES, TAGS, imported_log, rewritten, splice
 from tests.support.programs import Run
 
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")  # where a chunk's messages begin
@@ -96,7 +96,7 @@ def test_corners_that_are_no_number_are_left_out(
 
 
 def test_a_run_that_never_moves(map_to: Run, tmp_path: Path) -> None:
-    log = write_drive(tmp_path / "logs", made_drive([0.0, 0.0, 0.2], [(0.0, 0.0, 5.0)]), TAGS, made_robot("a"))
+    log = write_drive(tmp_path / "logs", make_drive([0.0, 0.0, 0.2], [(0.0, 0.0, 5.0)]), TAGS, make_robot("a"))
     outcome = map_to(log)
     assert outcome.code == 0
     assert "a_one never moves" in outcome.out
@@ -121,7 +121,7 @@ def test_a_log_with_a_single_wheel_reading_and_nothing_else(map_to: Run, logs: d
 
 
 def test_a_run_with_a_single_tag(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
-    log = write_drive(tmp_path / "single", DRIVES["b"], TAGS[:1], made_robot("s"))
+    log = write_drive(tmp_path / "single", DRIVES["b"], TAGS[:1], make_robot("s"))
     outcome = map_to(logs["a"], log)
     assert outcome.code == 3
     assert "s_one saw a single tag, 0; two would make sure" in outcome.out
@@ -132,8 +132,8 @@ def test_tags_on_a_ceiling(map_to: Run, tmp_path: Path) -> None:
     """A camera that looks up; the tags lie flat above it."""
     mount = {"x_m": 0.2, "y_m": 0.0, "z_m": 0.4, "pitch_rad": -0.7}
     ceiling = [MadeTag(i, (2.0 + 0.8 * i, 0.5 * (-1) ** i, 2.6), 0.3 * i, -np.pi / 2) for i in range(5)]
-    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.4, 6.0)])
-    log = write_drive(tmp_path / "logs", drive, ceiling, made_robot("u", mount=mount), corner_sigma_px=0.2)
+    drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.4, 6.0)])
+    log = write_drive(tmp_path / "logs", drive, ceiling, make_robot("u", mount=mount), corner_sigma_px=0.2)
     outcome = map_to(log)
     assert outcome.code == 0
     assert "does not hang upright" in outcome.out
@@ -147,12 +147,12 @@ def test_tags_on_a_ceiling(map_to: Run, tmp_path: Path) -> None:
 def test_a_tag_that_another_robot_carries_about(map_to: Run, tmp_path: Path) -> None:
     """Tag 9 sits on a robot: it was in one place in the first drive, and moves in the second."""
     still = MadeTag(9, (4.0, 0.0, 0.3), np.pi)
-    log_a = write_drive(tmp_path / "logs", DRIVES["a"], [*TAGS, still], made_robot("a"))
+    log_a = write_drive(tmp_path / "logs", DRIVES["a"], [*TAGS, still], make_robot("a"))
     parts = []
     for i in range(4):
         carried = replace(still, position_m=(4.0 + 0.3 * i, 1.0 + 0.4 * i, 0.3))
-        parts.append(write_drive(tmp_path / f"part{i}", DRIVES["b"], [*TAGS, carried], made_robot("b")))
-    outcome = map_to(log_a, spliced(parts, tmp_path / "carried"))
+        parts.append(write_drive(tmp_path / f"part{i}", DRIVES["b"], [*TAGS, carried], make_robot("b")))
+    outcome = map_to(log_a, splice(parts, tmp_path / "carried"))
     assert outcome.code == 0
     assert re.search(
         r"suspect: tag 9 \(tag36h11\) moving: by [\d.]+ m \(\d+ sigma\) during b_one: in a_one", outcome.out
@@ -164,7 +164,7 @@ def test_two_families_in_one_log(map_to: Run, tmp_path: Path) -> None:
     both = [*TAGS, MadeTag(0, (6.0, 0.2, 0.7), np.pi, size_m=0.1, family="tag25h9")]
     small = {"family": "tag25h9", "default_size_m": 0.1, "batch": "small"}
     batches = [{"family": FAMILY, "default_size_m": 0.15}, small]
-    robot = made_robot("a", tags=batches, recorder={"families": [FAMILY, "tag25h9"]})
+    robot = make_robot("a", tags=batches, recorder={"families": [FAMILY, "tag25h9"]})
     outcome = map_to(write_drive(tmp_path / "logs", DRIVES["a"], both, robot))
     assert (outcome.code, "warning" in outcome.out) == (0, False)
     tags = {(tag.family, tag.tag_id): tag for tag in read_map(tmp_path / "out").components[0].tags}

@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.onboard.log.messages import WheelEncoders
-from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_robot, write_drive
+from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS, imported_log, rewritten
 from tests.support.programs import Run
 
@@ -39,7 +39,7 @@ def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tm
 
 
 def test_a_camera_file_of_another_size(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
-    write_robot_yaml(made_robot("a"), tmp_path / "robot.yaml")
+    write_robot_yaml(make_robot("a"), tmp_path / "robot.yaml")
     write_camera_yaml(CAMERA.resize(0.5), tmp_path / "camera.yaml")
     text = refused(logs["a"], "--robot", tmp_path / "robot.yaml")
     for part in (str(logs["a"]), "1280x720", "640x360", "--robot"):
@@ -49,7 +49,7 @@ def test_a_camera_file_of_another_size(refused: Callable[..., str], logs: dict[s
 
 
 def test_a_tag_size_that_is_missing(refused: Callable[..., str], tmp_path: Path) -> None:
-    robot = made_robot("a", tags=[{"family": FAMILY, "sizes_m": {0: 0.15, 1: 0.15, 2: 0.15}}])
+    robot = make_robot("a", tags=[{"family": FAMILY, "sizes_m": {0: 0.15, 1: 0.15, 2: 0.15}}])
     log = write_drive(tmp_path / "logs", DRIVES["a"], TAGS, robot)
     text = refused(log)
     for part in (str(log), FAMILY, "tag 3", "default_size_m", "robot.yaml"):
@@ -58,7 +58,7 @@ def test_a_tag_size_that_is_missing(refused: Callable[..., str], tmp_path: Path)
 
 def test_a_tag_size_that_is_negative(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    write_robot_yaml(made_robot("a"), path)
+    write_robot_yaml(make_robot("a"), path)
     path.write_text(path.read_text().replace("default_size_m: 0.15", "default_size_m: -0.15"))
     text = refused(logs["a"], "--robot", path)
     for part in (str(path), "default_size_m", "-0.15", "above 0"):
@@ -66,7 +66,7 @@ def test_a_tag_size_that_is_negative(refused: Callable[..., str], logs: dict[str
 
 
 def test_logs_that_disagree_about_a_size(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
-    other = made_robot("b", tags=[{"family": FAMILY, "default_size_m": 0.16}])
+    other = make_robot("b", tags=[{"family": FAMILY, "default_size_m": 0.16}])
     log = write_drive(tmp_path / "other", DRIVES["b"], TAGS, other)
     text = refused(logs["a"], log)
     for part in (str(log), "tag 0", "0.16", "0.15", "--robot"):
@@ -135,7 +135,7 @@ def test_ticks_that_no_wheel_can_count(refused: Callable[..., str], logs: dict[s
 
 def test_a_family_without_a_size_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
     both = [*TAGS, MadeTag(0, (6.0, 0.2, 0.7), np.pi, family="tag25h9")]
-    log = write_drive(tmp_path / "logs", DRIVES["a"], both, made_robot("a"))
+    log = write_drive(tmp_path / "logs", DRIVES["a"], both, make_robot("a"))
     text = refused(log)
     for part in (str(log), "tag25h9", "size"):
         assert part in text

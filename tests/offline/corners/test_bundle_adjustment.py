@@ -40,7 +40,7 @@ from groundsbot.offline.measurements.tags import Detections
 from groundsbot.offline.sam.arrowhead.build import compiled_motions
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, seen_corners_px, write_drive
+from tests.support.data.drives import HALL, MadeDrive, MadeTag, make_drive, make_robot, seen_corners_px, write_drive
 from tests.support.programs import Run as Program
 
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
@@ -55,13 +55,13 @@ CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, 
 
 
 def drive_of(name: str) -> MadeDrive:
-    return made_drive(STARTS[name], ROUND)
+    return make_drive(STARTS[name], ROUND)
 
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> MapResult:
     folder = tmp_path_factory.mktemp("exact")
-    logs = [write_drive(folder, drive_of(name), TAGS, made_robot(name)) for name in STARTS]
+    logs = [write_drive(folder, drive_of(name), TAGS, make_robot(name)) for name in STARTS]
     return build_map(read_runs(logs), noise=NOISE, corners=True)
 
 
@@ -113,15 +113,15 @@ def test_a_refined_map_is_read_back_as_it_was_written(exact: MapResult, tmp_path
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    drive = made_drive(STARTS["a"], ROUND[:2])
+    drive = make_drive(STARTS["a"], ROUND[:2])
     return load_run(
-        write_drive(tmp_path_factory.mktemp("short"), drive, TAGS[:3], made_robot("a"), corner_sigma_px=0.2)
+        write_drive(tmp_path_factory.mktemp("short"), drive, TAGS[:3], make_robot("a"), corner_sigma_px=0.2)
     )
 
 
 def rolled_run(tmp_path: Path, readout_s: float) -> Run:
     """A drive whose pictures are read out row by row, each corner seen from where the robot was by then."""
-    drive, robot = drive_of("a"), made_robot("a", readout_s=readout_s)
+    drive, robot = drive_of("a"), make_robot("a", readout_s=readout_s)
     run = load_run(write_drive(tmp_path, drive, TAGS, robot))
     camera = run.camera
     assert camera is not None

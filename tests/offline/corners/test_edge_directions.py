@@ -9,12 +9,12 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.tags.edges import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState
-from tests.offline.corners.test_factors import CAMERAS, made_factors, made_state
+from tests.offline.corners.test_factors import CAMERAS, make_factors, make_state
 
 
-def made(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
+def make_scene(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
     rng = np.random.default_rng(3)
-    return made_factors(rng, model), made_state(rng)
+    return make_factors(rng, model), make_state(rng)
 
 
 def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
@@ -26,14 +26,14 @@ def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
 
 @pytest.mark.parametrize("model", CAMERAS)
 def test_sides_face_as_the_state_has_them(model: str) -> None:
-    factors, state = made(model)
+    factors, state = make_scene(model)
     faced = with_predicted_facings(factors, state)
     np.testing.assert_allclose(faced.looks.outward, outward(predicted_px(factors, state)), atol=1e-9)
     np.testing.assert_array_equal(faced.looks.corners_px, factors.looks.corners_px)
 
 
 def test_noise_of_seen_corners_turns_no_side() -> None:
-    factors, state = made()
+    factors, state = make_scene()
     seen = predicted_px(factors, state)
     noise = np.random.default_rng(4).standard_normal(seen.shape)
     clean, noisy = (
@@ -44,7 +44,7 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
 
 
 def test_where_a_lens_has_no_image_sides_face_as_they_were_seen() -> None:
-    factors, state = made()
+    factors, state = make_scene()
     behind = replace(state, tags=np.where(np.arange(len(state.tags))[:, None] == 1, -state.tags, state.tags))
     faced, hidden = with_predicted_facings(factors, behind), factors.looks.tag == 1
     np.testing.assert_array_equal(faced.looks.outward[hidden], factors.looks.outward[hidden])

@@ -36,7 +36,7 @@ SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.
 WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces somebody who looks along x
 
 
-def made_state(rng: np.random.Generator) -> SpatialState:
+def make_state(rng: np.random.Generator) -> SpatialState:
     """Poses near the origin that look along x, at tags two to four metres away that hang askew."""
     turns = Rotation.from_rotvec(0.3 * rng.standard_normal((N_TAGS, 3))).as_matrix() @ WALL
     return SpatialState(
@@ -48,7 +48,7 @@ def made_state(rng: np.random.Generator) -> SpatialState:
     )
 
 
-def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFactors:
+def make_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFactors:
     """Looks by two cameras at once, each row read out from elsewhere."""
     camera = CameraModel("one", 1280, 720, 902.4, 901.1, 643.2, 356.7, model, CAMERAS[model])
     looks = Looks(
@@ -71,12 +71,12 @@ def made_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFa
     return CornerFactors(looks, (camera, replace(camera, fx_px=700.0)))
 
 
-def made_problem(
+def make_problem(
     seed: int, wobble_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0), model: str = "plumb_bob"
 ) -> tuple[CornerProblem, SpatialState]:
     """Looks that fit the state but for some pixels, and the motions between its poses."""
     rng = np.random.default_rng(seed)
-    state, factors = made_state(rng), made_factors(rng, model)
+    state, factors = make_state(rng), make_factors(rng, model)
     state = replace(state, poses=np.concatenate([np.zeros((1, 3)), state.poses[1:]]))
     seen = factors.looks.corners_px + factors.residual(state).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
     noisy = seen + 0.5 * rng.standard_normal(seen.shape)
@@ -112,7 +112,7 @@ def made_problem(
     return problem, state
 
 
-def moved(state: SpatialState, columns: SpatialColumns, step: FloatArray) -> SpatialState:
+def perturb(state: SpatialState, columns: SpatialColumns, step: FloatArray) -> SpatialState:
     """The plainest reading of what columns mean."""
     padded = np.append(step, 0.0)
     return SpatialState(
@@ -137,7 +137,7 @@ def dense(columns: SpatialColumns, own: IntArray, values: FloatArray) -> FloatAr
 @pytest.mark.parametrize("model", CAMERAS)
 def test_derivatives_are_those_of_the_residuals(model: str) -> None:
     rng = np.random.default_rng(1)
-    state, factors = made_state(rng), made_factors(rng, model)
+    state, factors = make_state(rng), make_factors(rng, model)
     columns = columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS)
     linearised, _ = factors.linearise(state, columns)
     ((own, jacobian),) = linearised.blocks
@@ -145,7 +145,7 @@ def test_derivatives_are_those_of_the_residuals(model: str) -> None:
     step = 1e-6
     numeric = np.empty((N_LOOKS, 8, columns.n))
     for i, e in enumerate(step * np.eye(columns.n)):
-        up, down = (factors.residual(moved(state, columns, way * e)) for way in (1.0, -1.0))
+        up, down = (factors.residual(perturb(state, columns, way * e)) for way in (1.0, -1.0))
         numeric[..., i] = (up - down) / (2 * step)
     np.testing.assert_allclose(dense(columns, own, jacobian), numeric, rtol=1e-7, atol=1e-5)
 
@@ -153,7 +153,7 @@ def test_derivatives_are_those_of_the_residuals(model: str) -> None:
 def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> None:
     """Roll, pitch and height of base, put into the mount: the camera rises and turns about base's axes, not its own."""
     rng = np.random.default_rng(2)
-    state, factors = made_state(rng), made_factors(rng)
+    state, factors = make_state(rng), make_factors(rng)
     looks = replace(factors.looks, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
     factors = replace(factors, looks=looks)
     _, wobble = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
@@ -173,7 +173,7 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
 
 def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance() -> None:
     """R + J S J^T for all corners of a picture together, by a plain inverse, against the low-rank elimination."""
-    problem, state = made_problem(3, wobble_sigma=(0.004, 0.006, 0.003))
+    problem, state = make_problem(3, wobble_sigma=(0.004, 0.006, 0.003))
     normals, cost = problem.linearise(state)
     H, g = as_dense(problem, normals)
     linearised, wobble = problem.corners.linearise(state, problem.columns)
@@ -220,7 +220,7 @@ def as_built(problem: CornerProblem, system: System) -> FloatArray:
 @pytest.mark.parametrize("wobble", [0.0, 0.004])
 def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wobble: float) -> None:
     """In the fronts and by gradients alone; with looks so far off that they count for less."""
-    problem, state = made_problem(6, wobble_sigma=(wobble, wobble, wobble), model=model)
+    problem, state = make_problem(6, wobble_sigma=(wobble, wobble, wobble), model=model)
     state = replace(state, tags=state.tags + np.array([[0.02], [0.0], [0.0]]))
     normals, cost = problem.linearise(state)
     H, g = as_dense(problem, normals)
@@ -242,13 +242,13 @@ def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wob
 
 def test_after_a_step_tags_have_gone_along_with_their_anchors_and_by_their_own_step() -> None:
     """Written with arrays; one tag is held as nobody saw it."""
-    problem, state = made_problem(8)
+    problem, state = make_problem(8)
     free = np.arange(N_TAGS) > 0
     columns = columns_of(N_POSES, free, SIGMAS)
     problem = replace(problem, columns=columns, anchor=1 + np.arange(N_TAGS))
     step = 0.3 * np.random.default_rng(9).standard_normal(columns.n)
     after, padded = problem.retract(state, step), np.append(step, 0.0)
-    np.testing.assert_allclose(after.poses, moved(state, columns, step).poses, atol=1e-14)
+    np.testing.assert_allclose(after.poses, perturb(state, columns, step).poses, atol=1e-14)
     before, way = state.poses[problem.anchor], padded[columns.poses][problem.anchor]
     seen = se2.apply(se2.inverse(before), state.tags)
     own = se2.apply(before * [0.0, 0.0, -1.0], padded[columns.tags])
@@ -263,13 +263,13 @@ def test_after_a_step_tags_have_gone_along_with_their_anchors_and_by_their_own_s
 
 
 def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
-    problem, state = made_problem(6)
+    problem, state = make_problem(6)
     behind = replace(state, tags=-state.tags)
     assert problem.linearise(behind)[1] == problem.system(behind)[1] == np.inf
 
 
 def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> None:
-    problem, state = made_problem(6)
+    problem, state = make_problem(6)
     without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
     few = problem.corners.looks.where(problem.corners.looks.pose < N_POSES - 1)
     found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, looks=few)), state)
@@ -277,7 +277,7 @@ def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> Non
     assert not initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures).any()
 
 
-def assembled(order: Fronts, matrices: list[FloatArray]) -> System:
+def assemble(order: Fronts, matrices: list[FloatArray]) -> System:
     system = order.empty()
     order.add(system, 0, [Normal(each, np.zeros(each.shape[:2])) for each in matrices])
     return system
@@ -304,7 +304,7 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
     raised = rng.uniform(0, 1, n)
     for extra in (None, raised):
         whole = H if extra is None else H + np.diag(extra)
-        factor = order.factorise(assembled(order, normals), extra)
+        factor = order.factorise(assemble(order, normals), extra)
         vector = rng.standard_normal(n)
         np.testing.assert_allclose(factor.solve(vector), np.linalg.solve(whole, vector), rtol=1e-8)
         some = rng.standard_normal((3, n))
@@ -315,6 +315,6 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
         expected = inverse[np.ix_(wanted, wanted)] * ((wanted >= 0)[:, None] & (wanted >= 0))
         np.testing.assert_allclose(factor.covariance(wanted), expected, rtol=1e-8, atol=1e-12)
     with pytest.raises(NotPositiveError):
-        order.factorise(assembled(order, [-normal for normal in normals]))
+        order.factorise(assemble(order, [-normal for normal in normals]))
     assert common_ancestor([0, 1], parent) == 5
     assert common_ancestor([0, 2, 3], parent) == 7

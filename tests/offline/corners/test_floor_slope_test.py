@@ -17,7 +17,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import Detections
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.drives import HALL, MadeTag, S, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, MadeTag, S, make_drive, make_robot, write_drive
 
 WORD = "is not level with the rest"
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0), (0.4, 0.4, 6.0), (-0.3, 0.3, 6.0), (0.4, 0.4, 5.0)]
@@ -26,7 +26,7 @@ RAMP_S = (9.0, 16.0)
 
 def ramp_run(folder: Path, pitch_deg: float, height_m: float, tilt_deg: float) -> Run:
     """A drive in the hall of which seven seconds are on a ramp, every picture tilted at random besides."""
-    drive, robot = made_drive([1.0, 1.5, 0.3], ROUND), made_robot("a")
+    drive, robot = make_drive([1.0, 1.5, 0.3], ROUND), make_robot("a")
     run = load_run(write_drive(folder, drive, HALL, robot))
     camera = run.camera
     assert camera is not None
@@ -38,7 +38,7 @@ def ramp_run(folder: Path, pitch_deg: float, height_m: float, tilt_deg: float) -
         pose = drive.at(np.array([stamp_ns]))[0]
         for i in np.flatnonzero(found.stamps_ns == stamp_ns):
             tag = HALL[run.tags[found.tag[i]].tag_id]
-            in_base = tilted(in_level_base(tag, pose), tilt, height_m * on_ramp)
+            in_base = tilt_view(in_level_base(tag, pose), tilt, height_m * on_ramp)
             corners_px[i] = camera.project(eye.inv().apply(in_base)) + 0.2 * rng.standard_normal((4, 2))
     seen = np.isfinite(corners_px).all((1, 2))
     return replace(run, detections=Detections(found.stamps_ns[seen], found.tag[seen], corners_px[seen]))
@@ -49,7 +49,7 @@ def in_level_base(tag: MadeTag, pose: FloatArray) -> FloatArray:
     return corners
 
 
-def tilted(points: FloatArray, tilt: FloatArray, height_m: float) -> FloatArray:
+def tilt_view(points: FloatArray, tilt: FloatArray, height_m: float) -> FloatArray:
     """As seen from a base that rolls and pitches and stands higher."""
     turned: FloatArray = (points - [0.0, 0.0, height_m]) @ Rotation.from_euler("xy", tilt).as_matrix()
     return turned

@@ -14,12 +14,12 @@ from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, candidat
 from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, looks_by_tag, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
-from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, made_problem
+from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_problem
 
 
 @pytest.mark.parametrize("model", CAMERAS)
 def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str) -> None:
-    problem, state = made_problem(11, model=model)
+    problem, state = make_problem(11, model=model)
     looks, which = problem.corners.looks, np.arange(N_LOOKS)
     rays = np.empty((N_LOOKS, 4, 3))
     rays_of(problem.corners.arrays, problem.corners.lenses, which, rays)
@@ -53,7 +53,7 @@ def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str
 
 
 def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_number() -> None:
-    problem, state = made_problem(12)
+    problem, state = make_problem(12)
     factors, which = problem.corners, np.arange(2)
     far = factors.looks.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
     rays = np.empty((2, 4, 3))
@@ -89,7 +89,7 @@ def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
 
 def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
     """Tag 0 as it hangs, nearly so, the other way round, and nearly so again; tag 1 nearly as tag 0 hangs."""
-    problem, state = made_problem(3)
+    problem, state = make_problem(3)
     factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
     turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])
     places = np.repeat(np.append(state.tags[0], state.heights_m[0])[None], 5, axis=0)
@@ -101,7 +101,7 @@ def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
 
 
 def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> None:
-    problem, state = made_problem(5)
+    problem, state = make_problem(5)
     off = replace(state, calibration=state.calibration + 2.0 * SIGMAS, heights_m=state.heights_m + 0.02)
     found = initial_calibration(problem, off)
     np.testing.assert_array_equal(found.poses, state.poses)
@@ -110,7 +110,7 @@ def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> N
 
 
 def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
-    problem, state = made_problem(5)
+    problem, state = make_problem(5)
     free = np.arange(N_TAGS) > 0
     corners = replace(problem.corners, looks=problem.corners.looks.where(problem.corners.looks.tag > 0))
     problem = replace(problem, corners=corners, columns=columns_of(N_POSES, free, SIGMAS))
@@ -122,6 +122,6 @@ def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
 
 def test_a_start_that_a_step_does_not_better_stays() -> None:
     """Tags behind the camera, and three times as far off as they are, where squares lead the wrong way."""
-    problem, state = made_problem(6)
+    problem, state = make_problem(6)
     for off in (replace(state, tags=-state.tags), replace(state, tags=3.0 * state.tags)):
         assert initial_calibration(problem, off) is off

@@ -17,7 +17,7 @@ from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run, load_run
 from tests.offline.global_map.test_tag_joins import seeing
-from tests.support.data.drives import HALL, MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, MadeTag, make_drive, make_robot, write_drive
 from tests.support.programs import Run as Program
 
 START = [1.0, 1.5, 0.3]
@@ -35,8 +35,8 @@ def run_past(tmp_path_factory: pytest.TempPathFactory) -> Run:
         replace(tag, pitch_rad=rng.normal() * SIGMA_RAD, roll_rad=tag.roll_rad + rng.normal() * SIGMA_RAD)
         for tag in TAGS
     ]
-    drive = made_drive(START, [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)])
-    log = write_drive(tmp_path_factory.mktemp("drive"), drive, hung, made_robot("a"), corner_sigma_px=0.2)
+    drive = make_drive(START, [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)])
+    log = write_drive(tmp_path_factory.mktemp("drive"), drive, hung, make_robot("a"), corner_sigma_px=0.2)
     run = load_run(log)
     return seeing(run, *FEW, looks=FEW)
 
@@ -82,8 +82,8 @@ def assert_honest(result: MapResult) -> None:
 
 def test_a_tag_that_leans_is_named(tmp_path: Path) -> None:
     leaning = [replace(tag, pitch_rad=0.2 * (tag.tag_id == 4)) for tag in TAGS]
-    drive = made_drive(START, [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)])
-    run = load_run(write_drive(tmp_path, drive, leaning, made_robot("a"), corner_sigma_px=0.2))
+    drive = make_drive(START, [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)])
+    run = load_run(write_drive(tmp_path, drive, leaning, make_robot("a"), corner_sigma_px=0.2))
     result = build_map([run], NoiseParameters(), corners=True, upright_sigma_rad=SIGMA_RAD)
     said = [warning for warning in result.warnings if "--upright-deg" in warning]
     assert len(said) == 1

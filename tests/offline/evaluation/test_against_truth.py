@@ -15,10 +15,10 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import align_points, evaluate
 from groundsbot.offline.evaluation.truth import TrueRun, Truth, read_truth
 from groundsbot.offline.maps.result import Component
-from tests.support.data.maps import STEP_NS, made_component, made_map, made_truth
+from tests.support.data.maps import STEP_NS, make_component, make_map, make_truth
 
 
-def moved(component: Component, d_tags_m: FloatArray, d_start_m: FloatArray) -> Component:
+def perturb(component: Component, d_tags_m: FloatArray, d_start_m: FloatArray) -> Component:
     """The component with tags (T, 2) and the second run's start (2,) found elsewhere."""
     tags = tuple(replace(tag, position_m=tag.position_m + d) for tag, d in zip(component.tags, d_tags_m, strict=True))
     first, second = component.runs
@@ -29,8 +29,8 @@ def moved(component: Component, d_tags_m: FloatArray, d_start_m: FloatArray) -> 
 @given(st.tuples(*[st.floats(-100, 100)] * 2, st.floats(-3.1, 3.1)))
 @settings(max_examples=20)
 def test_a_right_map_has_no_error_wherever_the_world_has_its_origin(T_world_map: tuple[float, ...]) -> None:
-    component = made_component()
-    errors = evaluate(made_map(component), made_truth(component, np.array(T_world_map))).components[0]
+    component = make_component()
+    errors = evaluate(make_map(component), make_truth(component, np.array(T_world_map))).components[0]
     assert errors.tags_rmse_m == pytest.approx(0, abs=1e-9)
     assert errors.tags_rmse_aligned_m == pytest.approx(0, abs=1e-9)
     assert errors.trajectory_rmse_m == pytest.approx(0, abs=1e-9)
@@ -40,18 +40,18 @@ def test_a_right_map_has_no_error_wherever_the_world_has_its_origin(T_world_map:
 
 
 def test_tag_figures_are_those_worked_out_by_hand() -> None:
-    component = made_component()
+    component = make_component()
     off = np.array([[0.03, 0.04], [0.0, 0.0], [0.0, -0.12]])  # lengths 0.05, 0, 0.12
-    errors = evaluate(made_map(moved(component, off, np.zeros(2))), made_truth(component)).components[0]
+    errors = evaluate(make_map(perturb(component, off, np.zeros(2))), make_truth(component)).components[0]
     assert errors.tags_rmse_m == pytest.approx(0.13 / np.sqrt(3))  # sqrt((0.05^2 + 0.12^2) / 3)
     assert [tag.error_m for tag in errors.tags] == pytest.approx([0.05, 0.0, 0.12])
     assert errors.tags[0].sigma_m == pytest.approx(np.trace(component.joint_covariance[6:8, 6:8]) ** 0.5)
 
 
 def test_start_figures_are_those_worked_out_by_hand() -> None:
-    component = made_component()
+    component = make_component()
     d = np.array([0.3, -0.4])
-    errors = evaluate(made_map(moved(component, np.zeros((3, 2)), d)), made_truth(component)).components[0]
+    errors = evaluate(make_map(perturb(component, np.zeros((3, 2)), d)), make_truth(component)).components[0]
     (pair,) = errors.starts
     assert (pair.a, pair.b) == ("red_one", "blue_two")
     assert pair.vector_error_m == pytest.approx(0.5)
@@ -62,29 +62,29 @@ def test_start_figures_are_those_worked_out_by_hand() -> None:
 
 def test_nees_of_small_errors_is_that_worked_out_by_hand() -> None:
     """Of large ones lengths and directions count (test_nees)."""
-    component = made_component()
+    component = make_component()
     off, d = 1e-4 * np.array([[3.0, 4.0], [0.0, 0.0], [0.0, -12.0]]), 1e-4 * np.array([3.0, -4.0])
-    errors = evaluate(made_map(moved(component, off, d)), made_truth(component)).components[0]
+    errors = evaluate(make_map(perturb(component, off, d)), make_truth(component)).components[0]
     for name, rows, error in (("tags", slice(6, 12), off.reshape(-1)), ("start", slice(3, 5), d)):
         wanted = error @ np.linalg.inv(component.joint_covariance[rows, rows]) @ error / len(error)
         assert getattr(errors, f"nees_{name}_per_dim") == pytest.approx(wanted, rel=1e-3), name
 
 
 def test_errors_drawn_from_the_covariance_have_a_nees_of_one() -> None:
-    component = made_component()
+    component = make_component()
     rng = np.random.default_rng(11)
     drawn = rng.multivariate_normal(np.zeros(9), component.joint_covariance[3:, 3:], size=300)
-    truth = made_truth(component)
-    figures = [evaluate(made_map(moved(component, e[3:].reshape(3, 2), e[:2])), truth).components[0] for e in drawn]
+    truth = make_truth(component)
+    figures = [evaluate(make_map(perturb(component, e[3:].reshape(3, 2), e[:2])), truth).components[0] for e in drawn]
     # 300 draws of 6 and of 2 dimensions: the mean's sigma is sqrt(2 / 1800) = 0.033 and sqrt(2 / 600) = 0.058.
     assert np.mean([f.nees_tags_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=0.13)
     assert np.mean([f.nees_start_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=0.23)
 
 
 def test_a_turned_map_is_wrong_as_it_stands_and_right_when_aligned() -> None:
-    component = made_component()
+    component = make_component()
     turned = np.array([se2.apply([0.5, -0.2, 0.1], tag.position_m) - tag.position_m for tag in component.tags])
-    errors = evaluate(made_map(moved(component, turned, np.zeros(2))), made_truth(component)).components[0]
+    errors = evaluate(make_map(perturb(component, turned, np.zeros(2))), make_truth(component)).components[0]
     assert errors.tags_rmse_m is not None
     assert errors.tags_rmse_m > 0.5
     assert errors.tags_rmse_aligned_m == pytest.approx(0, abs=1e-9)
@@ -99,26 +99,26 @@ def test_alignment_neither_scales_nor_mirrors() -> None:
 
 
 def test_the_trajectory_is_compared_at_its_own_times() -> None:
-    component = made_component()
+    component = make_component()
     runs = {}
     for run in component.runs:  # truth at other times than the keyframes, on the same arc
         between = se2.interpolate(run.T_map_base[:-1], run.T_map_base[1:], np.full(run.n_keyframes - 1, 0.5))
         stamps_ns = np.concatenate([run.stamps_ns[:1], run.stamps_ns[:-1] + STEP_NS // 2, run.stamps_ns[-1:]])
         runs[run.name] = TrueRun(stamps_ns, np.concatenate([run.T_map_base[:1], between, run.T_map_base[-1:]]))
-    truth = replace(made_truth(component), runs=runs)
-    errors = evaluate(made_map(component), truth).components[0]
+    truth = replace(make_truth(component), runs=runs)
+    errors = evaluate(make_map(component), truth).components[0]
     assert errors.trajectory_rmse_m == pytest.approx(0, abs=1e-8)
     shifted = {name: TrueRun(run.stamps_ns + STEP_NS // 2, run.T_world_base) for name, run in runs.items()}
-    late = evaluate(made_map(component), replace(truth, runs=shifted)).components[0]
+    late = evaluate(make_map(component), replace(truth, runs=shifted)).components[0]
     assert late.trajectory_rmse_m == pytest.approx(0.05, rel=0.1)  # half of 0.1 m a step
 
 
 def test_what_the_truth_does_not_know_is_named_and_left_out() -> None:
-    component = made_component()
-    truth = made_truth(component)
+    component = make_component()
+    truth = make_truth(component)
     known_tags = {name: place for name, place in truth.tags_m.items() if name[1] != 7}
     partial = Truth({"red_one": truth.runs["red_one"]}, known_tags, frozenset({("tag25h9", 3, "")}))
-    errors = evaluate(made_map(component), partial).components[0]
+    errors = evaluate(make_map(component), partial).components[0]
     assert errors.notes == (
         "not in the truth, left out: runs blue_two",
         "not in the truth, or there more than once, left out: tags tag36h11:7, tag25h9:3",
@@ -130,42 +130,42 @@ def test_what_the_truth_does_not_know_is_named_and_left_out() -> None:
 
 
 def test_without_the_frames_own_run_there_is_no_comparison() -> None:
-    component = made_component()
-    truth = made_truth(component)
+    component = make_component()
+    truth = make_truth(component)
     with pytest.raises(OfflineError, match=r"no 'red_one' at its start's time.*it has blue_two"):
-        evaluate(made_map(component), replace(truth, runs={"blue_two": truth.runs["blue_two"]}))
+        evaluate(make_map(component), replace(truth, runs={"blue_two": truth.runs["blue_two"]}))
 
 
 def test_each_component_is_judged_in_its_own_frame() -> None:
-    large, small = made_component(), made_component("green_one", "grey_two")
+    large, small = make_component(), make_component("green_one", "grey_two")
     T_world_small = np.array([50.0, 60.0, 2.0])
-    truth, other = made_truth(large), made_truth(small, T_world_small)
+    truth, other = make_truth(large), make_truth(small, T_world_small)
     both = replace(truth, runs=truth.runs | other.runs, tags_m=other.tags_m)
-    errors = evaluate(made_map(large, small), both)
+    errors = evaluate(make_map(large, small), both)
     assert errors.components[1].tags_rmse_m == pytest.approx(0, abs=1e-9)
     data = errors.as_json()
     assert data["frame_run"] == "red_one"
     assert data["tags_rmse_m"] == data["components"][0]["tags_rmse_m"]
     assert data["tags_rmse_m"] > 10
     assert "2 components, each judged in its own frame, largest first" in errors.lines()[0]
-    unknown = evaluate(made_map(large, small), truth).components[1]
+    unknown = evaluate(make_map(large, small), truth).components[1]
     assert unknown.tags_rmse_m is None
     assert "does not know the start of green_one" in unknown.notes[0]
 
 
 def test_a_covariance_that_is_none_gives_no_figure_but_a_reason() -> None:
-    component = made_component()
+    component = make_component()
     flat = replace(component, joint_covariance=np.zeros_like(component.joint_covariance))
-    errors = evaluate(made_map(flat), made_truth(component)).components[0]
+    errors = evaluate(make_map(flat), make_truth(component)).components[0]
     assert errors.nees_tags_per_dim is None
     assert sum("not positive definite" in note for note in errors.notes) == 2
 
 
 def test_a_single_run_has_no_start_figures() -> None:
-    component = made_component()
+    component = make_component()
     rows = np.r_[0:3, 6:12]
     alone = replace(component, runs=component.runs[:1], joint_covariance=component.joint_covariance[np.ix_(rows, rows)])
-    data = evaluate(made_map(alone), made_truth(component)).as_json()
+    data = evaluate(make_map(alone), make_truth(component)).as_json()
     assert data["start_to_start_vector_error_m"] is None
     assert data["nees_start_per_dim"] is None
     assert data["nees_tags_per_dim"] == pytest.approx(0, abs=1e-9)

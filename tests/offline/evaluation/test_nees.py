@@ -26,7 +26,7 @@ def _corridor(x: FloatArray) -> FloatArray:
     return places
 
 
-def _drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _draw(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Places found, true places, and the covariance that is right for them: J S J^T at the found."""
     sigma = np.repeat([_SIGMA_HEADING_RAD, _SIGMA_STEP_M, _SIGMA_TAG_M], [_N_STEPS, _N_STEPS, 4 * _N_STEPS])
     x = np.concatenate([rng.normal(0.0, 0.2, _N_STEPS), np.full(_N_STEPS, _STEP_M), np.zeros(4 * _N_STEPS)])
@@ -56,7 +56,7 @@ def test_a_map_that_bends_as_its_covariance_says_is_honest() -> None:
     rng = np.random.default_rng(4)
     plain, bent = [], []
     for _ in range(20):
-        found, true, covariance = _drawn(rng)
+        found, true, covariance = _draw(rng)
         plain.append(_nees(found - true, covariance))
         bent.append(_nees(tangent_errors(found, true, covariance), covariance))
     assert _honest(bent, 4 * _N_STEPS)
@@ -101,7 +101,7 @@ def test_a_spur_that_hangs_by_a_link_of_which_little_is_known_does_not_carry_the
 
 
 def test_a_covariance_that_claims_too_much_is_found_out_in_a_bent_map() -> None:
-    found, true, covariance = _drawn(np.random.default_rng(7))
+    found, true, covariance = _draw(np.random.default_rng(7))
     errors = tangent_errors(found, true, covariance)
     honest = _nees(errors, covariance)
     assert _nees(errors, covariance / 4.0) == pytest.approx(4.0 * honest)
@@ -112,7 +112,7 @@ def test_a_covariance_that_claims_too_much_is_found_out_in_a_bent_map() -> None:
 
 
 def test_small_errors_stand_as_they_are() -> None:
-    found, true, covariance = _drawn(np.random.default_rng(8))
+    found, true, covariance = _draw(np.random.default_rng(8))
     small = found + 1e-4 * (true - found)
     errors = tangent_errors(found, small, covariance)
     assert errors == pytest.approx(found - small, abs=1e-3 * np.abs(found - small).max())
@@ -132,7 +132,7 @@ def test_two_runs_that_start_side_by_side_are_honest(sigmas_apart: float) -> Non
 
 @pytest.mark.parametrize("scale", [1e-9, 1e6])
 def test_units_do_not_matter(scale: float) -> None:
-    found, true, covariance = _drawn(np.random.default_rng(10))
+    found, true, covariance = _draw(np.random.default_rng(10))
     errors = tangent_errors(scale * found, scale * true, scale**2 * covariance)
     assert errors == pytest.approx(scale * tangent_errors(found, true, covariance), rel=1e-6)
 

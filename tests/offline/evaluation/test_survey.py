@@ -12,7 +12,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.survey import SurveyEntry, judge_survey, read_survey
 from groundsbot.offline.maps.result import Component, MapResult, TagResult
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 
 _N_TAGS = 15
 _SIGMA_M = 0.02
@@ -29,7 +29,7 @@ def _component(rng: np.random.Generator) -> tuple[Component, FloatArray]:
     turn = np.stack([-true[:, 1], true[:, 0]], axis=-1).reshape(-1, 1)
     covariance = (0.01 * turn) @ (0.01 * turn).T + 0.01**2 * np.eye(2 * _N_TAGS)
     found = true + rng.multivariate_normal(np.zeros(2 * _N_TAGS), covariance).reshape(-1, 2)
-    like = made_component()
+    like = make_component()
     joint = np.zeros((6 + 2 * _N_TAGS, 6 + 2 * _N_TAGS))
     joint[6:, 6:] = covariance
     tags = tuple(
@@ -39,7 +39,7 @@ def _component(rng: np.random.Generator) -> tuple[Component, FloatArray]:
     return replace(like, tags=tags, joint_covariance=joint), true
 
 
-def _surveyed(rng: np.random.Generator, true: FloatArray, scale: float = 1.0) -> list[SurveyEntry]:
+def _survey(rng: np.random.Generator, true: FloatArray, scale: float = 1.0) -> list[SurveyEntry]:
     measured = scale * se2.apply(T_SURVEY_MAP, true) + rng.normal(0.0, _SIGMA_M, true.shape)
     return [SurveyEntry("", i, "", place, _SIGMA_M) for i, place in enumerate(measured)]
 
@@ -47,7 +47,7 @@ def _surveyed(rng: np.random.Generator, true: FloatArray, scale: float = 1.0) ->
 def _map_and_survey(seed: int) -> tuple[MapResult, list[SurveyEntry]]:
     rng = np.random.default_rng(seed)
     component, true = _component(rng)
-    return made_map(component), _surveyed(rng, true)
+    return make_map(component), _survey(rng, true)
 
 
 def test_a_good_survey_fits_with_honest_figures() -> None:
@@ -90,7 +90,7 @@ def test_a_swapped_pair_is_named_as_one() -> None:
 def test_a_wrong_scale_is_found_with_its_sigma() -> None:
     rng = np.random.default_rng(3)
     component, true = _component(rng)
-    (judged,) = judge_survey(made_map(component), _surveyed(rng, true, scale=0.99)).components
+    (judged,) = judge_survey(make_map(component), _survey(rng, true, scale=0.99)).components
     assert judged.scale_error == pytest.approx(0.01, abs=4.0 * judged.scale_sigma)
     assert judged.scale_sigma < 0.003
 
@@ -99,7 +99,7 @@ def test_a_tag_that_two_families_share_needs_its_family() -> None:
     result, survey = _map_and_survey(4)
     component = result.components[0]
     other = replace(component.tags[1], family="tag25h9", tag_id=0)
-    result = made_map(replace(component, tags=(component.tags[0], other, *component.tags[2:])))
+    result = make_map(replace(component, tags=(component.tags[0], other, *component.tags[2:])))
     notes = judge_survey(result, survey).notes
     assert notes == ("not in the map: tags 0, 1",)
     survey[0] = replace(survey[0], family="tag36h11")
@@ -131,7 +131,7 @@ def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
     result, survey = _map_and_survey(6)
     (component,) = result.components
     board = tuple(replace(tag, position_m=np.zeros(2)) for tag in component.tags[:3])
-    result = made_map(replace(component, tags=(*board, *component.tags[3:])))
+    result = make_map(replace(component, tags=(*board, *component.tags[3:])))
     piled = [replace(entry, position_m=np.zeros(2)) for entry in survey[:3]]
     (judged,) = judge_survey(result, [*piled, replace(survey[14], position_m=np.array([1e3, 0.0]))]).components
     assert [entry.tag.tag_id for entry in judged.odd] == [14]

@@ -18,9 +18,9 @@ from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.maps.result import Component
 from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log
-from tests.support.data.drives import made_robot
+from tests.support.data.drives import make_robot
 from tests.support.data.exported_map import make_small_map
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Outcome, Run
 
 
@@ -209,7 +209,7 @@ def test_cameras_sit_where_the_solve_found_them(folder: Path) -> None:
     result = read_map(folder)
     for run in result.components[0].runs:
         found = {each.name: each.value for each in result.calibration if each.owner == run.robot_id}
-        mount = made_robot(run.robot_id).mount
+        mount = make_robot(run.robot_id).mount
         corrected = mount.model_copy(
             update={
                 name: getattr(mount, name) + found[f"mount_{name}"]
@@ -252,7 +252,7 @@ def test_nothing_is_written_over(run: Run, folder: Path, tmp_path: Path, form: s
 
 
 def test_one_of_several_components_must_be_chosen(run: Run, tmp_path: Path) -> None:
-    write_map(made_map(made_component(), made_component("green_one", "grey_two")), tmp_path)
+    write_map(make_map(make_component(), make_component("green_one", "grey_two")), tmp_path)
     outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out")
     assert outcome.code == 1
     assert "1 (frame of green_one, 2 runs, 3 tags)" in outcome.err
@@ -262,7 +262,7 @@ def test_one_of_several_components_must_be_chosen(run: Run, tmp_path: Path) -> N
 
 
 def test_a_map_without_its_graph_is_told(run: Run, tmp_path: Path) -> None:
-    write_map(made_map(), tmp_path)
+    write_map(make_map(), tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")
     assert outcome.code == 1
     assert "make the map again" in outcome.err
@@ -271,13 +271,13 @@ def test_a_map_without_its_graph_is_told(run: Run, tmp_path: Path) -> None:
 
 def test_tags_that_the_map_mistrusts_are_named(run: Run, tmp_path: Path) -> None:
     suspects = (SuspectTag("tag36h11", 3, "moved", ("blue_two",), "it is 2 m off"),)
-    write_map(replace(made_map(), suspects=suspects), tmp_path)
+    write_map(replace(make_map(), suspects=suspects), tmp_path)
     outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out")
     assert "warning: suspect: tag 3 (tag36h11) moved: it is 2 m off" in outcome.out
 
 
 def test_what_was_measured_by_hand_is_said_to_be_missing(run: Run, folder: Path, tmp_path: Path) -> None:
-    result = replace(read_map(folder), measurements=made_map().measurements)
+    result = replace(read_map(folder), measurements=make_map().measurements)
     write_map(result, tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")
     assert "warning: what --start and --distance measured is not in it" in outcome.out

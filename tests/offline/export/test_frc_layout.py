@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagResult
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
 
 Export = Callable[..., tuple[dict[str, Any], list[str]]]
@@ -26,7 +26,7 @@ def of_one_family(tags: Sequence[TagResult]) -> tuple[TagResult, ...]:
     return tuple(replace(tag, family="tag36h11", tag_id=i + 1) for i, tag in enumerate(tags))
 
 
-def viewed(component: Component) -> Component:
+def view(component: Component) -> Component:
     """Each tag is seen from the starts of both runs."""
     n, m = component.runs[0].n_keyframes, len(component.tags)
     none = np.zeros(0, dtype=np.int64)
@@ -44,10 +44,10 @@ def viewed(component: Component) -> Component:
 
 @pytest.fixture
 def component(tmp_path: Path) -> Component:
-    made = viewed(made_component())
+    made = view(make_component())
     made = replace(made, tags=of_one_family(made.tags))
     (tmp_path / "map").mkdir()
-    write_map(made_map(made), tmp_path / "map")
+    write_map(make_map(made), tmp_path / "map")
     return made
 
 
@@ -79,7 +79,7 @@ def refused(run: Run, tmp_path: Path) -> Refused:
     return call
 
 
-def filled_in(folder: Path, rows: Sequence[tuple[str, str]]) -> Path:
+def fill_in(folder: Path, rows: Sequence[tuple[str, str]]) -> Path:
     """The map's own tags.csv with z_m and yaw_rad, which stand in the fourth and fifth column."""
     header, *lines = (folder / "tags.csv").read_text().splitlines()
     cells = [line.split(",") for line in lines]
@@ -92,7 +92,7 @@ def filled_in(folder: Path, rows: Sequence[tuple[str, str]]) -> Path:
 
 def test_wpilib_gets_its_layout(component: Component, export: Export, tmp_path: Path) -> None:
     yaws = (0.0, np.pi, -0.5 * np.pi)
-    poses = filled_in(tmp_path / "map", [(f"{1.0 + i}", repr(yaw)) for i, yaw in enumerate(yaws)])
+    poses = fill_in(tmp_path / "map", [(f"{1.0 + i}", repr(yaw)) for i, yaw in enumerate(yaws)])
     layout, said = export("frc", *FIELD, "--tag-poses", poses)
     assert list(layout) == ["tags", "field"]
     assert layout["field"] == {"length": 16.5, "width": 8.2}
@@ -107,7 +107,7 @@ def test_wpilib_gets_its_layout(component: Component, export: Export, tmp_path: 
 
 
 def test_limelight_gets_its_fmap(component: Component, export: Export, tmp_path: Path) -> None:
-    poses = filled_in(tmp_path / "map", [("1.5", "0.3")] * 3)
+    poses = fill_in(tmp_path / "map", [("1.5", "0.3")] * 3)
     fmap, _ = export("limelight", "--tag-poses", poses)
     assert fmap["type"] == "frc"
     for entry, tag in zip(fmap["fiducials"], component.tags, strict=True):
@@ -132,7 +132,7 @@ def test_assumptions_are_those_asked_for_and_said(component: Component, export: 
 
 
 def test_what_was_measured_wins_over_what_is_assumed(component: Component, export: Export, tmp_path: Path) -> None:
-    poses = filled_in(tmp_path / "map", [("0.7", "0.3"), ("", "0.3"), ("", "")])
+    poses = fill_in(tmp_path / "map", [("0.7", "0.3"), ("", "0.3"), ("", "")])
     layout, said = export("frc", *FIELD, "--tag-poses", poses, *ASSUMED)
     assert [entry["pose"]["translation"]["z"] for entry in layout["tags"]] == [0.7, 1.25, 1.25]
     assert "assumed: 2 of 3 tags hang 1.25 m above the floor" in said
@@ -142,7 +142,7 @@ def test_what_was_measured_wins_over_what_is_assumed(component: Component, expor
 R_TILTED = Rotation.from_euler("ZYX", [0.4, 0.2, 0.1])  # of x out of the face, y to the viewer's right, z up
 
 
-def hung(component: Component) -> Component:
+def place_tag(component: Component) -> Component:
     """Two of three tags with the pose that a map of corners has: its z out of the face, x to the right, y up."""
     right, up, out = R_TILTED.as_matrix()[:, [1, 2, 0]].T
     quaternion = Rotation.from_matrix(np.column_stack([right, up, out])).as_quat()
@@ -154,13 +154,13 @@ def hung(component: Component) -> Component:
 def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
     component: Component, export: Export, tmp_path: Path
 ) -> None:
-    made = hung(component)
-    write_map(made_map(made), tmp_path / "map")
+    made = place_tag(component)
+    write_map(make_map(made), tmp_path / "map")
     assert made.tags[0].pose is not None
     face = R_TILTED.apply([1.0, 0.0, 0.0])
     assert made.tags[0].pose.yaw_rad == pytest.approx(np.arctan2(face[1], face[0]))
     rows = [("", ""), ("0.7", repr(made.tags[0].pose.yaw_rad + 0.3)), ("0.9", "0.5")]
-    layout, said = export("frc", *FIELD, "--tag-poses", filled_in(tmp_path / "map", rows))
+    layout, said = export("frc", *FIELD, "--tag-poses", fill_in(tmp_path / "map", rows))
     wanted = [(1.7, R_TILTED), (0.7, Rotation.from_euler("z", 0.3) * R_TILTED), (0.9, Rotation.from_euler("z", 0.5))]
     for entry, (z_m, rotation) in zip(layout["tags"], wanted, strict=True):
         assert entry["pose"]["translation"]["z"] == pytest.approx(z_m)
@@ -197,14 +197,14 @@ def test_what_is_not_known_is_not_made_up(
 
 def test_cells_that_are_no_numbers_are_named(component: Component, refused: Refused, tmp_path: Path) -> None:
     assert len(component.tags) == 3
-    poses = filled_in(tmp_path / "map", [("1.0", "0.3"), ("high", "0.3"), ("1.0", "0.3")])
+    poses = fill_in(tmp_path / "map", [("1.0", "0.3"), ("high", "0.3"), ("1.0", "0.3")])
     assert "measured.csv line 3, column z_m: 'high' is not a number" in refused("frc", *FIELD, "--tag-poses", poses)
 
 
 def test_an_id_in_two_places(component: Component, export: Export, tmp_path: Path) -> None:
     first, second, third = component.tags
     twice = (replace(first, tag_id=5, instance="a"), replace(second, tag_id=5, instance="b"), third)
-    write_map(made_map(replace(component, tags=twice)), tmp_path / "map")
+    write_map(make_map(replace(component, tags=twice)), tmp_path / "map")
     layout, said = export("frc", *FIELD, *ASSUMED)
     assert [entry["ID"] for entry in layout["tags"]] == [3]
     assert "left out, since a layout has one place for an id: 5" in said
@@ -216,13 +216,13 @@ def test_an_id_in_two_places(component: Component, export: Export, tmp_path: Pat
 def test_families_and_sizes(component: Component, export: Export, refused: Refused, tmp_path: Path) -> None:
     first, second, third = component.tags
     mixed = replace(component, tags=(first, second, replace(third, family="tag25h9")))
-    write_map(made_map(mixed), tmp_path / "map")
+    write_map(make_map(mixed), tmp_path / "map")
     assert "tells no families apart, and the map has tag25h9, tag36h11" in refused("frc", *FIELD, *ASSUMED)
     assert "knows tags of tag36h11, tag16h5, not of tag25h9" in refused("limelight", *ASSUMED)
     layout, _ = export("frc", *FIELD, *ASSUMED, "--family", "tag36h11")
     assert [entry["ID"] for entry in layout["tags"]] == [1, 2]
     (tmp_path / "out.json").unlink()
-    write_map(made_map(replace(component, tags=(first, replace(second, size_m=None), third))), tmp_path / "map")
+    write_map(make_map(replace(component, tags=(first, replace(second, size_m=None), third))), tmp_path / "map")
     assert "that of 2 is not known to the map" in refused("limelight", *ASSUMED)
 
 

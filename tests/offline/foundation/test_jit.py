@@ -46,7 +46,7 @@ def test_compiling_is_told_of_once() -> None:
     assert told == [COMPILING]
 
 
-def made_package(folder: Path) -> Path:
+def make_package(folder: Path) -> Path:
     """A package `groundsbot.offline` with this module, and rooms `one` and `other` with nothing."""
     package = folder / "groundsbot" / "offline"
     for room in (package / "foundation", package / "one", package / "other" / "inside"):
@@ -55,7 +55,7 @@ def made_package(folder: Path) -> Path:
     return package
 
 
-def printed_by(program: str, folder: Path, **more: str) -> str:
+def output_of(program: str, folder: Path, **more: str) -> str:
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", **more}
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=True
@@ -65,14 +65,14 @@ def printed_by(program: str, folder: Path, **more: str) -> str:
 
 def test_an_edit_of_any_kernel_leaves_the_old_cache_alone(tmp_path: Path) -> None:
     """A caller in one room must not be loaded with what a callee in another used to be."""
-    package = made_package(tmp_path)
+    package = make_package(tmp_path)
     callee, caller = package / "one" / "callee.py", package / "other" / "inside" / "caller.py"
     imported = "from groundsbot.offline.foundation.jit import inner, njit\n"
     caller.write_text(f"{imported}from groundsbot.offline.one.callee import f\n@njit\ndef g(x):\n    return f(x)\n")
     found = []
     for plus in ("1.0", "2.0"):
         callee.write_text(f"{imported}@inner\ndef f(x):\n    return x + {plus}\n")
-        found.append(float(printed_by("from groundsbot.offline.other.inside.caller import g; print(g(1.0))", tmp_path)))
+        found.append(float(output_of("from groundsbot.offline.other.inside.caller import g; print(g(1.0))", tmp_path)))
     assert found == [2.0, 3.0]
 
 
@@ -92,19 +92,19 @@ def test_all_files_with_kernels_are_counted() -> None:
 
 def test_caches_that_nobody_used_for_long_are_removed(tmp_path: Path) -> None:
     """Only what is a cache by its name, and only after thirty days; using one counts, though it is but read."""
-    made_package(tmp_path)
+    make_package(tmp_path)
     caches = tmp_path / "caches"
     folders = {name: caches / name for name in ("solver-" + "0" * 16, "solver-" + "1" * 16, "solver-mine", "other")}
     for folder in folders.values():
         (folder / "inside").mkdir(parents=True)
         (folder / "inside" / "f.nbi").write_bytes(b"compiled")
     program = "import numba, groundsbot.offline.foundation.jit; print(numba.config.CACHE_DIR)"
-    used = Path(printed_by(program, tmp_path, NUMBA_CACHE_DIR=str(caches)).strip())
+    used = Path(output_of(program, tmp_path, NUMBA_CACHE_DIR=str(caches)).strip())
     day_s, now_s = 86_400.0, time.time()
     for folder, age in zip((*folders.values(), used), (31.0, 29.0, 31.0, 31.0, 31.0), strict=True):
         os.utime(folder, (now_s - age * day_s, now_s - age * day_s))
     (caches / ("solver-" + "2" * 16)).symlink_to(folders["other"])
-    printed_by(program, tmp_path, NUMBA_CACHE_DIR=str(caches))
+    output_of(program, tmp_path, NUMBA_CACHE_DIR=str(caches))
     kept = sorted(path.name for path in caches.iterdir())
     assert kept == sorted(["solver-" + "1" * 16, "solver-" + "2" * 16, "solver-mine", "other", used.name])
     assert (folders["other"] / "inside" / "f.nbi").exists()

@@ -8,7 +8,7 @@ import pytest
 
 from groundsbot.offline.foundation import stages as stages_module
 from groundsbot.offline.foundation.stages import Stages
-from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
 from tests.support.programs import Run, on_terminal
 
 ALL = [
@@ -85,7 +85,7 @@ def test_no_peak_where_the_kernel_tells_none(monkeypatch: pytest.MonkeyPatch, tm
 def logs(tmp_path: Path) -> Path:
     tags = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 2.0, 0.4), np.pi), MadeTag(2, (6.0, -1.0, 0.6), np.pi)]
     for name, start in (("a", [0.0, 0.0, 0.2]), ("b", [0.5, 1.0, -0.1])):
-        write_drive(tmp_path / "logs", made_drive(start, [(0.5, 0.52, 3.0)]), tags, made_robot(name))
+        write_drive(tmp_path / "logs", make_drive(start, [(0.5, 0.52, 3.0)]), tags, make_robot(name))
     return tmp_path / "logs"
 
 

@@ -14,13 +14,13 @@ from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.sam.solver import Solution
-from tests.support.data.moved_tags import CLEAN, MOVED, made_scene
+from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
 
 
 @cache
-def mapped(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
+def map_runs(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
     """Two runs under fitted noise, joined; tags are moved between them and taken for one all the same."""
-    drives = made_scene(41, kind, n_tags, 0.5).drives[1:3]
+    drives = make_scene(41, kind, n_tags, 0.5).drives[1:3]
     maps = fit_and_weigh([solve_local_map(drive.chain) for drive in drives], NoiseParameters()).maps
     (group,) = merge(maps).groups
     _, solution = solve_global_map(maps, group, Stages())
@@ -33,7 +33,7 @@ def by_windows(solution: Solution, least_factor: float = 0.0) -> Goodness:
 
 @pytest.mark.parametrize(("kind", "n_tags", "fits"), [(CLEAN, 0, True), (MOVED, 4, False)])
 def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fits: bool) -> None:
-    maps, solution = mapped(kind, n_tags)
+    maps, solution = map_runs(kind, n_tags)
     assert all(each.goodness.fits for each in maps)
     # Fitted noise counts what readings share, of which windows show less.
     found, all_windows = joint_goodness_of_fit(maps, solution), by_windows(solution, least_factor=1.0)
@@ -45,7 +45,7 @@ def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fit
 
 def test_sigmas_that_were_told_are_not_believed() -> None:
     """Windows then tell how far off they are, and nothing is added up."""
-    maps, solution = mapped(CLEAN, 0)
+    maps, solution = map_runs(CLEAN, 0)
     told = [replace(each, goodness=replace(each.goodness, reading_factor=1.5)) for each in maps]
     assert joint_goodness_of_fit(told, solution) == by_windows(solution)
     assert joint_goodness_of_fit(maps, solution) != by_windows(solution)

@@ -26,7 +26,7 @@ from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.outliers.sightings import instances, sightings_of, with_instances
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution, solve
-from tests.support.data.moved_tags import CLEAN, MOVED, made_scene
+from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
 
 SEED = 41
 MOVED_M = 0.5
@@ -42,9 +42,9 @@ def with_errors_of_passes(chain: Chain, sigmas: float) -> Chain:
 
 
 @cache
-def solved(kind: str, n_tags: int = 0, sigmas: float = 0.0) -> Solved:
+def solve_drives(kind: str, n_tags: int = 0, sigmas: float = 0.0) -> Solved:
     """Two drives as one map, moved tags taken for one."""
-    drives = made_scene(SEED, kind, n_tags, MOVED_M).drives[1:3]
+    drives = make_scene(SEED, kind, n_tags, MOVED_M).drives[1:3]
     chains = [drives[0].chain, with_errors_of_passes(drives[1].chain, sigmas)]
     maps = fit_and_weigh([solve_local_map(chain) for chain in chains], NoiseParameters()).maps
     (group,) = merge(maps).groups
@@ -53,14 +53,14 @@ def solved(kind: str, n_tags: int = 0, sigmas: float = 0.0) -> Solved:
 
 def squared_sigmas(component: Component) -> float:
     """Mean square of the tags' errors about the first drive's start, in sigmas: 1 where covariances are right."""
-    scene = made_scene(SEED)
+    scene = make_scene(SEED)
     places = se2.apply(se2.inverse(scene.drives[1].T_town_start), scene.first_m)
     error = np.concatenate([tag.position_m - places[tag.tag_id] for tag in component.tags])
     return float(error @ np.linalg.solve(component.tag_covariance, error)) / len(error)
 
 
 def test_gentle_drives_keep_their_sigmas() -> None:
-    maps, graph, solution = solved(CLEAN)
+    maps, graph, solution = solve_drives(CLEAN)
     assert misfit_of(maps, graph, solution) is None
     scatter = scatter_of_passes(graph, solution, 1.0, noise_freedom(maps))
     assert (scatter.factors == 1.0).all()
@@ -75,7 +75,7 @@ def test_gentle_drives_keep_their_sigmas() -> None:
 )
 def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas: float, what: str) -> None:
     """Passes of one drive err by what their readings share, or tags were moved in between and taken for one."""
-    maps, graph, solution = solved(kind, n_tags, sigmas)
+    maps, graph, solution = solve_drives(kind, n_tags, sigmas)
     misfit = misfit_of(maps, graph, solution)
     assert misfit is not None
     assert misfit.kind == what
@@ -91,9 +91,9 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
 
 
 def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatter() -> None:
-    maps, graph, solution = solved(MOVED, 1)
+    maps, graph, solution = solve_drives(MOVED, 1)
     scatter = scatter_of_passes(graph, solution, 1.0, noise_freedom(maps))
-    (moved,) = made_scene(SEED, MOVED, 1, MOVED_M).ids
+    (moved,) = make_scene(SEED, MOVED, 1, MOVED_M).ids
     (which,) = np.flatnonzero(scatter.factors > 1.0)
     assert graph.tags[which].tag_id == moved
     (said,) = scatter_warnings(graph, scatter)
@@ -116,7 +116,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
 
 def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
     """A drive's own solve has one place for a tag to which the joint solve gives two: it is solved again with both."""
-    maps, graph, solution = solved(CLEAN, 0, 3.0)
+    maps, graph, solution = solve_drives(CLEAN, 0, 3.0)
     sightings = sightings_of([maps[1].chain])
     apart = with_instances([maps[1].chain], sightings, instances(sightings, np.arange(len(sightings)), "second "))[0]
     again = build_graph([graph.chains[0], apart])
@@ -130,7 +130,7 @@ def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
 
 
 def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
-    maps, graph, solution = solved(MOVED, 4)
+    maps, graph, solution = solve_drives(MOVED, 4)
     (group,) = merge(maps).groups
     found, misfit = Found(), misfit_of(maps, graph, solution)
     assert misfit is not None

@@ -16,14 +16,14 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
 from groundsbot.offline.self_calibration.option import Calibrate
-from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
+from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
 
 ROUND = [(0.5, 0.5, 4.0), (0.3, 0.5, 7.85), (0.5, 0.5, 4.0), (0.5, 0.3, 7.85), (0.2, -0.2, 7.85)]
 PLACES = np.array([[2.0, 1.0], [1.0, -2.0], [4.0, 4.0], [-1.0, 3.0], [3.0, 0.5], [-2.0, 1.0]])
 SIGMA_M = 0.03
 
 
-def mapped(size: float = 1.0, track: float = 1.0, seed: int | None = None, distance: str | None = None) -> MapResult:
+def map_it(size: float = 1.0, track: float = 1.0, seed: int | None = None, distance: str | None = None) -> MapResult:
     """A drive past six tags; these are `size` times what is told, the track is `track` times that.
 
     Args:
@@ -32,16 +32,16 @@ def mapped(size: float = 1.0, track: float = 1.0, seed: int | None = None, dista
         seed: of noise of the sigma told; none where None.
         distance: --distance.
     """
-    drive = made_drive([0.0, 0.0, 0.0], ROUND, track_m=0.5 * track, step_ns=50_000_000)
+    drive = make_drive([0.0, 0.0, 0.0], ROUND, track_m=0.5 * track, step_ns=50_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(drive.stamps_ns) : 4, 0 : len(PLACES)])
     seen: FloatArray = se2.apply(se2.inverse(drive.T_world_base[at]), PLACES[tag]) / size
     if seed is not None:
         seen = seen + SIGMA_M * np.random.default_rng(seed).standard_normal(seen.shape)
-    run = made_run(
+    run = make_run(
         [drive.track],
-        robot=made_robot("carl"),
+        robot=make_robot("carl"),
         tags=[TagKey(FAMILY, i) for i in range(len(PLACES))],
-        positions=made_positions(drive.stamps_ns[at], tag, seen, SIGMA_M),
+        positions=make_positions(drive.stamps_ns[at], tag, seen, SIGMA_M),
     )
     tape = TapeOptions(distances=[distance] if distance else [])
     return build_map([run], NoiseParameters(), Stages(), tape, calibrate=Calibrate())
@@ -57,7 +57,7 @@ def contradictions(result: MapResult) -> list[str]:
 
 
 def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
-    result = mapped(size=1.10)
+    result = map_it(size=1.10)
     scale = check(result, "scale")
     assert scale.value == pytest.approx(0.10, abs=0.01)
     assert scale.sigma < 0.01
@@ -70,7 +70,7 @@ def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
 
 
 def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
-    result = mapped(track=1.15)
+    result = map_it(track=1.15)
     turn = check(result, "turn")
     assert turn.value == pytest.approx(-0.15, abs=0.03)
     (said,) = contradictions(result)
@@ -79,7 +79,7 @@ def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
 
 
 def test_what_is_as_told_contradicts_nothing() -> None:
-    result = mapped()
+    result = map_it()
     for name in ("scale", "turn"):
         assert check(result, name).value == pytest.approx(0.0, abs=1e-6)
     assert not contradictions(result)
@@ -87,13 +87,16 @@ def test_what_is_as_told_contradicts_nothing() -> None:
 
 def test_values_are_off_by_as_much_as_their_sigmas_say() -> None:
     """Readings are noisy, wheels are not; so what the wheels' sigma adds is no error here."""
-    found = [check(mapped(seed=seed), "scale") for seed in range(5)]
+    found = [check(map_it(seed=seed), "scale") for seed in range(5)]
     assert all(abs(each.value) < 4.0 * each.sigma for each in found)
 
 
 def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
     apart_m = float(np.linalg.norm(PLACES[2] - PLACES[5]))
-    one, other = check(mapped(size=1.02), "scale"), check(mapped(size=1.02, distance=f"2,5={apart_m!r},0.001"), "scale")
+    one, other = (
+        check(map_it(size=1.02), "scale"),
+        check(map_it(size=1.02, distance=f"2,5={apart_m!r},0.001"), "scale"),
+    )
     assert other.value == pytest.approx(one.value, abs=0.2 * one.sigma)
     assert other.sigma == pytest.approx(one.sigma, rel=0.2)
 

@@ -19,7 +19,7 @@ from groundsbot.offline.measurements.tags import Detections
 from groundsbot.offline.measurements.tape import TapeOptions
 from groundsbot.offline.report.tables import tables
 from tests.benchmarks.trust.tag_join_study import study_seed
-from tests.support.data.drives import HALL, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, make_drive, make_robot, write_drive
 
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
 STARTS = {"a": [1.0, 1.5, 0.3], "b": [1.4, 2.2, -0.2], "c": [1.2, 1.0, 0.6]}
@@ -35,8 +35,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     worlds = {"a": HALL, "b": HALL, "c": HALL, "raised": RAISED, "shifted": SHIFTED}
     for seed, (name, tags) in enumerate(worlds.items()):
         robot = name if name in STARTS else "c"
-        drive = made_drive(STARTS[robot], ROUND)
-        log = write_drive(folder / name, drive, tags, made_robot(robot), corner_sigma_px=0.2, seed=seed)
+        drive = make_drive(STARTS[robot], ROUND)
+        log = write_drive(folder / name, drive, tags, make_robot(robot), corner_sigma_px=0.2, seed=seed)
         found[name] = load_run(log)
     return found
 

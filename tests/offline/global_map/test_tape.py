@@ -17,7 +17,7 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
-from tests.support.data.drives import FAMILY, MadeTag, made_drive, made_positions, made_robot, made_run, write_drive
+from tests.support.data.drives import FAMILY, MadeTag, make_drive, make_positions, make_robot, make_run, write_drive
 from tests.support.programs import Outcome
 from tests.support.programs import Run as Program
 
@@ -34,28 +34,28 @@ def run_of(
     places: dict[int, tuple[float, float]] = PLACES,
 ) -> Run:
     """A drive that reads each of some tags ten times; lengths are told `scale` times too short."""
-    drive = made_drive(STARTS[name], LEGS, step_ns=100_000_000)
+    drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
     hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
     seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung) / scale
     track = drive.track
     shrunk = type(track)(track.stamps_ns, track.left_m / scale, track.right_m / scale)
-    return made_run(
+    return make_run(
         [shrunk],
-        robot=robot or made_robot(name),
+        robot=robot or make_robot(name),
         tags=[TagKey(FAMILY, key) for key in tags],
-        positions=made_positions(drive.stamps_ns[at], tag, seen),
+        positions=make_positions(drive.stamps_ns[at], tag, seen),
     )
 
 
-def mapped(runs: Sequence[Run], starts: Sequence[str] = (), distances: Sequence[str] = ()) -> MapResult:
+def map_runs(runs: Sequence[Run], starts: Sequence[str] = (), distances: Sequence[str] = ()) -> MapResult:
     return build_map(runs, NoiseParameters(), Stages(), TapeOptions(starts, distances))
 
 
 def test_a_measured_start_joins_runs_that_share_no_tag() -> None:
     runs = [run_of("a", (1, 2)), run_of("b", (3, 4))]
-    assert len(mapped(runs).components) == 2
-    result = mapped(runs, ["b_one=5,0.5,2,0.3,0.1,0.05"])
+    assert len(map_runs(runs).components) == 2
+    result = map_runs(runs, ["b_one=5,0.5,2,0.3,0.1,0.05"])
     (component,) = result.components
     b = component.runs[1]
     np.testing.assert_allclose(b.T_map_start, [5.0, 0.5, 2.0], atol=1e-9)
@@ -69,7 +69,7 @@ def test_a_measured_start_joins_runs_that_share_no_tag() -> None:
 
 def test_a_start_and_a_distance_are_weighed_by_their_sigmas() -> None:
     runs = [run_of("a", (1, 2)), run_of("b", (3, 4))]
-    result = mapped(runs, ["b_one=5.1,0,2,0.2,0.1,0.05"], ["a_one,b_one=5.0,0.1"])
+    result = map_runs(runs, ["b_one=5.1,0,2,0.2,0.1,0.05"], ["a_one,b_one=5.0,0.1"])
     b = result.components[0].runs[1]
     # 5.1 and 5.0 at weights of 25 and 100.
     np.testing.assert_allclose(b.T_map_start, [5.02, 0.0, 2.0], atol=1e-8)
@@ -84,7 +84,7 @@ def test_a_start_and_a_distance_are_weighed_by_their_sigmas() -> None:
 
 def test_a_distance_that_contradicts_is_said_with_its_sigmas() -> None:
     runs = [run_of("a", (1, 2)), run_of("b", (3, 4))]
-    result = mapped(runs, ["b_one=5,0,2,0.03,0.1,0.05"], ["a_one,b_one=5.25,0.04"])
+    result = map_runs(runs, ["b_one=5,0,2,0.03,0.1,0.05"], ["a_one,b_one=5.25,0.04"])
     assert [told.contradicts for told in result.measurements] == [True, True]
     assert result.measurements[1].off_sigmas == pytest.approx(5.0, rel=1e-6)
     (said,) = [warning for warning in result.warnings if warning.startswith("--distance a_one,b_one")]
@@ -100,14 +100,14 @@ def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_b
         },
         "tags": [{"family": FAMILY, "default_size_m": 0.15, "sigma_size_m": 0.015}],
     }  # fmt: skip
-    runs = [run_of(name, (1, 2, 3), 1.03, made_robot(name, **wide)) for name in ("a", "b")]
+    runs = [run_of(name, (1, 2, 3), 1.03, make_robot(name, **wide)) for name in ("a", "b")]
     apart_m = float(np.linalg.norm(np.subtract(PLACES[1], PLACES[3])))
-    free = mapped(runs)
+    free = map_runs(runs)
     (metre,) = free.metres
     assert metre.sigma > 0.02
     assert metre.shares["distances"] == 0.0
     assert np.linalg.norm(tag(free, 1) - tag(free, 3)) < 0.985 * apart_m
-    taped = mapped(runs, distances=[f"1,3={apart_m!r},0.001"])
+    taped = map_runs(runs, distances=[f"1,3={apart_m!r},0.001"])
     (metre,) = taped.metres
     assert metre.sigma == pytest.approx(0.001 / apart_m, rel=0.01)
     assert metre.shares["distances"] > 0.99
@@ -120,13 +120,13 @@ def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_b
 
 def test_a_distance_within_one_run_counts() -> None:
     apart_m = float(np.linalg.norm(np.subtract(PLACES[1], PLACES[2])))
-    result = mapped([run_of("a", (1, 2))], distances=[f"1,2={apart_m + 0.01!r},0.0001"])
+    result = map_runs([run_of("a", (1, 2))], distances=[f"1,2={apart_m + 0.01!r},0.0001"])
     assert np.linalg.norm(tag(result, 1) - tag(result, 2)) == pytest.approx(apart_m + 0.01, abs=1e-4)
 
 
 def test_what_spans_two_components_is_not_used_and_said_so() -> None:
     runs = [run_of("a", (1, 2, 5)), run_of("b", (3, 4))]
-    result = mapped(runs, distances=["1,3=5,0.1"])
+    result = map_runs(runs, distances=["1,3=5,0.1"])
     assert len(result.components) == 2
     assert [told.component for told in result.measurements] == [None]
     assert any("--distance tag36h11:1,tag36h11:3: not used" in warning for warning in result.warnings)
@@ -136,7 +136,7 @@ def test_tags_outvote_a_start_that_was_written_down_wrong() -> None:
     """One of them was moved, so that they do not all agree."""
     ids = (1, 2, 3, 4, 5)
     runs = [run_of("a", ids), run_of("b", ids, places=PLACES | {5: (2.0, 2.0)})]
-    result = mapped(runs, ["b_one=15,0,2,0.05,0.05,0.02"])
+    result = map_runs(runs, ["b_one=15,0,2,0.05,0.05,0.02"])
     assert result.alignments[0].is_sure
     np.testing.assert_allclose(result.alignments[0].T_from_to, STARTS["b"], atol=1e-3)
     assert any("--start b_one: measured (15.000, 0.000) m" in warning for warning in result.warnings)
@@ -153,7 +153,7 @@ def test_tags_outvote_a_start_that_was_written_down_wrong() -> None:
 )
 def test_what_cannot_be_is_refused(starts: list[str], distances: list[str], told: str) -> None:
     with pytest.raises(OfflineError) as caught:
-        mapped([run_of("a", (1, 2)), run_of("b", (1, 2))], starts, distances)
+        map_runs([run_of("a", (1, 2)), run_of("b", (1, 2))], starts, distances)
     assert told in str(caught.value)
 
 
@@ -161,7 +161,7 @@ def test_the_command_takes_and_prints_them(run: Program, tmp_path: Path) -> None
     tags = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 2.0, 0.4), np.pi)]
     ahead = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
     for name, at in (("a", [0.0, 0.0, 0.2]), ("b", [0.5, 1.0, -0.1])):
-        write_drive(tmp_path / "logs", made_drive(at, ahead), tags, made_robot(name))
+        write_drive(tmp_path / "logs", make_drive(at, ahead), tags, make_robot(name))
 
     def call(*options: str) -> Outcome:
         return run("map", tmp_path / "logs", "-o", tmp_path / "out", *options)

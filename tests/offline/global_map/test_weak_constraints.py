@@ -34,24 +34,24 @@ from groundsbot.offline.sam.factors.odometry_and_readings import (
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.support.data.drives import FAMILY, MadeDrive, made_drive, made_positions, made_robot, made_run
-from tests.support.data.graphs import made_graph, with_measured
+from tests.support.data.drives import FAMILY, MadeDrive, make_drive, make_positions, make_robot, make_run
+from tests.support.data.graphs import make_graph, with_measured
 
 LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
 
 
 def chain_past(name: str, start: Sequence[float], tags: dict[int, tuple[float, float]]) -> Chain:
     """A drive that reads each of some tags ten times, exactly."""
-    drive: MadeDrive = made_drive(start, LEGS, step_ns=100_000_000)
+    drive: MadeDrive = make_drive(start, LEGS, step_ns=100_000_000)
     keys = sorted(tags)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(keys)])
     places = np.array([tags[key] for key in keys]).reshape(-1, 2)[tag]
     read = se2.apply(se2.inverse(drive.T_world_base[at]), places)
-    run = made_run(
+    run = make_run(
         [drive.track],
-        robot=made_robot(name),
+        robot=make_robot(name),
         tags=[TagKey(FAMILY, key) for key in keys],
-        positions=made_positions(drive.stamps_ns[at], tag, read),
+        positions=make_positions(drive.stamps_ns[at], tag, read),
     )
     return replace(chains_of(run, NoiseParameters())[0], name=name)
 
@@ -60,17 +60,17 @@ STARTS = {"a": (0.0, 0.0, 0.0), "b": (3.0, 1.0, 2.0), "c": (-1.0, 2.0, -1.0), "d
 PLACES = {1: (2.0, 1.0), 2: (1.0, -2.0), 3: (-1.0, 1.0), 4: (3.0, 3.0), 5: (0.0, 4.0), 6: (-2.0, -2.0)}
 
 
-def solved(tags_of: dict[str, Sequence[int]]) -> tuple[Graph, Solution]:
+def solve_drives(tags_of: dict[str, Sequence[int]]) -> tuple[Graph, Solution]:
     """Chains that read some tags each, solved from the truth in the frame of the first one's start."""
     chains = [chain_past(name, STARTS[name], {tag: PLACES[tag] for tag in tags}) for name, tags in tags_of.items()]
     graph = build_graph(chains)
-    poses = [made_drive(STARTS[c.name], LEGS, step_ns=100_000_000).at(c.stamps_ns) for c in chains]
+    poses = [make_drive(STARTS[c.name], LEGS, step_ns=100_000_000).at(c.stamps_ns) for c in chains]
     start = graph.start(se2.compose(se2.inverse(np.array(STARTS["a"])), np.concatenate(poses)), {}, {})
     return graph, solve(graph.problem, start)
 
 
 def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_is_known() -> None:
-    graph, solution = solved({"a": (1, 2), "b": (3, 4)})
+    graph, solution = solve_drives({"a": (1, 2), "b": (3, 4)})
     assert solution.unobservable.chains == (1,)
     assert solution.rank == graph.problem.columns.n - 3
     (sentence,) = [s for s in weak_parts(graph, solution) if s.startswith("b ")]
@@ -78,7 +78,7 @@ def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_
     first_of_b = graph.problem.columns.poses[graph.first_pose[1]]
     assert (np.sqrt(solution.covariance(first_of_b).diagonal()) > 100.0).all()
     # What is tied down is as well known as without b, which knows a little of the scale of tags too.
-    alone, by_itself = solved({"a": (1, 2)})
+    alone, by_itself = solve_drives({"a": (1, 2)})
     for tag in range(2):
         together, apart = (
             s.covariance(g.problem.columns.tags[tag]) for g, s in ((graph, solution), (alone, by_itself))
@@ -87,7 +87,7 @@ def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_
 
 
 def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
-    graph, solution = solved({"a": (1, 2), "b": (2, 3)})
+    graph, solution = solve_drives({"a": (1, 2), "b": (2, 3)})
     assert solution.unobservable.n_directions == 1
     assert any("b shares only tag 2 with the others, about which it can turn" in s for s in weak_parts(graph, solution))
 
@@ -105,7 +105,7 @@ def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
 def test_chains_and_shared_tags_are_bars_and_joints(
     tags_of: dict[str, Sequence[int]], n_untied: int, chains: tuple[int, ...]
 ) -> None:
-    graph, solution = solved(tags_of)
+    graph, solution = solve_drives(tags_of)
     assert solution.unobservable.n_directions == n_untied
     assert solution.unobservable.chains == chains
     assert np.isfinite(solution.covariance(np.arange(graph.problem.columns.n))).all()
@@ -122,7 +122,7 @@ def test_chains_and_shared_tags_are_bars_and_joints(
 def test_rank_is_that_of_the_dense_jacobian(
     seed: int, lengths: list[int], n_kept: int, held: float, n_measured: int
 ) -> None:
-    problem, truth = made_graph(seed, lengths, 5, held=held)
+    problem, truth = make_graph(seed, lengths, 5, held=held)
     keep = np.random.default_rng(seed).permutation(len(problem.readings.pose))[:n_kept]
     names = problem.readings.__dataclass_fields__
     few = ReadingFactors(**{name: getattr(problem.readings, name)[keep] for name in names})
@@ -200,7 +200,7 @@ def readings_csv(
     return rows
 
 
-def mapped(folder: Path, runs: dict[str, tuple[str, list[tuple[float, ...]], str]]) -> MapResult:
+def map_runs(folder: Path, runs: dict[str, tuple[str, list[tuple[float, ...]], str]]) -> MapResult:
     """Imports and maps runs of (odometry.csv, rows of observations.csv, its sigma columns)."""
     logs = []
     for name, (odometry, rows, sigmas) in runs.items():
@@ -243,7 +243,7 @@ CASES: dict[str, tuple[dict[str, tuple[str, list[tuple[float, ...]], str]], str]
 @pytest.mark.parametrize("case", CASES)
 def test_weak_input_makes_a_finite_map_and_is_named(tmp_path: Path, case: str) -> None:
     runs, words = CASES[case]
-    result = mapped(tmp_path, runs)
+    result = map_runs(tmp_path, runs)
     assert any(words in warning for warning in result.warnings) or not words, result.warnings
     json.dumps(map_as_json(result), allow_nan=False)
     for component in result.components:
@@ -254,9 +254,9 @@ def test_weak_input_makes_a_finite_map_and_is_named(tmp_path: Path, case: str) -
 
 def test_a_sigma_of_zero_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(GroundsbotError, match=r"observations\.csv line 2, column sigma_x_m"):
-        mapped(tmp_path, {"a": (WEAVE, [(*row, 0.0, 0.1) for row in READ], SIGMAS)})
+        map_runs(tmp_path, {"a": (WEAVE, [(*row, 0.0, 0.1) for row in READ], SIGMAS)})
 
 
 def test_sound_maps_say_nothing(tmp_path: Path) -> None:
-    result = mapped(tmp_path, {"a": (WEAVE, READ, ""), "b": (WEAVE, READ, "")})
+    result = map_runs(tmp_path, {"a": (WEAVE, READ, ""), "b": (WEAVE, READ, "")})
     assert result.warnings == ()

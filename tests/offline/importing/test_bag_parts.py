@@ -25,12 +25,12 @@ from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.importing.run_writer import ImportReport
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import TagKey
-from tests.support.data.bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, made_message, write_bag
+from tests.support.data.bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, make_message, write_bag
 from tests.support.data.drives import CAMERA as LENS
-from tests.support.data.drives import HALL, PINHOLE, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, PINHOLE, make_drive, make_robot, write_drive
 from tests.support.programs import Run as Program
 
-DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.3, 1.0)], step_ns=20_000_000)
+DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.3, 1.0)], step_ns=20_000_000)
 SIZED = BagOptions(tag_size_m=0.15)
 
 
@@ -39,7 +39,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("log"), DRIVE, HALL[:2], camera=PINHOLE)
 
 
-def imported(
+def import_run(
     messages: Sequence[Sent], folder: Path, bag_options: BagOptions = SIZED, **options: Any
 ) -> tuple[ImportReport, Run]:
     bag = write_bag(folder / "drive", messages)
@@ -48,7 +48,7 @@ def imported(
 
 
 def test_names_of_run_and_robot_come_from_the_bag_and_its_track_need_not_be_known(tmp_path: Path, log: Path) -> None:
-    report, run = imported(good(log).sent, tmp_path)
+    report, run = import_run(good(log).sent, tmp_path)
     assert (report.run_id, report.robot_id, run.name) == ("drive", "drive", "drive_drive")
     assert report.distance_m == pytest.approx(0.35)
 
@@ -68,7 +68,7 @@ def test_times_of_receiving_are_used_where_asked_for(tmp_path: Path, log: Path) 
         s._replace(fields=s.fields | ({"header": header(0, CAMERA)} if "header" in s.fields else {})) for s in made.sent
     ]
     bare = [s._replace(fields=s.fields | {"child_frame_id": BASE}) if s.topic == "/odom" else s for s in bare]
-    report, run = imported(bare, tmp_path, replace(SIZED, receive_times=True))
+    report, run = import_run(bare, tmp_path, replace(SIZED, receive_times=True))
     np.testing.assert_array_equal(run.picture_stamps_ns, made.run.picture_stamps_ns + 90_000_000)
     assert run.stretches[0].stamps_ns[0] == made.track.stamps_ns[0] + 5_000_000
     assert "times are those at which the bag received the messages" in report.remarks
@@ -79,7 +79,7 @@ def test_messages_out_of_order_twice_or_without_a_time_do_no_harm(tmp_path: Path
     swapped = [each._replace(received_ns=2 * made.sent[1].received_ns - each.received_ns) for each in made.sent[1:]]
     nameless = made.sent[5]._replace(fields=made.sent[5].fields | {"header": header(0, "odom")})
     messages = [made.sent[0], *swapped, made.sent[7]._replace(received_ns=made.sent[7].received_ns + 99), nameless]
-    report, run = imported(messages, tmp_path)
+    report, run = import_run(messages, tmp_path)
     np.testing.assert_array_equal(run.stretches[0].stamps_ns, made.track.stamps_ns)
     np.testing.assert_array_equal(run.detections.stamps_ns, made.run.detections.stamps_ns)
     assert "/odom: 1 message left out: their times were there already" in report.remarks
@@ -91,7 +91,7 @@ def test_options_choose_among_several_topics(tmp_path: Path, log: Path) -> None:
     choice = BagOptions(
         odometry_topic="/other", tags_topic="detections", tag_size_m=0.15, camera_info_topic="/camera/camera_info"
     )
-    report, _ = imported(made.sent, tmp_path, choice)
+    report, _ = import_run(made.sent, tmp_path, choice)
     assert report.remarks[:3] == (
         "odometry: /other (nav_msgs/Odometry)",
         "tags: /detections (apriltag_msgs/AprilTagDetectionArray)",
@@ -127,24 +127,24 @@ def test_detections_are_in_rectified_pixels(tmp_path: Path, log: Path) -> None:
     (info,) = [each for each in made.sent if each.topic == "/camera/camera_info"]
     p = [800.0, 0.0, 640.5, 0.0, 0.0, 801.0, 360.5, 0.0, 0.0, 0.0, 1.0, 0.0]
     changed = [each._replace(fields=each.fields | {"p": p}) if each is info else each for each in made.sent]
-    _, run = imported(changed, tmp_path)
+    _, run = import_run(changed, tmp_path)
     assert run.camera is not None
     assert (run.camera.fx_px, run.camera.fy_px, run.camera.cx_px, run.camera.cy_px) == (800.0, 801.0, 640.5, 360.5)
     assert run.camera.distortion == (0.0,) * 5
 
 
 def test_robot_yaml_gives_sizes_mount_and_camera(tmp_path: Path, log: Path) -> None:
-    robot = made_robot("dora", mount={"x_m": 0.3}, tags=[{"default_size_m": 0.2}])
+    robot = make_robot("dora", mount={"x_m": 0.3}, tags=[{"default_size_m": 0.2}])
     write_robot_yaml(robot, tmp_path / "robot.yaml")
     write_camera_yaml(LENS, tmp_path / "camera.yaml")
-    _, run = imported(good(log).without("/tf_static").sent, tmp_path, BagOptions(), robot=tmp_path / "robot.yaml")
+    _, run = import_run(good(log).without("/tf_static").sent, tmp_path, BagOptions(), robot=tmp_path / "robot.yaml")
     assert (run.robot_id, run.robot.mount.x_m, run.robot.tag_size_m("tag36h11", 1)[0]) == ("dora", 0.3, 0.2)
     assert run.camera == replace(LENS, name="camera")
 
 
 def test_options_go_before_tf(tmp_path: Path, log: Path) -> None:
-    _, run = imported(good(log).sent, tmp_path, camera_x_m=0.25)
-    mount, by_tf = run.robot.mount, made_robot().mount
+    _, run = import_run(good(log).sent, tmp_path, camera_x_m=0.25)
+    mount, by_tf = run.robot.mount, make_robot().mount
     assert mount.x_m == 0.25
     np.testing.assert_allclose(
         [mount.y_m, mount.yaw_rad, mount.pitch_rad, mount.roll_rad],
@@ -163,7 +163,7 @@ def test_joints_may_be_named_and_start_over_after_a_turn(tmp_path: Path, log: Pa
             each = each._replace(fields=each.fields | {"position": wrapped})
         sent.append(each)
     options = BagOptions(left_joint="a", right_joint="b", tag_size_m=0.15)
-    _, run = imported(sent, tmp_path, options, wheel_radius_m=0.1, track_width_m=0.5)
+    _, run = import_run(sent, tmp_path, options, wheel_radius_m=0.1, track_width_m=0.5)
     np.testing.assert_allclose(run.stretches[0].left_m, made.track.left_m, atol=1e-9)
     np.testing.assert_allclose(run.stretches[0].right_m, made.track.right_m, atol=1e-9)
 
@@ -185,7 +185,7 @@ def test_each_joint_may_come_in_messages_of_its_own(tmp_path: Path, log: Path, l
                 "position": [each.fields["position"][i]],
             }
             sent.append(each._replace(fields=each.fields | own))
-    _, run = imported(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
+    _, run = import_run(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
     (track,) = run.stretches
     (whole,) = made.run.stretches
     there = whole.at(track.stamps_ns)
@@ -205,7 +205,7 @@ def test_joints_of_different_times_are_no_wheels(tmp_path: Path, log: Path) -> N
             each = each._replace(fields=each.fields | own)
         sent.append(each)
     with pytest.raises(GroundsbotError, match="wheel_left and wheel_right were not published at the same time"):
-        imported(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
+        import_run(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
 
 
 def test_a_list_shorter_than_its_type_says_is_told_in_a_line(tmp_path: Path, log: Path) -> None:
@@ -221,7 +221,7 @@ def test_poses_about_the_base_need_no_camera(tmp_path: Path, log: Path) -> None:
     detection = {"family": "36h11", "id": 5, "pose": pose}
     fields = {"header": header(stamp_ns, BASE), "detections": [detection]}
     made.add("/tags", "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", stamp_ns, fields)
-    _, run = imported(made.sent, tmp_path, BagOptions())
+    _, run = import_run(made.sent, tmp_path, BagOptions())
     np.testing.assert_allclose(run.positions.value, [[3.0, -1.0]])
     assert not run.positions.in_camera.any()
     assert run.tags == (TagKey("tag36h11", 5),)
@@ -248,7 +248,7 @@ def fixed_frames(*links: tuple[str, str, Sequence[float]]) -> FixedFrames:
     for parent, child, (x, y, z) in links:
         transform = {"translation": {"x": x, "y": y, "z": z}, "rotation": {"w": 1.0}}
         fields = {"transforms": [{"header": header(0, parent), "child_frame_id": child, "transform": transform}]}
-        frames.add(made_message(STORE2, "tf2_msgs/msg/TFMessage", fields))
+        frames.add(make_message(STORE2, "tf2_msgs/msg/TFMessage", fields))
     return frames
 
 
@@ -305,7 +305,7 @@ def test_covariances_are_used_where_they_are_some(covariance: np.ndarray, is_san
 GREY = np.add.outer(np.arange(40), np.arange(60)).astype(np.uint8)
 
 
-def encoded(encoding: str) -> np.ndarray:
+def encode(encoding: str) -> np.ndarray:
     colour = cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)
     wide = GREY.astype(np.uint16) * 256 + 255
     forms = {
@@ -321,15 +321,15 @@ def encoded(encoding: str) -> np.ndarray:
 
 @pytest.mark.parametrize("encoding", ["mono16", "rgb8", "bgra8", "bayer_grbg8", "yuv422", "yuv422_yuy2"])
 def test_pictures_of_many_encodings_become_grey(encoding: str) -> None:
-    rows = np.pad(encoded(encoding), ((0, 0), (0, 3)))
+    rows = np.pad(encode(encoding), ((0, 0), (0, 3)))
     fields = {"height": 40, "width": 60, "encoding": encoding, "step": rows.shape[1], "data": rows.ravel()}
-    picture = picture_of("bag", IMAGE, made_message(STORE2, IMAGE, fields))
+    picture = picture_of("bag", IMAGE, make_message(STORE2, IMAGE, fields))
     assert isinstance(picture, np.ndarray)
     assert picture.shape == GREY.shape
     inner = (slice(2, -2), slice(2, -2))  # Bayer's edges are made up
     np.testing.assert_allclose(picture[inner].astype(int), GREY[inner].astype(int), atol=2)
     with pytest.raises(GroundsbotError, match="a picture of 60x41 in"):
-        picture_of("bag", IMAGE, made_message(STORE2, IMAGE, fields | {"height": 41}))
+        picture_of("bag", IMAGE, make_message(STORE2, IMAGE, fields | {"height": 41}))
 
 
 def test_options_of_bags_are_refused_for_csv(tmp_path: Path, run: Program) -> None:

@@ -23,15 +23,15 @@ from groundsbot.onboard.log.messages import PlanarOdometry, RunInfo, TagDetectio
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.support.data.bags import BagOfLog, without_definitions
-from tests.support.data.drives import HALL, PINHOLE, START_NS, S, made_drive, made_robot, picture_stamps, write_drive
-from tests.support.data.odometry_steps import accumulated, covariances_of_steps
+from tests.support.data.drives import HALL, PINHOLE, START_NS, S, make_drive, make_robot, picture_stamps, write_drive
+from tests.support.data.odometry_steps import accumulate, covariances_of_steps
 from tests.support.tag_pictures import draw_tag
 
 TAGS = [HALL[i] for i in (0, 1, 2, 4, 6, 7)]
-DRIVE = made_drive(
+DRIVE = make_drive(
     [1.0, 1.5, 0.3], [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 4.0), (0.3, 0.5, 1.0)], step_ns=S // 50
 )
-SHORT = made_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)])
+SHORT = make_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)])
 PICTURES = CameraModel("c", 640, 480, 600.0, 601.0, 320.5, 239.5, "plumb_bob", (-0.18, 0.07, 0.0006, -0.0004, 0.0))
 OPTIONS = ImportOptions(run_id="one", robot_id="carl", track_width_m=0.5)
 SIZED = BagOptions(tag_size_m=0.15)
@@ -68,7 +68,7 @@ def position_map(position_log: Path) -> MapResult:
 
 
 def _position_log(folder: Path, *, with_covariances: bool = True) -> Path:
-    robot, rng = made_robot(), np.random.default_rng(3)
+    robot, rng = make_robot(), np.random.default_rng(3)
     plain = write_drive(folder, DRIVE, [], robot, camera=None)
     run = next(iter(read_log(plain))).message
     assert isinstance(run, RunInfo)
@@ -101,7 +101,7 @@ def _position_log(folder: Path, *, with_covariances: bool = True) -> Path:
     return log
 
 
-def imported(
+def import_run(
     bag: Path, tmp_path: Path, options: ImportOptions = OPTIONS, bag_options: BagOptions = SIZED
 ) -> ImportReport:
     return import_bag(bag, tmp_path / "logs", options, bag_options, lambda *_: None)
@@ -140,7 +140,7 @@ def test_a_bag_of_corners_gives_the_map_of_its_log(
     if "file" in form:
         (bag,) = bag.glob("*.mcap")
     options = replace(OPTIONS, wheel_radius_m=0.1) if form == "joints" else OPTIONS
-    report = imported(bag, tmp_path, options)
+    report = import_run(bag, tmp_path, options)
     assert_same_map(corner_map, map_of(report.run_folder, corner_log))
 
 
@@ -152,7 +152,7 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
     made = BagOfLog.of(position_log).mount().odometry()
     made = made.apriltag_ros() if form == "apriltag_ros" else made.isaac_poses()
     bag = made.write(tmp_path / ("drive.bag" if form == "apriltag_ros" else "drive"))
-    report = imported(bag, tmp_path, bag_options=BagOptions())
+    report = import_run(bag, tmp_path, bag_options=BagOptions())
     assert_same_map(position_map, map_of(report.run_folder, position_log))
     n_without = sum(not each.covariance for message in made.observations for each in message.observations)
     assert any(f"those of {n_without} readings of {report.n_observations} are zeros" in each for each in report.remarks)
@@ -160,7 +160,7 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
 
 def test_a_bag_with_tags_in_tf_gives_the_map_of_its_log(tmp_path: Path, bare_position_log: Path) -> None:
     bag = BagOfLog.of(bare_position_log).mount().odometry().tag_transforms().write(tmp_path / "drive")
-    report = imported(bag, tmp_path, bag_options=BagOptions())
+    report = import_run(bag, tmp_path, bag_options=BagOptions())
     assert_same_map(
         build_map(read_runs([bare_position_log]), noise=NOISE), map_of(report.run_folder, bare_position_log)
     )
@@ -170,8 +170,8 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
     """They grow by a known covariance with each step, and the map is that of a log which holds these."""
     made = BagOfLog.of(corner_log)
     steps = covariances_of_steps(made.poses)
-    bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulated(made.poses, steps))
-    report = imported(bag.write(tmp_path / "drive"), tmp_path)
+    bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulate(made.poses, steps))
+    report = import_run(bag.write(tmp_path / "drive"), tmp_path)
     assert "covariances of the odometry are used: by how much each step adds to those of the pose" in report.remarks
     log = _with_covariances(corner_log, made.poses, steps, tmp_path / "expected")
     expected = build_map(read_runs([log]), noise=NOISE)
@@ -184,7 +184,7 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
 def test_a_bag_leaves_open_what_it_does_not_tell(tmp_path: Path, position_log: Path) -> None:
     """tf tells of the mount; neither clocks nor wheels nor who measured ranges are in a bag."""
     bag = BagOfLog.of(position_log).mount().odometry().isaac_poses().write(tmp_path / "drive")
-    robot = load_run(imported(bag, tmp_path, replace(OPTIONS, track_width_m=None), BagOptions()).run_folder).robot
+    robot = load_run(import_run(bag, tmp_path, replace(OPTIONS, track_width_m=None), BagOptions()).run_folder).robot
     assert (robot.time_offset_s_sigma, robot.range_offset_m_sigma) == (0.3, 0.1)
     assert robot.wheels.track_m_sigma == pytest.approx(0.3 * robot.wheels.track_m)
     assert (robot.wheels.radii_scale_sigma, robot.wheels.radii_ratio_sigma) == (0.01, 0.02)
@@ -221,7 +221,7 @@ def test_pictures_of_a_bag_give_what_the_detector_finds_in_them(tmp_path: Path, 
         (found,) = TagDetector(quad_decimate=1.0, camera=PICTURES).detect(picture)
         np.testing.assert_allclose(found.corners_px, corners_px, atol=0.5)
         expected.append((stamp_ns, found.corners_px.ravel().tolist()))
-    report = imported(made.write(tmp_path / "drive"), tmp_path)
+    report = import_run(made.write(tmp_path / "drive"), tmp_path)
     looks = [each.message for each in read_log(report.run_folder) if isinstance(each.message, TagDetections)]
     assert [(each.stamp_ns, list(each.detections[0].corners_px)) for each in looks] == expected
     assert load_run(report.run_folder).camera == replace(PICTURES, name="camera")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.support.data.bags import CAMERA, BagOfLog, Sent, good, header, without_definitions, write_bag
-from tests.support.data.drives import HALL, PINHOLE, made_drive, write_drive
+from tests.support.data.drives import HALL, PINHOLE, make_drive, write_drive
 from tests.support.programs import Run
 
-DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)], step_ns=20_000_000)
+DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)], step_ns=20_000_000)
 SIZE = ("--tag-size-m", "0.15")
 
 Spoil = Callable[[BagOfLog, Path], Path]
@@ -23,7 +23,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("log"), DRIVE, HALL[:2], camera=PINHOLE)
 
 
-def changed(
+def alter(
     made: BagOfLog, folder: Path, topic: str, change: Callable[[dict[str, Any]], dict[str, Any]], first: int = 0
 ) -> Path:
     """The bag with messages of one topic changed, from one of them on."""
@@ -37,14 +37,14 @@ def changed(
 
 
 def without_stamps(made: BagOfLog, folder: Path) -> Path:
-    return changed(made, folder, "/detections", lambda _: {"header": header(0, CAMERA)})
+    return alter(made, folder, "/detections", lambda _: {"header": header(0, CAMERA)})
 
 
 def other_clock(made: BagOfLog, folder: Path) -> Path:
-    return changed(made, folder, "/detections", lambda f: {"header": f["header"] | {"stamp": {"sec": 77}}})
+    return alter(made, folder, "/detections", lambda f: {"header": f["header"] | {"stamp": {"sec": 77}}})
 
 
-def shortened(name: str, share: float) -> Spoil:
+def shorten(name: str, share: float) -> Spoil:
     def spoil(made: BagOfLog, folder: Path) -> Path:
         bag = (made.without("/detections") if name.endswith(".bag") else made).write(folder / name)
         file = bag if bag.is_file() else next(bag.glob("*.mcap"))
@@ -93,7 +93,7 @@ def spoilt_quaternion(made: BagOfLog, folder: Path) -> Path:
         first, *rest = fields["transforms"]
         return {"transforms": [first | {"transform": {"translation": first["transform"]["translation"]}}, *rest]}
 
-    return changed(made, folder, "/tf_static", spoil)
+    return alter(made, folder, "/tf_static", spoil)
 
 
 def moving_mount(made: BagOfLog, folder: Path) -> Path:
@@ -105,8 +105,8 @@ def moving_mount(made: BagOfLog, folder: Path) -> Path:
     return write_bag(folder / "drive", [*made.sent, *also])
 
 
-def jumped(made: BagOfLog, folder: Path) -> Path:
-    return changed(made, folder, "/odom", lambda _: {"pose": {"pose": {"orientation": {"w": 1.0}}}}, first=20)
+def jump(made: BagOfLog, folder: Path) -> Path:
+    return alter(made, folder, "/odom", lambda _: {"pose": {"pose": {"orientation": {"w": 1.0}}}}, first=20)
 
 
 def with_picture(made: BagOfLog, encoding: str, shape: tuple[int, int]) -> BagOfLog:
@@ -115,9 +115,7 @@ def with_picture(made: BagOfLog, encoding: str, shape: tuple[int, int]) -> BagOf
 
 
 def picture_of_other_encoding(made: BagOfLog, folder: Path) -> Path:
-    return changed(
-        with_picture(made, "mono8", (720, 1280)), folder, "/camera/image_raw", lambda _: {"encoding": "32FC1"}
-    )
+    return alter(with_picture(made, "mono8", (720, 1280)), folder, "/camera/image_raw", lambda _: {"encoding": "32FC1"})
 
 
 BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
@@ -132,7 +130,7 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
         r"no tags: no messages of apriltag_ros/AprilTagDetectionArray or .*sensor_msgs/CompressedImage; it holds",
     ),
     "nothing seen": (
-        lambda made, folder: changed(made, folder, "/detections", lambda _: {"detections": []}),
+        lambda made, folder: alter(made, folder, "/detections", lambda _: {"detections": []}),
         SIZE,
         r"/detections: no tag was seen in 8 pictures",
     ),
@@ -143,8 +141,8 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
     ),
     "another definition": (other_definition, SIZE, r"holds a message that is not as its type should be: .*'width'"),
     "broken index": (broken_index, SIZE, r"drive\.bag: cannot be read as a bag: .*`rosbag reindex`"),
-    "cut short, ROS 1": (shortened("drive.bag", 0.6), SIZE, r"cannot be read as a bag: .*`rosbag reindex`"),
-    "cut short, MCAP": (shortened("drive", 0.7), SIZE, r"\.mcap: cannot be read as a bag: .*`mcap recover`"),
+    "cut short, ROS 1": (shorten("drive.bag", 0.6), SIZE, r"cannot be read as a bag: .*`rosbag reindex`"),
+    "cut short, MCAP": (shorten("drive", 0.7), SIZE, r"\.mcap: cannot be read as a bag: .*`mcap recover`"),
     "no metadata": (no_metadata, SIZE, r"has no metadata\.yaml, .*`ros2 bag reindex`"),
     "times of zero": (
         without_stamps,
@@ -180,19 +178,19 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
         r"/detections: to place tags by their corners needs a CameraInfo",
     ),
     "not calibrated": (
-        lambda made, folder: changed(
+        lambda made, folder: alter(
             made, folder, "/camera/camera_info", lambda _: {"k": np.zeros(9), "p": np.zeros(12)}
         ),
         SIZE,
         r"/camera/camera_info: camera camera: fx_px is 0.0 but must be above 0",
     ),
     "odometry reset": (
-        jumped,
+        jump,
         SIZE,
         r"/odom: a wheel rolls .* before message 21, faster than 20 m/s; was the odometry",
     ),
     "a pose that is none": (
-        lambda made, folder: changed(made, folder, "/odom", lambda _: {"pose": {"pose": {"orientation": {}}}}, first=6),
+        lambda made, folder: alter(made, folder, "/odom", lambda _: {"pose": {"pose": {"orientation": {}}}}, first=6),
         SIZE,
         r"/odom: the pose of message 7 is no pose",
     ),

@@ -25,7 +25,7 @@ from tests.support.data.csv_folders import (
     PAPER,
     TRACK,
     folder_with,
-    imported,
+    import_run,
     observations_of,
     odometry_of,
     run_of,
@@ -34,7 +34,7 @@ from tests.support.paper_recordings import RECORDINGS, needs_recordings
 
 
 def test_speeds_become_cumulative_distances(tmp_path: Path) -> None:
-    report = imported(tmp_path)
+    report = import_run(tmp_path)
     assert report.run_folder == tmp_path / "logs" / "drive"
     assert [file.name for file in report.run_folder.iterdir()] == ["0000.core.mcap"]
     readings = odometry_of(report.run_folder)
@@ -44,7 +44,7 @@ def test_speeds_become_cumulative_distances(tmp_path: Path) -> None:
 
 
 def test_tags_of_one_time_are_one_message(tmp_path: Path) -> None:
-    report = imported(tmp_path)
+    report = import_run(tmp_path)
     first, second = observations_of(report.run_folder)
     assert (first.frame, first.stamp_ns) == ("camera_planar", 500_000_000)
     assert [(o.family, o.tag_id) for o in second.observations] == [("tag36h11", 7), ("tag36h11", 9)]
@@ -55,7 +55,7 @@ def test_tags_of_one_time_are_one_message(tmp_path: Path) -> None:
 
 
 def test_the_log_is_in_order_of_time_with_the_run_first(tmp_path: Path) -> None:
-    entries: list[LogMessage] = list(read_log(imported(tmp_path).run_folder))
+    entries: list[LogMessage] = list(read_log(import_run(tmp_path).run_folder))
     assert entries[0].topic == "/run"
     assert [entry.log_time_ns for entry in entries] == sorted(entry.log_time_ns for entry in entries)
     assert all(entry.log_time_ns == entry.publish_time_ns for entry in entries)
@@ -63,7 +63,7 @@ def test_the_log_is_in_order_of_time_with_the_run_first(tmp_path: Path) -> None:
 
 def test_ranges_bearings_and_sigmas_are_kept(tmp_path: Path) -> None:
     text = "t_s,tag_id,range_m,bearing_rad,sigma_range_m,sigma_bearing_rad\n1,4,3.5,-0.25,0.1,0.02\n"
-    (message,) = observations_of(imported(tmp_path, observations=text).run_folder)
+    (message,) = observations_of(import_run(tmp_path, observations=text).run_folder)
     (seen,) = message.observations
     assert (seen.polar.range_m, seen.polar.bearing_rad) == (3.5, -0.25)
     assert list(seen.covariance) == pytest.approx([0.01, 0, 0, 0.0004])
@@ -72,7 +72,7 @@ def test_ranges_bearings_and_sigmas_are_kept(tmp_path: Path) -> None:
 def test_seconds_keep_their_nanoseconds(tmp_path: Path) -> None:
     odometry = "t_s,left_m_s,right_m_s\n1800000000.123456789,0,0\n1800000001.123456789,0,0\n"
     observations = "t_ns,tag_id,x_m,y_m\n1800000000123456790,1,2,0\n"
-    log = imported(tmp_path, odometry, observations).run_folder
+    log = import_run(tmp_path, odometry, observations).run_folder
     assert odometry_of(log)[0].stamp_ns == 1_800_000_000_123_456_789
     assert observations_of(log)[0].stamp_ns == 1_800_000_000_123_456_790
 
@@ -80,7 +80,7 @@ def test_seconds_keep_their_nanoseconds(tmp_path: Path) -> None:
 def test_ticks_become_metres_from_zero_on(tmp_path: Path) -> None:
     odometry = "t_s,left_ticks,right_ticks\n0,1000,-500\n1,1500,0\n2,1400,500\n"
     options = ImportOptions(track_width_m=0.5, wheel_radius_m=0.1, ticks_per_turn=1000)
-    log = imported(tmp_path, odometry, options=options).run_folder
+    log = import_run(tmp_path, odometry, options=options).run_folder
     turn_m = 2 * np.pi * 0.1
     distances = [(r.wheels.left_m, r.wheels.right_m) for r in odometry_of(log)]
     np.testing.assert_allclose(distances, np.array([(0, 0), (0.5, 0.5), (0.4, 1.0)]) * turn_m, rtol=1e-12)
@@ -105,7 +105,7 @@ def test_options_about_ticks_are_refused_where_there_are_none(
     tmp_path: Path, odometry: str, options: dict[str, Any], named: str
 ) -> None:
     with pytest.raises(GroundsbotError, match=rf"odometry\.csv: holds no ticks, so {named} would not be used"):
-        imported(tmp_path, odometry, options=ImportOptions(track_width_m=0.5, **options))
+        import_run(tmp_path, odometry, options=ImportOptions(track_width_m=0.5, **options))
     assert not (tmp_path / "logs").exists()
 
 
@@ -127,7 +127,7 @@ def test_wheels_and_mount_come_from_robot_yaml_and_options_win(tmp_path: Path) -
     robot_yaml.write_text(yaml.safe_dump({"robot_id": "carl", "wheels": wheels_section, "mount": mount, "tags": tags}))
     odometry = "t_s,left_ticks,right_ticks\n0,0,0\n1,100,100\n"
     options = ImportOptions(robot=robot_yaml, track_width_m=0.45, camera_y_m=-0.05)
-    report = imported(tmp_path, odometry, options=options)
+    report = import_run(tmp_path, odometry, options=options)
     last = odometry_of(report.run_folder)[-1]
     assert (last.wheels.left_m, last.wheels.right_m) == pytest.approx((0.2 * np.pi, 0.4 * np.pi))
     robot = parse_robot_yaml(run_of(report.run_folder).robot_yaml, "log")
@@ -192,7 +192,7 @@ def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> 
 
 
 def test_of_a_mount_given_in_part_the_rest_is_open(tmp_path: Path) -> None:
-    log = imported(tmp_path, options=ImportOptions(track_width_m=0.5, camera_x_m=0.3)).run_folder
+    log = import_run(tmp_path, options=ImportOptions(track_width_m=0.5, camera_x_m=0.3)).run_folder
     mount = parse_robot_yaml(run_of(log).robot_yaml, "log").mount
     assert (mount.x_m, mount.y_m, mount.y_m_sigma) == (0.3, 0, 0.5)
     assert mount.x_m_sigma < 0.01
@@ -211,7 +211,7 @@ def test_observations_are_in_base_only_where_a_robot_yaml_is_given_and_no_camera
     tmp_path: Path, options: dict[str, Any], with_robot: bool, frame: str, said: str
 ) -> None:
     robot = robot_yaml_in(tmp_path) if with_robot else None
-    report = imported(tmp_path, options=ImportOptions(robot=robot, track_width_m=0.5, **options))
+    report = import_run(tmp_path, options=ImportOptions(robot=robot, track_width_m=0.5, **options))
     assert {message.frame for message in observations_of(report.run_folder)} == {frame}
     assert any(f"observations.csv: taken to be in {said}" in line for line in report.lines())
 
@@ -228,7 +228,7 @@ TWISTS = "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0.5\n"
 
 def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
     """A mount, a clock, a track and offsets of ranges: unlike the defaults, which a person's own robot.yaml has."""
-    robot = parse_robot_yaml(run_of(imported(tmp_path).run_folder).robot_yaml, "log")
+    robot = parse_robot_yaml(run_of(import_run(tmp_path).run_folder).robot_yaml, "log")
     assert (robot.time_offset_s, robot.time_offset_s_sigma) == (0.0, 0.3)
     assert (robot.range_offset_m, robot.range_offset_m_sigma) == (0.0, 0.1)
     assert (robot.mount.x_m_sigma, robot.mount.y_m_sigma) == (0.5, 0.5)
@@ -258,7 +258,7 @@ def test_who_vouches_for_the_metre_depends_on_the_form(
 
 def test_a_robot_yaml_that_is_given_keeps_its_sigmas(tmp_path: Path) -> None:
     options = ImportOptions(robot=robot_yaml_in(tmp_path))
-    robot = parse_robot_yaml(run_of(imported(tmp_path, options=options).run_folder).robot_yaml, "log")
+    robot = parse_robot_yaml(run_of(import_run(tmp_path, options=options).run_folder).robot_yaml, "log")
     assert (robot.time_offset_s_sigma, robot.range_offset_m_sigma) == (0.001, 0.0)
     assert robot.wheels.track_m_sigma == pytest.approx(0.004)
     assert (robot.wheels.radii_scale_sigma, robot.imported_tag_scale_sigma) == (None, 0.005)
@@ -266,7 +266,7 @@ def test_a_robot_yaml_that_is_given_keeps_its_sigmas(tmp_path: Path) -> None:
 
 def test_turning_speeds_need_no_track_width(tmp_path: Path) -> None:
     """Whatever track stands in robot.yaml, the log's wheels turn by it as the file says."""
-    report = imported(tmp_path, TWISTS, options=ImportOptions())
+    report = import_run(tmp_path, TWISTS, options=ImportOptions())
     robot = parse_robot_yaml(run_of(report.run_folder).robot_yaml, "log")
     last = odometry_of(report.run_folder)[-1].wheels
     moved = wheels.advance(np.array(last.left_m), np.array(last.right_m), robot.wheels.track_m)
@@ -275,7 +275,7 @@ def test_turning_speeds_need_no_track_width(tmp_path: Path) -> None:
 
 
 def test_a_drive_without_tags_is_imported(tmp_path: Path) -> None:
-    report = imported(tmp_path, observations="t_s,tag_id,x_m,y_m\n")
+    report = import_run(tmp_path, observations="t_s,tag_id,x_m,y_m\n")
     assert (report.n_observations, report.n_tags) == (0, 0)
     assert len(odometry_of(report.run_folder)) == 3
 
@@ -297,7 +297,7 @@ def test_two_folders_become_two_runs_beside_each_other(tmp_path: Path) -> None:
 
 
 def test_names_can_be_given(tmp_path: Path) -> None:
-    report = imported(tmp_path, options=ImportOptions(track_width_m=0.5, run_id="monday", robot_id="carl"))
+    report = import_run(tmp_path, options=ImportOptions(track_width_m=0.5, run_id="monday", robot_id="carl"))
     info = run_of(report.run_folder)
     assert (info.run_id, info.robot_id, report.run_folder.name) == ("monday", "carl", "monday")
     with pytest.raises(GroundsbotError, match=r"--run-id is 'a/b'"):
@@ -305,7 +305,7 @@ def test_names_can_be_given(tmp_path: Path) -> None:
 
 
 def test_observations_outside_the_odometrys_time_are_said(tmp_path: Path) -> None:
-    report = imported(tmp_path, observations="t_s,tag_id,x_m,y_m\n1,1,2,0\n2.5,1,2,0\n")
+    report = import_run(tmp_path, observations="t_s,tag_id,x_m,y_m\n1,1,2,0\n2.5,1,2,0\n")
     assert any(line.strip().startswith("1 observation outside the odometry's time") for line in report.lines())
 
 

@@ -12,7 +12,7 @@ from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.onboard.log.messages import PlanarOdometry
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.csv_folders import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, imported
+from tests.support.data.csv_folders import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, import_run
 
 BAD_ODOMETRY = [
     ("", "odometry.csv: is empty"),
@@ -41,7 +41,7 @@ BAD_ODOMETRY = [
 
 
 @contextmanager
-def refused(folder: Path, said: str) -> Iterator[None]:
+def refusal(folder: Path, said: str) -> Iterator[None]:
     """One line that says so, and no log."""
     with pytest.raises(GroundsbotError) as caught:
         yield
@@ -51,8 +51,8 @@ def refused(folder: Path, said: str) -> Iterator[None]:
 
 @pytest.mark.parametrize(("text", "said"), BAD_ODOMETRY)
 def test_bad_odometry_is_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
-    with refused(tmp_path, said):
-        imported(tmp_path, odometry=text)
+    with refusal(tmp_path, said):
+        import_run(tmp_path, odometry=text)
 
 
 def test_lines_end_where_csv_ends_them(tmp_path: Path) -> None:
@@ -85,8 +85,8 @@ BAD_OBSERVATIONS = [
 
 @pytest.mark.parametrize(("text", "said"), BAD_OBSERVATIONS)
 def test_bad_observations_are_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
-    with refused(tmp_path, said):
-        imported(tmp_path, observations=text)
+    with refusal(tmp_path, said):
+        import_run(tmp_path, observations=text)
 
 
 BAD_PAPER_FILES = [
@@ -104,7 +104,7 @@ BAD_PAPER_FILES = [
 @pytest.mark.parametrize(("odometry", "landmarks", "said"), BAD_PAPER_FILES)
 def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str, landmarks: str, said: str) -> None:
     folder = folder_with(tmp_path, {"odom.csv": odometry, "landmarks.csv": landmarks})
-    with refused(tmp_path, said):
+    with refusal(tmp_path, said):
         import_folder(folder, tmp_path / "logs", PAPER)
 
 
@@ -126,7 +126,7 @@ def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str,
 )
 def test_what_is_missing_is_said(tmp_path: Path, files: dict[str, str], options: ImportOptions, said: str) -> None:
     folder = folder_with(tmp_path, files)
-    with refused(tmp_path, said):
+    with refusal(tmp_path, said):
         import_folder(folder, tmp_path / "logs", options)
 
 
@@ -146,7 +146,7 @@ def test_what_is_hidden_in_the_output_is_no_hindrance(tmp_path: Path) -> None:
     """Another import may be under way, and some desktops leave files of their own."""
     (tmp_path / "logs" / ".monday.77.partial").mkdir(parents=True)
     (tmp_path / "logs" / ".DS_Store").touch()
-    assert imported(tmp_path).run_folder.is_dir()
+    assert import_run(tmp_path).run_folder.is_dir()
 
 
 def test_an_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -174,5 +174,5 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(LogWriter, "write", fail_later)
     with pytest.raises(GroundsbotError, match="drive: cannot be written: No space left on device"):
-        imported(tmp_path)
+        import_run(tmp_path)
     assert not (tmp_path / "logs").exists()

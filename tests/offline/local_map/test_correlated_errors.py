@@ -11,7 +11,7 @@ from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
-from tests.support.data.long_drives import LongDrive, made_long_drive, with_a_moved_tag, with_drifting_readings
+from tests.support.data.long_drives import LongDrive, make_long_drive, with_a_moved_tag, with_drifting_readings
 
 LENGTH_M = 500.0
 SIGMAS = 1.5
@@ -20,7 +20,7 @@ DRIFT_M = 2.0
 
 def dense_drive(seed: int) -> LongDrive:
     """A picture every 5 cm, and noise as told."""
-    return made_long_drive(seed, LENGTH_M, picture_every=1, noise_factors=(1.0, 1.0))
+    return make_long_drive(seed, LENGTH_M, picture_every=1, noise_factors=(1.0, 1.0))
 
 
 def drifting_graph(drive: LongDrive) -> Graph:

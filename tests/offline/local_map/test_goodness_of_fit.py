@@ -21,20 +21,20 @@ from groundsbot.offline.outliers import local_maps_without_outliers
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
-from tests.support.data.drives import FAMILY, MadeTag, S, made_drive, made_positions, made_run, write_drive
-from tests.support.data.long_drives import made_long_drive, with_a_moved_tag
+from tests.support.data.drives import FAMILY, MadeTag, S, make_drive, make_positions, make_run, write_drive
+from tests.support.data.long_drives import make_long_drive, with_a_moved_tag
 
 LENGTH_M = 500.0
 
 
-def judged(chain: Chain) -> Goodness:
+def judge(chain: Chain) -> Goodness:
     return solve_local_map(chain).goodness
 
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     """Plain Levenberg-Marquardt from dead reckoning ends in a wrong valley here; the same windows judge both."""
-    drive = made_long_drive(seed, LENGTH_M)
+    drive = make_long_drive(seed, LENGTH_M)
     graph = build_graph([drive.chain])
     right = solve(graph.problem, drive.true_state(graph))
     wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckon(), {}, {}))
@@ -51,14 +51,14 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
 
 def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
     """Told of twice the wheels' noise and half that of the readings, the check finds as much less and more."""
-    chain = made_long_drive(5, LENGTH_M).chain
+    chain = make_long_drive(5, LENGTH_M).chain
     odometry, readings = chain.odometry, chain.readings
     told_wrong = replace(
         chain,
         odometry=replace(odometry, covariance=4.0 * odometry.covariance),
         readings=replace(readings, covariance=0.25 * readings.covariance),
     )
-    one, other = judged(chain), judged(told_wrong)
+    one, other = judge(chain), judge(told_wrong)
     # What was told counts a little: like four measurements.
     assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
     assert other.reading_factor == pytest.approx(2.0 * one.reading_factor, rel=0.05)
@@ -68,12 +68,12 @@ def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> N
 
 def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wheels and readings take turns at what rounding leaves over; both would go on to and fro."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
+    drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
     stamps_ns, tag = drive.stamps_ns[::5], np.arange(len(drive.stamps_ns[::5])) % 3
     places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]
-    positions = made_positions(stamps_ns, tag, se2.apply(se2.inverse(drive.at(stamps_ns)), places))
+    positions = make_positions(stamps_ns, tag, se2.apply(se2.inverse(drive.at(stamps_ns)), places))
     tags = [TagKey(FAMILY, i) for i in range(3)]
-    (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    (chain,) = chains_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     rounds = []
     left_over = goodness_of_fit._mean_squares
 
@@ -88,15 +88,15 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
 
 
 def test_single_wrong_readings_do_not_count_against_a_map() -> None:
-    chain = made_long_drive(5, LENGTH_M).chain
+    chain = make_long_drive(5, LENGTH_M).chain
     readings = chain.readings
     value = readings.value.copy()
     value[::20] += [1.0, 0.5]
-    assert judged(replace(chain, readings=replace(readings, value=value))).fits
+    assert judge(replace(chain, readings=replace(readings, value=value))).fits
 
 
 def test_a_tag_that_moved_in_between_is_noticed() -> None:
-    drive = made_long_drive(5, LENGTH_M)
+    drive = make_long_drive(5, LENGTH_M)
     graph = build_graph([with_a_moved_tag(drive)])
     best = solve(graph.problem, drive.true_state(graph))
     assert not fit_windows(graph.problem).judge(best.state).fits
@@ -105,17 +105,17 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])
 def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
-    chain = with_a_moved_tag(made_long_drive(5, LENGTH_M))
+    chain = with_a_moved_tag(make_long_drive(5, LENGTH_M))
     readings = chain.readings
     parts = CovarianceParts(
         ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
     )
     biased = replace(readings, parts=parts, corner_bias_px=np.full((len(readings), 2), bias_px))
-    assert judged(replace(chain, readings=biased)).fits is (bias_px > 0.0)
+    assert judge(replace(chain, readings=biased)).fits is (bias_px > 0.0)
 
 
 def test_windows_share_neither_poses_nor_tags() -> None:
-    problem = build_graph([made_long_drive(5, LENGTH_M).chain]).problem
+    problem = build_graph([make_long_drive(5, LENGTH_M).chain]).problem
     apart = in_windows(problem, 10.0)
     windows = np.cumsum(apart.columns.poses[:, 0] < 0)
     assert windows[-1] == pytest.approx(LENGTH_M / 10.0, abs=2)
@@ -128,15 +128,15 @@ def test_windows_share_neither_poses_nor_tags() -> None:
 
 def test_what_no_condition_joins_fits() -> None:
     """A drive of one window has nothing to contradict."""
-    drive = made_long_drive(5, LENGTH_M)
-    verdict = judged(drive.chain.prefix(30))
+    drive = make_long_drive(5, LENGTH_M)
+    verdict = judge(drive.chain.prefix(30))
     assert verdict.expected == 0
     assert verdict.fits
 
 
 def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tags = [MadeTag(i, (4.0, 1.5 * i - 1.5, 0.5), np.pi) for i in range(3)]
-    log = write_drive(tmp_path, made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
+    log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
     def contradictory(chain: Chain, _: Effort, *, noise_is_open: bool) -> LocalMap:

@@ -20,7 +20,7 @@ from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.convergence_study import is_right, missed_bounds, study_seed
-from tests.support.data.long_drives import made_long_drive, made_town
+from tests.support.data.long_drives import make_long_drive, make_town
 
 
 def test_study_keeps_its_promises_on_a_few_seeds() -> None:
@@ -32,7 +32,7 @@ def test_study_keeps_its_promises_on_a_few_seeds() -> None:
 
 
 def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = made_long_drive(0, 500.0)
+    drive = make_long_drive(0, 500.0)
     graph = build_graph([drive.chain])
     best = solve(graph.problem, drive.true_state(graph))
     starts = _first_from_dead_reckoning(monkeypatch)
@@ -43,7 +43,7 @@ def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest
 
 
 def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = made_long_drive(0, 500.0)
+    drive = make_long_drive(0, 500.0)
     monkeypatch.setattr(local_map, "_OTHER_STARTS", 0)
     _first_from_dead_reckoning(monkeypatch)
     found = solve_local_map(drive.chain)
@@ -53,7 +53,7 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 @pytest.mark.parametrize(("seed", "length_m"), [(3, 500.0), (24, 2000.0)])
 def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
-    drive = made_long_drive(seed, length_m)
+    drive = make_long_drive(seed, length_m)
     odometry, readings = drive.chain.odometry, drive.chain.readings
     chain = replace(
         drive.chain,
@@ -88,7 +88,7 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
 
 
 def test_a_coarse_chain_is_the_same_drive() -> None:
-    chain = made_long_drive(4, 100.0).chain
+    chain = make_long_drive(4, 100.0).chain
     keyframes = coarse_keyframes(chain)
     coarse = coarsen(chain, keyframes)
     assert len(keyframes) < 0.5 * len(chain.stamps_ns)
@@ -112,7 +112,7 @@ def test_a_coarse_chain_is_the_same_drive() -> None:
 
 
 def test_refined_poses_go_through_the_coarse_ones() -> None:
-    chain = made_long_drive(4, 100.0).chain
+    chain = make_long_drive(4, 100.0).chain
     keyframes = coarse_keyframes(chain)
     poses = np.random.default_rng(0).normal(size=(len(keyframes), 3))
     found = refine_poses(chain, keyframes, poses, np.zeros(3))
@@ -124,7 +124,7 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
 
 
 def _n_pieces(length_m: float, wheel_sigma: float) -> int:
-    chain = made_long_drive(2, length_m).chain
+    chain = make_long_drive(2, length_m).chain
     pieces, n_keyframes, found = local_map._Pieces(chain), 1, 0
     pieces.wheel_covariance = wheel_sigma**2 * np.eye(3)
     while n_keyframes < len(chain.stamps_ns):
@@ -167,7 +167,7 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Places of the others were once taken for theirs, beyond the end of arrays."""
-    chain = made_long_drive(5, 300.0, town=made_town(5, (0.6, 1.2))).chain
+    chain = make_long_drive(5, 300.0, town=make_town(5, (0.6, 1.2))).chain
     whole = solve_local_map(chain)
     monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
     check = local_map._Check(build_graph([chain]), Effort.of_log(chain.run.log_bytes, chain.run.inputs))
@@ -176,7 +176,7 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
 
 
 def test_a_start_of_another_problem_is_refused() -> None:
-    short, long = (build_graph([made_long_drive(3, length_m).chain]) for length_m in (50.0, 100.0))
+    short, long = (build_graph([make_long_drive(3, length_m).chain]) for length_m in (50.0, 100.0))
     state = long.start(np.zeros((len(long.chains[0].stamps_ns), 3)), {}, {})
     with pytest.raises(ValueError, match="another number of poses"):
         solve(short.problem, state)

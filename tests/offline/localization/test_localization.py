@@ -16,7 +16,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
-from tests.support.data.drives import FAMILY, HALL, made_drive, made_positions, made_robot, made_run, write_drive
+from tests.support.data.drives import FAMILY, HALL, make_drive, make_positions, make_robot, make_run, write_drive
 from tests.support.programs import Run as Program
 
 LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
@@ -29,15 +29,15 @@ def run_of(
     name: str, tags: tuple[int, ...], moved: dict[int, tuple[float, float]] | None = None, *, seed: int = 0
 ) -> Run:
     """A drive that reads each of some tags ten times, with noise."""
-    drive = made_drive(STARTS[name], LEGS, step_ns=100_000_000)
+    drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
     places = PLACES | (moved or {})
     hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
     seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung)
     noisy = seen + SIGMA_M * np.random.default_rng([seed, ord(name)]).standard_normal(seen.shape)
     keys = [TagKey(FAMILY, key) for key in tags]
-    positions = made_positions(drive.stamps_ns[at], tag, noisy, SIGMA_M)
-    return made_run([drive.track], robot=made_robot(name), tags=keys, positions=positions)
+    positions = make_positions(drive.stamps_ns[at], tag, noisy, SIGMA_M)
+    return make_run([drive.track], robot=make_robot(name), tags=keys, positions=positions)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_the_trajectory_is_that_of_the_joint_solve_but_for_what_the_run_tells_of
     (located,) = found.runs
     assert not found.not_located
     assert [tag.tag_id for tag in located.tags] == [1, 2, 4, 5, 6]
-    true = made_drive(STARTS["c"], LEGS, step_ns=100_000_000).at(located.stamps_ns)
+    true = make_drive(STARTS["c"], LEGS, step_ns=100_000_000).at(located.stamps_ns)
     for k in (0, -1):
         assert sigmas_off(located.T_map_base[k], located.covariance[k], true[k]) < 4.0
     joint = groundsbot.build_map([run], extending=known).components[0].runs[2]
@@ -174,8 +174,8 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kept")
     logs = {}
     for name, start in (("a", [1.0, 1.5, 0.3]), ("b", [4.0, 2.5, 2.9]), ("c", [2.0, 2.0, -1.0])):
-        drive = made_drive(start, [(0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)], step_ns=50_000_000)
-        logs[name] = write_drive(folder / "logs", drive, TAGS, made_robot(name), corner_sigma_px=0.2)
+        drive = make_drive(start, [(0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)], step_ns=50_000_000)
+        logs[name] = write_drive(folder / "logs", drive, TAGS, make_robot(name), corner_sigma_px=0.2)
     (folder / "map").mkdir()
     write_map(groundsbot.build_map([groundsbot.load_run(logs[name]) for name in "ab"]), folder / "map")
     return folder
@@ -230,6 +230,6 @@ def test_bad_inputs_are_refused_in_one_line(refused: Callable[..., str], kept: P
 
 def with_sizes(folder: Path, size_m: float) -> Path:
     """A log of a robot that takes the tags for others."""
-    drive = made_drive([2.0, 2.0, -1.0], [(-0.3, 0.3, 5.0)], step_ns=50_000_000)
-    robot = made_robot("c", tags=[{"family": FAMILY, "default_size_m": size_m}])
+    drive = make_drive([2.0, 2.0, -1.0], [(-0.3, 0.3, 5.0)], step_ns=50_000_000)
+    robot = make_robot("c", tags=[{"family": FAMILY, "default_size_m": size_m}])
     return write_drive(folder / "logs", drive, TAGS, robot)

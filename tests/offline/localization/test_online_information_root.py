@@ -18,19 +18,19 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD
-from tests.benchmarks.accuracy.localize_study import Scene, Taken, filtered, made_scene, taken_one_by_one
+from tests.benchmarks.accuracy.localize_study import Scene, Taken, filter_online, make_scene, taken_one_by_one
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    made = made_scene(4)
+    made = make_scene(4)
     assert made is not None
     return made
 
 
 @pytest.fixture(scope="module")
 def online(scene: Scene) -> OnlineLocalizer:
-    return filtered(scene)[0]
+    return filter_online(scene)[0]
 
 
 def _root(online: OnlineLocalizer, calibration: FloatArray) -> OnlineRoot:
@@ -93,7 +93,7 @@ def test_a_root_takes_the_step_of_dense_least_squares(
     in_straight_lines = _straight_step(root)
     np.testing.assert_allclose(in_straight_lines[:3], step[last], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(root.pose_covariance(), covariance[np.ix_(last, last)], rtol=1e-6)
-    order = [graph.tags.index(_called(online, tag)) for tag in online._index]
+    order = [graph.tags.index(_map_name(online, tag)) for tag in online._index]
     tags = columns.tags[order].reshape(-1)
     np.testing.assert_allclose(in_straight_lines[3 + root.prior.first_tag :], step[tags], atol=1e-9)
     np.testing.assert_allclose(root.tags_covariance(), covariance[np.ix_(tags, tags)], rtol=1e-5, atol=1e-12)
@@ -178,7 +178,7 @@ def test_a_relaxed_step_is_where_the_cost_with_arcs_is_least(online: OnlineLocal
     S, d = np.tril(root._root[:n, :n]), root._right[:n]
 
     def cost(step: FloatArray) -> float:
-        straight, arcs = (prior.root @ (each - prior.off) for each in (step, _turned(root, step)))
+        straight, arcs = (prior.root @ (each - prior.off) for each in (step, _rotate(root, step)))
         return float(((S @ step - d) ** 2).sum() + (arcs**2).sum() - (straight**2).sum()) / 2.0
 
     found, unit = root.step[3:], np.linalg.inv(S)
@@ -250,7 +250,7 @@ def _straight_step(root: OnlineRoot) -> FloatArray:
     return root.through(np.concatenate([root._pose[:, 3], root._right[: root.prior.n]]))
 
 
-def _turned(root: OnlineRoot, step: FloatArray) -> FloatArray:
+def _rotate(root: OnlineRoot, step: FloatArray) -> FloatArray:
     return rotate_step(root._prior, step, root.prior.first_tag)
 
 
@@ -262,7 +262,7 @@ def _feed(online: OnlineLocalizer, taken: Sequence[Taken]) -> None:
             online.add_reading(reading)
 
 
-def _called(online: OnlineLocalizer, tag: TagKey) -> TagKey:
+def _map_name(online: OnlineLocalizer, tag: TagKey) -> TagKey:
     """In this scene tags bear the map's names."""
     return online._smoother.map_tags.get(online._index[tag], tag)
 

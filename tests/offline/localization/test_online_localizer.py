@@ -15,27 +15,27 @@ from groundsbot.offline.measurements.chain import Chain
 from tests.benchmarks.accuracy.localize_study import (
     Scene,
     against,
-    filtered,
-    judged,
-    made_scene,
-    missed,
+    broken_bounds,
+    filter_online,
+    judge,
+    make_scene,
     taken_one_by_one,
 )
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    made = made_scene(4)
+    made = make_scene(4)
     assert made is not None
     return made
 
 
 def test_the_study_in_small(scene: Scene) -> None:
     """Its bounds, of one seed with moved tags and one without, the online class within 2 % of a sigma of the batch."""
-    moved = made_scene(3)
+    moved = make_scene(3)
     assert moved is not None
-    rows = [judged(4, scene), judged(3, moved)]
-    assert [sentence for sentence in missed(rows) if "NEES" not in sentence and "slowest" not in sentence] == []
+    rows = [judge(4, scene), judge(3, moved)]
+    assert [sentence for sentence in broken_bounds(rows) if "NEES" not in sentence and "slowest" not in sentence] == []
     assert (rows[1].moved_missed, rows[1].falsely_named) == (0, 0)
     for row in rows:
         assert row.found
@@ -67,7 +67,7 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
 
 def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
     """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
-    made = made_scene(47)
+    made = make_scene(47)
     assert made is not None
     online = OnlineLocalizer(made.known, made.drive.chain.run.robot)
     seen, starts = set[int](), []
@@ -113,7 +113,7 @@ def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
     """Ids that the map does not have: nothing is located, and nothing breaks."""
     chain = scene.drive.chain
     renamed = tuple(tag._replace(tag_id=tag.tag_id + 500) for tag in chain.tags)
-    online, _ = filtered(replace(scene, drive=replace(scene.drive, chain=replace(chain, tags=renamed))))
+    online, _ = filter_online(replace(scene, drive=replace(scene.drive, chain=replace(chain, tags=renamed))))
     assert online.pose is None
     assert online.reason == "no tag of the map was seen; two are needed"
     assert online.settle() is None

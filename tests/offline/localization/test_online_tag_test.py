@@ -36,7 +36,7 @@ class _MadeRoot:
         return FITS if len(free) == 1 else self._together
 
 
-def _judged(held: dict[int, float], together: float) -> TagJudge:
+def _judge(held: dict[int, float], together: float) -> TagJudge:
     judge = TagJudge(dict(HELD), {tag: (TAGS[tag],) for tag in (4, 5)})
     for _ in judge.judge(cast("OnlineRoot", _MadeRoot(held, together)), 100):
         pass
@@ -46,12 +46,12 @@ def _judged(held: dict[int, float], together: float) -> TagJudge:
 @pytest.mark.parametrize(("together", "stay"), [(2.0 * FITS, [1, 2, 3]), (CONTRADICTS, [0, 1, 2, 3])])
 def test_a_tag_is_let_go_for_others_that_fit_together_without_it(together: float, stay: list[int]) -> None:
     """Each alone is not enough: without a tag that stayed, a turn of the drive may explain either, but not both."""
-    judge = _judged({}, together)
+    judge = _judge({}, together)
     assert sorted(judge.held) == stay
     assert (0 in judge.maybe) == (0 not in stay)
 
 
 def test_the_tag_that_all_else_contradicts_most_is_let_go_first() -> None:
-    judge = _judged({2: 20.0, 3: 25.0}, CONTRADICTS)
+    judge = _judge({2: 20.0, 3: 25.0}, CONTRADICTS)
     assert sorted(judge.held) == [0, 1, 2]
     assert judge.maybe[3] == (TAGS[3],)

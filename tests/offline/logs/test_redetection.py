@@ -50,7 +50,7 @@ def recorded(tmp_path: Path) -> Path:
     return write_log(tmp_path / "run1", sorted(entries, key=lambda entry: entry.log_time_ns))
 
 
-def found_in(log: Path) -> dict[int, list[int]]:
+def tags_by_picture(log: Path) -> dict[int, list[int]]:
     """Tags by the number of their picture."""
     return {
         (each.message.stamp_ns - START_NS) // (100 * MS): [tag.tag_id for tag in each.message.detections]
@@ -66,7 +66,7 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
     assert "1 pictures are of no use" in outcome.out
     assert "4 older detections kept, whose pictures were not" in outcome.out
     assert "4 pictures" in outcome.out
-    assert found_in(tmp_path / "again") == {0: [0], 1: [99], 2: [2], 3: [99], 4: [4], 5: [99], 6: [99], 7: [99]}
+    assert tags_by_picture(tmp_path / "again") == {0: [0], 1: [99], 2: [2], 3: [99], 4: [4], 5: [99], 6: [99], 7: [99]}
     assert {path.name: path.read_bytes() for path in recorded.iterdir()} == before
 
     old, new = list(read_log(recorded)), list(read_log(tmp_path / "again"))
@@ -93,19 +93,19 @@ def test_a_file_that_holds_nothing_is_told_of(tmp_path: Path, run: Run) -> None:
     outcome = run("detect", log, "-o", tmp_path / "again", "--processes", 1)
     assert outcome.code == 3
     assert "0001.core.mcap: not usable: is empty" in outcome.out
-    assert found_in(tmp_path / "again") == {0: [3]}
+    assert tags_by_picture(tmp_path / "again") == {0: [3]}
 
 
 def test_without_the_detections_of_pictures_that_were_not_kept(recorded: Path, tmp_path: Path, run: Run) -> None:
     output = tmp_path / "again.mcap"
     assert run("detect", recorded, "-o", output, "--processes", 1, "--drop-others", "--decimate", 2).code == 3
-    assert found_in(output) == {0: [0], 2: [2], 4: [4], 6: [99]}  # picture 6 was kept, if of no use
+    assert tags_by_picture(output) == {0: [0], 2: [2], 4: [4], 6: [99]}  # picture 6 was kept, if of no use
     assert len(list(read_log(output, ["/wheels"]))) == 100
 
 
 def test_another_family(recorded: Path, tmp_path: Path, run: Run) -> None:
     assert run("detect", recorded, "-o", tmp_path / "a", "--processes", 1, "--family", "tag25h9", "--drop-others").code
-    assert found_in(tmp_path / "a") == {0: [], 2: [], 4: [], 6: [99]}
+    assert tags_by_picture(tmp_path / "a") == {0: [], 2: [], 4: [], 6: [99]}
 
 
 def test_what_cannot_be_is_one_line_and_leaves_nothing(recorded: Path, tmp_path: Path, run: Run) -> None:

@@ -14,7 +14,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tape import TapeOptions
-from tests.support.data.drives import HALL, MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import HALL, MadeTag, make_drive, make_robot, write_drive
 from tests.support.programs import Run as Program
 
 TAGS = [HALL[i] for i in (0, 1, 2, 6)]
@@ -32,9 +32,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("b", [4.0, 2.5, 2.9], TAGS),
         ("c", [2.0, 2.0, -1.0], MOVED),
     ):
-        drive = made_drive(start, [(-0.3, 0.3, 5.0), (0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)], step_ns=50_000_000)
+        drive = make_drive(start, [(-0.3, 0.3, 5.0), (0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)], step_ns=50_000_000)
         boots = None if name != "b" else [1 + (i > 130) for i in range(len(drive.stamps_ns))]
-        write_drive(folder / "logs", drive, tags, made_robot(name), corner_sigma_px=0.2, boot_of=boots)
+        write_drive(folder / "logs", drive, tags, make_robot(name), corner_sigma_px=0.2, boot_of=boots)
     (folder / "map").mkdir()
     write_map(build_map(runs_of(folder, "ab"), NOISE, tape=TAPE), folder / "map")
     return folder

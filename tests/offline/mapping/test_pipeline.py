@@ -26,7 +26,7 @@ from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.messages import TagDetections
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.benchmarks.accuracy.accuracy_study import medians, missed_bounds, run_study, study_seed
-from tests.support.data.drives import HALL, MadeDrive, MadeTag, made_drive, made_robot, made_run, write_drive
+from tests.support.data.drives import HALL, MadeDrive, MadeTag, make_drive, make_robot, make_run, write_drive
 
 ROUND = [(0.4, 0.4, 3.0), (0.5, 0.3, 4.0), (-0.2, 0.2, 5.0), (0.3, 0.5, 3.0), (0.4, 0.4, 1.5), (0.2, -0.2, 6.0)]
 BACK = [(0.0, 0.0, 1.0), (-0.25, 0.25, 4.0), (0.4, 0.5, 4.0), (0.45, 0.35, 4.0), (-0.3, -0.3, 1.0), (-0.25, 0.25, 4.0)]
@@ -35,11 +35,11 @@ LEGS = {"a": ROUND, "b": BACK, "c": [*BACK[1:], *ROUND[:3]]}
 
 
 def drive_of(name: str) -> MadeDrive:
-    return made_drive(STARTS[name], LEGS[name])
+    return make_drive(STARTS[name], LEGS[name])
 
 
 def exact_log(folder: Path, name: str, tags: Sequence[MadeTag] = tuple(HALL)) -> Path:
-    return write_drive(folder, drive_of(name), tags, made_robot(name))
+    return write_drive(folder, drive_of(name), tags, make_robot(name))
 
 
 def map_of(*logs: Path) -> MapResult:
@@ -82,10 +82,10 @@ def test_exact_measurements_give_the_truth_back(tmp_path: Path, names: tuple[str
 
 def test_a_calibration_that_is_off_is_found(tmp_path: Path) -> None:
     """What the log says and what the robot truly is differ by a sigma or so; exact measurements tell which way."""
-    true = made_robot("a")
+    true = make_robot("a")
     log = write_drive(tmp_path, drive_of("a"), HALL, true)
     wrong = {"radius_left_m": 0.1003, "radius_right_m": 0.0999, "track_m": 0.503, "ticks_per_turn": 1e9}
-    believed = made_robot("a", wheels=wrong, mount=true.mount.model_dump() | {"yaw_rad": 0.105})
+    believed = make_robot("a", wheels=wrong, mount=true.mount.model_dump() | {"yaw_rad": 0.105})
     run = replace(load_run(log), robot=believed)
     stretch = run.stretches[0]
     run = replace(run, stretches=(replace(stretch, left_m=stretch.left_m * 1.003, right_m=stretch.right_m * 0.999),))
@@ -198,8 +198,8 @@ def test_the_run_nearest_to_joining_tells_the_reason(tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 100) for tag in HALL]
     logs = [
         exact_log(tmp_path, "a"),
-        write_drive(tmp_path, drive_of("b"), far, made_robot("b")),
-        write_drive(tmp_path, drive_of("c"), [*far[1:], HALL[0]], made_robot("c")),
+        write_drive(tmp_path, drive_of("b"), far, make_robot("b")),
+        write_drive(tmp_path, drive_of("c"), [*far[1:], HALL[0]], make_robot("c")),
     ]
     result = map_of(*logs)
     assert len(result.components) == 2
@@ -223,7 +223,7 @@ def test_a_controller_reset_is_bridged_by_tags_only(tmp_path: Path) -> None:
     boots = [1] * (n // 2) + [2] * (n - n // 2)
     kept = np.r_[0 : n // 2, n // 2 + 80 : n]  # nothing is known of the 0.8 s around the reset
     cut = MadeDrive(drive.stamps_ns[kept], drive.left_m[kept], drive.right_m[kept], drive.T_world_base[kept])
-    log = write_drive(tmp_path, cut, HALL, made_robot("a"), boot_of=[boots[i] for i in kept.tolist()])
+    log = write_drive(tmp_path, cut, HALL, make_robot("a"), boot_of=[boots[i] for i in kept.tolist()])
     result = map_of(log)
     (component,) = result.components
     assert [run.name for run in component.runs] == ["a_one", "a_one_stretch2"]
@@ -238,7 +238,7 @@ def test_a_gap_that_counts_bridge_stays_one_stretch(tmp_path: Path) -> None:
     drive = drive_of("a")
     kept = np.r_[0:100, 250 : len(drive.stamps_ns)]  # 1.5 s lost on a straight line
     cut = MadeDrive(drive.stamps_ns[kept], drive.left_m[kept], drive.right_m[kept], drive.T_world_base[kept])
-    result = map_of(write_drive(tmp_path, cut, HALL, made_robot("a")))
+    result = map_of(write_drive(tmp_path, cut, HALL, make_robot("a")))
     (component,) = result.components
     (run,) = component.runs
     true = se2.between(np.array(STARTS["a"]), drive.at(run.stamps_ns))
@@ -260,7 +260,7 @@ def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_runs_of_one_name_are_refused(one: tuple[str, str], other: tuple[str, str], told: str) -> None:
-    run = made_run([drive_of("a").track])
+    run = make_run([drive_of("a").track])
     runs = [
         replace(run, name=f"{robot_id}_{run_id}", robot_id=robot_id, run_id=run_id) for robot_id, run_id in (one, other)
     ]

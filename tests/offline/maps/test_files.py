@@ -15,7 +15,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.maps.tum import read_tum, write_tum
-from tests.support.data.maps import START_B, made_component, made_map
+from tests.support.data.maps import START_B, make_component, make_map
 
 
 def assert_equal(left: object, right: object) -> None:
@@ -34,17 +34,17 @@ def assert_equal(left: object, right: object) -> None:
         assert left == right
 
 
-def written(result: MapResult, folder: Path) -> dict[str, Any]:
+def write_file(result: MapResult, folder: Path) -> dict[str, Any]:
     write_map(result, folder)
     data: dict[str, Any] = json.loads((folder / "map.json").read_text())
     return data
 
 
 def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
-    other = made_component("green_one", "grey_two")
+    other = make_component("green_one", "grey_two")
     stretch = replace(other.runs[1], name="grey_two_stretch2")
     joint = np.pad(other.joint_covariance, ((0, 3), (0, 3)))
-    result = made_map(made_component(), replace(other, runs=(*other.runs, stretch), joint_covariance=joint))
+    result = make_map(make_component(), replace(other, runs=(*other.runs, stretch), joint_covariance=joint))
     write_map(result, tmp_path)
     assert_equal(read_map(tmp_path), result)
 
@@ -52,7 +52,7 @@ def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_the_same_map_is_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        write_map(made_map(), tmp_path / name)
+        write_map(make_map(), tmp_path / name)
     names = sorted(file.name for file in (tmp_path / "one").iterdir())
     assert names == ["blue_two.tum", "map.json", "map.npz", "red_one.tum", "tags.csv"]
     for name in names:
@@ -60,7 +60,7 @@ def test_the_same_map_is_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
-    data = written(made_map(), tmp_path)
+    data = write_file(make_map(), tmp_path)
     assert list(data) == [
         *("format_version", "frame", "components", "runs", "tags", "alignments", "start_to_start"),
         *("noise", "noise_fit", "calibration", "choices", "robot_numbers", "measurements", "checks", "metres"),
@@ -79,10 +79,10 @@ def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
 
 
 def test_what_is_not_a_number_is_null_in_json_and_empty_in_csv(tmp_path: Path) -> None:
-    component = made_component()
+    component = make_component()
     unknown = replace(component.tags[0], covariance=np.full((2, 2), np.nan), size_m=None)
-    result = made_map(replace(component, tags=(unknown, *component.tags[1:]), cost=float("inf")))
-    data = written(result, tmp_path)
+    result = make_map(replace(component, tags=(unknown, *component.tags[1:]), cost=float("inf")))
+    data = write_file(result, tmp_path)
     assert "NaN" not in (tmp_path / "map.json").read_text()
     assert data["tags"][0]["covariance"] == [[None, None], [None, None]]
     assert data["tags"][0]["size_m"] is None
@@ -93,7 +93,7 @@ def test_what_is_not_a_number_is_null_in_json_and_empty_in_csv(tmp_path: Path) -
 
 
 def test_tags_csv_has_one_row_a_tag(tmp_path: Path) -> None:
-    result = made_map()
+    result = make_map()
     write_map(result, tmp_path)
     lines = (tmp_path / "tags.csv").read_text().splitlines()
     assert lines[0] == (
@@ -129,13 +129,13 @@ def _spoilt_in_the_middle(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _changed(path: Path, **changes: object) -> None:
+def _change(path: Path, **changes: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 def _of_another_frame(path: Path) -> None:
     components = json.loads(path.read_text())["components"]
-    _changed(path, components=[components[0] | {"frame_run": "nobody"}, *components[1:]])
+    _change(path, components=[components[0] | {"frame_run": "nobody"}, *components[1:]])
 
 
 @pytest.mark.parametrize(
@@ -150,9 +150,9 @@ def _of_another_frame(path: Path) -> None:
         (lambda d: (d / "map.npz").write_bytes(b""), "damaged"),
         (lambda d: (d / "map.npz").write_bytes((d / "map.npz").read_bytes()[:-300]), "damaged"),
         (lambda d: _spoilt_in_the_middle(d / "map.npz"), "damaged"),
-        (lambda d: _changed(d / "map.json", components=[]), "damaged or incomplete (no components)"),
-        (lambda d: _changed(d / "map.json", runs=None), "damaged"),
-        (lambda d: _changed(d / "map.json", metres=[7]), "damaged"),
+        (lambda d: _change(d / "map.json", components=[]), "damaged or incomplete (no components)"),
+        (lambda d: _change(d / "map.json", runs=None), "damaged"),
+        (lambda d: _change(d / "map.json", metres=[7]), "damaged"),
         (lambda d: _of_another_frame(d / "map.json"), "frame_run 'nobody' is none of its runs"),
         (lambda d: (d / "red_one.tum").unlink(), "red_one.tum: cannot be read"),
         (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is no pose"),
@@ -162,7 +162,7 @@ def _of_another_frame(path: Path) -> None:
     ],
 )
 def test_a_damaged_map_is_refused_in_one_line(tmp_path: Path, spoil: Callable[[Path], object], said: str) -> None:
-    write_map(made_map(), tmp_path)
+    write_map(make_map(), tmp_path)
     spoil(tmp_path)
     with pytest.raises(OfflineError) as caught:
         read_map(tmp_path)

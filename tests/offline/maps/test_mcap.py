@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.offline.maps.mcap import write_mcap
 from groundsbot.offline.maps.result import MapResult, TagPose
 from groundsbot.onboard.log.messages import TOPICS
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 
 T_BASE_CAMERA = np.array([0.2, 0.05, 0.4, -0.5, 0.5, -0.5, 0.5])
 
@@ -38,11 +38,11 @@ def heading(q: Any) -> float:
 
 
 def test_the_drive_plays_over_the_map_on_the_logs_time_line(tmp_path: Path) -> None:
-    component = made_component()
+    component = make_component()
     later = 5_000_000_000
     first, second = component.runs
     second = replace(second, stamps_ns=second.stamps_ns + later, T_base_camera=T_BASE_CAMERA)
-    result = made_map(replace(component, runs=(first, second)))
+    result = make_map(replace(component, runs=(first, second)))
     found = read_back(result, tmp_path / "map.mcap")
 
     times = [at for _, _, at, _ in found]
@@ -68,8 +68,8 @@ def test_the_drive_plays_over_the_map_on_the_logs_time_line(tmp_path: Path) -> N
 
 
 def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -> None:
-    component = made_component()
-    (scene,) = of_topic(read_back(made_map(component), tmp_path / "map.mcap"), "/map/tags")
+    component = make_component()
+    (scene,) = of_topic(read_back(make_map(component), tmp_path / "map.mcap"), "/map/tags")
     assert [entity.id for entity in scene.entities] == ["tag36h11:3", "tag36h11:7", "tag25h9:3"]
     for entity, tag in zip(scene.entities, component.tags, strict=True):
         assert entity.frame_id == "map"
@@ -88,11 +88,11 @@ def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -
 
 
 def test_tags_hang_where_a_map_of_corners_has_them(tmp_path: Path) -> None:
-    component = made_component()
+    component = make_component()
     pose = TagPose(1.7, Rotation.from_euler("ZYX", [0.4, 0.2, 1.5]).as_quat(), 1e-4 * np.eye(6))
     first, *others = component.tags
     component = replace(component, tags=(replace(first, pose=pose), *others))
-    (scene,) = of_topic(read_back(made_map(component), tmp_path / "map.mcap"), "/map/tags")
+    (scene,) = of_topic(read_back(make_map(component), tmp_path / "map.mcap"), "/map/tags")
     hung, flat, _ = scene.entities
     q = hung.spheres[0].pose.orientation
     assert [q.x, q.y, q.z, q.w] == pose.quaternion_xyzw.tolist()
@@ -104,8 +104,8 @@ def test_tags_hang_where_a_map_of_corners_has_them(tmp_path: Path) -> None:
 
 
 def test_trajectories_are_there_whole_as_lines_and_poses(tmp_path: Path) -> None:
-    component = made_component()
-    found = read_back(made_map(component), tmp_path / "map.mcap")
+    component = make_component()
+    found = read_back(make_map(component), tmp_path / "map.mcap")
     (scene,) = of_topic(found, "/map/runs")
     assert [entity.id for entity in scene.entities] == ["red_one", "blue_two"]
     for entity, run in zip(scene.entities, component.runs, strict=True):
@@ -117,7 +117,7 @@ def test_trajectories_are_there_whole_as_lines_and_poses(tmp_path: Path) -> None
 
 
 def test_components_have_frames_of_their_own(tmp_path: Path) -> None:
-    found = read_back(made_map(made_component(), made_component("green_one", "grey_two")), tmp_path / "map.mcap")
+    found = read_back(make_map(make_component(), make_component("green_one", "grey_two")), tmp_path / "map.mcap")
     transforms = [each for message in of_topic(found, "/map/tf") for each in message.transforms]
     parents = {each.child_frame_id: each.parent_frame_id for each in transforms}
     assert parents == {
@@ -131,12 +131,12 @@ def test_components_have_frames_of_their_own(tmp_path: Path) -> None:
 
 
 def test_no_topic_is_one_of_a_log_with_another_schema(tmp_path: Path) -> None:
-    topics = {topic for topic, _, _, _ in read_back(made_map(), tmp_path / "map.mcap")}
+    topics = {topic for topic, _, _, _ in read_back(make_map(), tmp_path / "map.mcap")}
     assert not topics & set(TOPICS)
 
 
 def test_the_same_map_is_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one.mcap", "two.mcap"):
-        write_mcap(made_map(), tmp_path / name)
+        write_mcap(make_map(), tmp_path / name)
     assert (tmp_path / "one.mcap").read_bytes() == (tmp_path / "two.mcap").read_bytes()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["one.mcap", "two.mcap"]

@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.offline.maps.result import Component
 from groundsbot.offline.maps.shape import shape_of
-from tests.support.data.maps import made_component
+from tests.support.data.maps import make_component
 
 
 def _with_covariance(component: Component, own_m2: float, turn_rad2: float, shift_m2: float) -> Component:
@@ -24,7 +24,7 @@ def _with_covariance(component: Component, own_m2: float, turn_rad2: float, shif
 
 
 def test_what_turns_and_shifts_all_tags_is_not_in_the_shape() -> None:
-    component = made_component()
+    component = make_component()
     rigid = shape_of(_with_covariance(component, 0.0, 0.04**2, 0.3**2))
     assert rigid is not None
     np.testing.assert_allclose(rigid.tag_covariances, 0.0, atol=1e-12)
@@ -40,7 +40,7 @@ def test_what_turns_and_shifts_all_tags_is_not_in_the_shape() -> None:
 
 
 def test_one_tag_and_unknown_covariances_have_no_shape() -> None:
-    component = made_component()
+    component = make_component()
     one = replace(component, tags=component.tags[:1], joint_covariance=np.eye(3 * len(component.runs) + 2))
     assert shape_of(one) is None
     assert shape_of(replace(component, joint_covariance=np.nan * component.joint_covariance)) is None

@@ -15,14 +15,14 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose
 from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.report.sentences import contradiction_sentence, sentences
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 
 MISFIT = Misfit("joins", "blue_two", 90.0, 40)
 QUIET = TagScatter(np.ones(3), np.zeros((3, 2, 2)))
 
 
 def full_component() -> Component:
-    made = made_component()
+    made = make_component()
     kept = KeptCalibration(
         ("red",), ("wheel_scale",), nominal_row((0.1,))[None], np.ones(1), np.full((1, 1), 4e-6), np.full((1, 6), 1e-5)
     )
@@ -79,7 +79,7 @@ def test_what_passes_add_is_an_error_of_the_tags_own() -> None:
 
 def test_files_keep_the_factor_and_old_ones_have_none(tmp_path: Path) -> None:
     scatter = TagScatter(np.array([3.0, 1.0, 1.0]), np.zeros((3, 2, 2)))
-    write_map(made_map(inflate_covariances(made_component(), MISFIT, scatter)), tmp_path)
+    write_map(make_map(inflate_covariances(make_component(), MISFIT, scatter)), tmp_path)
     (found,) = read_map(tmp_path).components
     assert (found.sigma_factor, found.misfit, found.tags[0].sigma_factor) == (1.5, MISFIT, 3.0)
     document = json.loads((tmp_path / "map.json").read_text())
@@ -98,7 +98,7 @@ def test_files_keep_the_factor_and_old_ones_have_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("kind", "said"), [("joins", "each other"), ("windows", "the model")])
 def test_terminal_and_report_say_it_first(kind: str, said: str) -> None:
-    result = made_map(inflate_covariances(made_component(), replace(MISFIT, kind=kind), QUIET))
+    result = make_map(inflate_covariances(make_component(), replace(MISFIT, kind=kind), QUIET))
     first = summary(result, Path("out"))[0]
     assert first.startswith(f"These drives contradict {said} by more than chance explains (90 squared sigmas, 40 expec")
     assert "all sigmas are 1.5 times as large as computed" in first
@@ -110,15 +110,15 @@ def test_terminal_and_report_say_it_first(kind: str, said: str) -> None:
 
 
 def test_gentle_maps_say_nothing_of_it() -> None:
-    result = made_map()
+    result = make_map()
     assert contradiction_sentence(map_as_json(result)) == ""
     assert "contradict" not in summary(result, Path("out"))[0]
     assert exit_code(result) == 0
 
 
 def test_of_several_components_the_worst_is_named() -> None:
-    result = made_map(
-        inflate_covariances(made_component(), MISFIT, QUIET),
-        inflate_covariances(made_component("a_b", "c_d"), Misfit("joins", "c_d", 360.0, 40), QUIET),
+    result = make_map(
+        inflate_covariances(make_component(), MISFIT, QUIET),
+        inflate_covariances(make_component("a_b", "c_d"), Misfit("joins", "c_d", 360.0, 40), QUIET),
     )
     assert contradiction_sentence(map_as_json(result)).startswith("In component 2 drives contradict each other")

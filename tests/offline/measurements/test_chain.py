@@ -9,7 +9,7 @@ from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.keyframes import KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.tags import TagKey
-from tests.support.data.drives import FAMILY, START_NS, MadeDrive, S, made_drive, made_positions, made_run
+from tests.support.data.drives import FAMILY, START_NS, MadeDrive, S, make_drive, make_positions, make_run
 
 NOISE = NoiseParameters()
 
@@ -23,18 +23,18 @@ def chain_of(
 ) -> Chain:
     """A drive whose pictures (by index) show tags (by index); positions stand in for corners."""
     shown = [(pictures_ns[i], tag) for i, tags in sorted((seen or {}).items()) for tag in tags]
-    positions = made_positions(
+    positions = make_positions(
         np.array([stamp for stamp, _ in shown], dtype=np.int64),
         np.array([tag for _, tag in shown], dtype=np.int64),
         np.tile([3.0, 1.0], (len(shown), 1)),
     )
     tags = [TagKey(FAMILY, i) for i in range(n_tags)]
-    (chain,) = chains_of(made_run([drive.track], tags=tags, pictures_ns=pictures_ns, positions=positions), NOISE)
+    (chain,) = chains_of(make_run([drive.track], tags=tags, pictures_ns=pictures_ns, positions=positions), NOISE)
     return chain
 
 
 def test_keyframes_are_pictures_but_for_the_first_which_is_the_first_wheel_reading() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     stamps = pictures(drive)
     chain = chain_of(drive, stamps)
     assert chain.stamps_ns[0] == drive.stamps_ns[0]
@@ -44,7 +44,7 @@ def test_keyframes_are_pictures_but_for_the_first_which_is_the_first_wheel_readi
 
 def test_a_slow_robot_has_keyframes_by_distance() -> None:
     """At 0.1 m/s and 15 pictures a second every sixth or seventh picture is enough."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.1, 0.1, 20.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.1, 0.1, 20.0)])
     chain = chain_of(drive, pictures(drive))
     moved = np.diff((chain.stamps_ns - START_NS) * 1e-9) * 0.1
     assert (moved >= KEYFRAME_DISTANCE_M - 1e-9).all()
@@ -52,7 +52,7 @@ def test_a_slow_robot_has_keyframes_by_distance() -> None:
 
 
 def test_a_turning_robot_has_keyframes_by_angle() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(-0.02, 0.02, 20.0)])  # 4.6 deg/s
+    drive = make_drive([0.0, 0.0, 0.0], [(-0.02, 0.02, 20.0)])  # 4.6 deg/s
     chain = chain_of(drive, pictures(drive))
     turned = np.diff((chain.stamps_ns - START_NS) * 1e-9) * 0.08
     assert (turned >= KEYFRAME_TURN_RAD - 1e-9).all()
@@ -60,13 +60,13 @@ def test_a_turning_robot_has_keyframes_by_angle() -> None:
 
 
 def test_a_fast_robot_makes_a_keyframe_of_every_picture() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.9, 0.9, 3.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.9, 0.9, 3.0)])
     stamps = pictures(drive)
     assert len(chain_of(drive, stamps).stamps_ns) == len(stamps) + 1 - 1  # the first picture is nearly at the start
 
 
 def test_a_robot_that_stands_adds_no_keyframe() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 1.0), (0.0, 0.0, 30.0), (0.5, 0.5, 1.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 1.0), (0.0, 0.0, 30.0), (0.5, 0.5, 1.0)])
     stamps = pictures(drive)
     seen = {i: [i % 3] for i in range(len(stamps))}  # even though tags come and go
     chain = chain_of(drive, stamps, seen)
@@ -76,7 +76,7 @@ def test_a_robot_that_stands_adds_no_keyframe() -> None:
 
 
 def test_readings_from_one_standing_pose_hang_on_its_keyframe() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0), (0.5, 0.5, 1.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0), (0.5, 0.5, 1.0)])
     stamps = pictures(drive)
     chain = chain_of(drive, stamps, {2: [0], 9: [1], 20: [0, 2]})
     assert chain.readings.keyframe.tolist() == [0, 0, 0, 0]
@@ -85,7 +85,7 @@ def test_readings_from_one_standing_pose_hang_on_its_keyframe() -> None:
 
 def test_a_tag_seen_between_keyframes_only_gets_one() -> None:
     """A creeping robot glimpses tag 5 once, a centimetre after a keyframe."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.1, 0.1, 6.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.1, 0.1, 6.0)])
     stamps = pictures(drive)
     plain = chain_of(drive, stamps)
     at = int(np.searchsorted(stamps, plain.stamps_ns[5])) + 2
@@ -99,14 +99,14 @@ def test_a_tag_seen_between_keyframes_only_gets_one() -> None:
 def test_every_tag_seen_within_the_drive_is_kept() -> None:
     rng = np.random.default_rng(0)
     for speed in (0.05, 0.3, 1.0):
-        drive = made_drive([0.0, 0.0, 0.0], [(speed, speed, 3.0), (0.0, 0.0, 2.0), (-speed, speed, 3.0)])
+        drive = make_drive([0.0, 0.0, 0.0], [(speed, speed, 3.0), (0.0, 0.0, 2.0), (-speed, speed, 3.0)])
         stamps = pictures(drive)
         seen = {int(i): [int(tag)] for tag, i in enumerate(rng.choice(len(stamps), 9, replace=False))}
         assert [tag.tag_id for tag in chain_of(drive, stamps, seen).tags] == list(range(9))
 
 
 def test_a_tag_without_a_usable_reading_is_named() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 1.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 1.0)])
     chain = chain_of(drive, pictures(drive), {3: [0, 1]}, n_tags=3)
     assert [tag.tag_id for tag in chain.tags] == [0, 1]
     (warning,) = chain.warnings
@@ -114,16 +114,16 @@ def test_a_tag_without_a_usable_reading_is_named() -> None:
 
 
 def test_without_pictures_stamps_of_the_log_are_candidates() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)], step_ns=S // 10)
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)], step_ns=S // 10)
     stamps = drive.stamps_ns[3:6] + 7_000_000
-    positions = made_positions(stamps, np.zeros(3, dtype=np.int64), np.tile([3.0, 1.0], (3, 1)))
-    (chain,) = chains_of(made_run([drive.track], tags=[TagKey(FAMILY, 0)], positions=positions), NOISE)
+    positions = make_positions(stamps, np.zeros(3, dtype=np.int64), np.tile([3.0, 1.0], (3, 1)))
+    (chain,) = chains_of(make_run([drive.track], tags=[TagKey(FAMILY, 0)], positions=positions), NOISE)
     np.testing.assert_array_equal(chain.stamps_ns[chain.readings.keyframe], stamps)
     assert chain.stamps_ns[0] == drive.stamps_ns[0]
 
 
 def test_what_is_seen_outside_the_wheels_time_is_not_used() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     stamps = pictures(drive)
     outside = np.concatenate([stamps[:1] - S, stamps, stamps[-1:] + S])
     chain = chain_of(drive, outside, {0: [1], 5: [0], len(outside) - 1: [2]}, n_tags=3)
@@ -133,13 +133,13 @@ def test_what_is_seen_outside_the_wheels_time_is_not_used() -> None:
 
 
 def test_each_stretch_is_a_chain_with_a_name_of_its_own() -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     tracks = [
         WheelTrack(drive.stamps_ns[part], drive.left_m[part], drive.right_m[part])
         for part in (slice(0, 150), slice(250, 401))
     ]
     stamps = pictures(drive)
-    first, second = chains_of(made_run(tracks, pictures_ns=stamps), NOISE)
+    first, second = chains_of(make_run(tracks, pictures_ns=stamps), NOISE)
     assert (first.name, second.name) == ("carl_one", "carl_one_stretch2")
     assert first.stamps_ns[-1] <= drive.stamps_ns[149]
     assert second.stamps_ns[0] == drive.stamps_ns[250]
@@ -147,7 +147,7 @@ def test_each_stretch_is_a_chain_with_a_name_of_its_own() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 7])
 def test_the_beginning_of_a_chain_is_a_chain(n: int) -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     stamps = pictures(drive)
     whole = chain_of(drive, stamps, {i: [i % 4] for i in range(len(stamps))})
     part = whole.prefix(n)

@@ -16,7 +16,7 @@ from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import CalibrationResult
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run, load_run
-from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
 
 START = [0.5, 2.0, 0.0]
 LEGS = [(0.4, 0.4, 8.0), (-0.3, 0.3, 5.3), (0.4, 0.4, 8.0), (-0.3, 0.3, 5.3)]
@@ -35,12 +35,12 @@ NOISE = NoiseParameters(sigma_corner_px=SIGMA_PX)
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """All sides seen 0.05 px too far in."""
     folder: Path = tmp_path_factory.mktemp("shifted")
-    plain = load_run(write_drive(folder, made_drive(START, LEGS), TAGS, made_robot("a"), corner_sigma_px=SIGMA_PX))
+    plain = load_run(write_drive(folder, make_drive(START, LEGS), TAGS, make_robot("a"), corner_sigma_px=SIGMA_PX))
     corners_px = shift_edges(plain.detections.corners_px, SHIFT_PX)
     return replace(plain, detections=replace(plain.detections, corners_px=corners_px))
 
 
-def mapped(run: Run, edge_sigma_px: float, *, corners: bool) -> MapResult:
+def map_runs(run: Run, edge_sigma_px: float, *, corners: bool) -> MapResult:
     robot = run.robot.model_copy(update={"edge_shift_px_sigma": edge_sigma_px})
     result = build_map([replace(run, robot=robot)], NOISE, corners=corners)
     assert result.components[0].model is (MapModel.CORNERS if corners else MapModel.FLOOR)
@@ -62,7 +62,7 @@ def tags_chi2(result: MapResult) -> float:
 
 @pytest.mark.parametrize("corners", [False, True], ids=["places", "corners"])
 def test_sides_seen_too_far_in_are_found_and_the_map_is_honest(run: Run, corners: bool) -> None:
-    result = mapped(run, 0.1, corners=corners)
+    result = map_runs(run, 0.1, corners=corners)
     (found,) = edges_of(result)
     assert found.owner == "a"
     assert found.sigma < 0.02  # of 0.1 before
@@ -74,7 +74,7 @@ def test_sides_seen_too_far_in_are_found_and_the_map_is_honest(run: Run, corners
 @pytest.mark.parametrize("corners", [False, True], ids=["places", "corners"])
 def test_a_file_that_is_sure_of_its_camera_holds_it_and_errs(run: Run, corners: bool) -> None:
     """Without the number the same drive's covariances are no longer true."""
-    result = mapped(run, 0.0, corners=corners)
+    result = map_runs(run, 0.0, corners=corners)
     assert [each.value for each in edges_of(result)] in ([], [0.0])
     n = 2 * len(result.components[0].tags)
     assert tags_chi2(result) > chi2.ppf(0.999, n)

@@ -20,9 +20,9 @@ from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, u
 from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import rough
-from tests.support.data.drives import CAMERA, FAMILY, MadeTag, made_drive, made_robot, made_run, seen_corners_px
+from tests.support.data.drives import CAMERA, FAMILY, MadeTag, make_drive, make_robot, make_run, seen_corners_px
 
-ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4})
+ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4})
 TAGS = [MadeTag(i, (3.0, 0.5 * i - 0.8, 0.35 + 0.05 * i), np.pi + 0.2 * i) for i in range(4)]
 SIGMA_PX = 0.2
 N = 80
@@ -84,7 +84,7 @@ def test_a_floor_that_tilts_leaves_no_more_over_than_its_sigma_says() -> None:
 
 
 def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:
-    run = made_run([made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)]).track], robot=ROBOT, tags=_keys())
+    run = make_run([make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)]).track], robot=ROBOT, tags=_keys())
     covariances = []
     for tilt_rad in (0.0, TILT_RAD):
         corners_px, tag, keyframe = driven_past(tilt_rad, 1)
@@ -99,7 +99,7 @@ def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:
 
 @pytest.mark.parametrize("twist", [(0.5, 0.0), (0.3, 0.6), (0.0, -1.0)])
 def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float, float]) -> None:
-    robot = made_robot(mount=ROBOT.mount.model_dump(), readout_s=0.03)
+    robot = make_robot(mount=ROBOT.mount.model_dump(), readout_s=0.03)
     tags = [MadeTag(i, (3.0, 0.5 * i - 0.8, 0.4 * i - 0.4), np.pi + 0.2 * i) for i in range(4)]  # in all rows
     still = np.array([seen_corners_px(tag, np.zeros(3), robot, CAMERA) for tag in tags])
     rolled = still.copy()

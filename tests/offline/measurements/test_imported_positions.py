@@ -13,12 +13,12 @@ from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.sensor_model.readings import Readings
 from groundsbot.offline.measurements.sensor_model.sensor_model import POSITION_NOISE, STAMP_NOISE, read_positions
 from groundsbot.offline.measurements.tags import Positions
-from tests.support.data.drives import made_positions, made_robot
+from tests.support.data.drives import make_positions, make_robot
 
 NOISE = NoiseParameters()
 NO_TWIST = np.zeros((2, 2))  # speed and turning rate at the keyframes
 TWIST = np.array([[0.4, -0.7]])
-ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "yaw_rad": 0.4})
+ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "yaw_rad": 0.4})
 TAG_M = np.array([2.5, -1.2])  # on the map, where the robot stands at the origin
 COVARIANCE = [[0.04, 0.01], [0.01, 0.09]]
 TIME, RANGE = (CAMERA_PARAMETERS.index(name) for name in (TIME_OFFSET, RANGE_OFFSET))
@@ -28,7 +28,7 @@ frames = pytest.mark.parametrize("in_camera", [True, False], ids=["camera", "bas
 
 def positions(value: list[list[float]], *, polar: bool, covariance: object = np.nan) -> Positions:
     n = len(value)
-    made = made_positions(np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.array(value))
+    made = make_positions(np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.array(value))
     whole = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (n, 2, 2)).copy()
     return replace(made, polar=np.full(n, polar), covariance=whole)
 
@@ -74,7 +74,7 @@ def test_imported_covariances_that_are_none_are_left_out(covariance: object) -> 
     assert len(warnings) == 1
 
 
-def seen_from(T_map_base: FloatArray, *, polar: bool, in_camera: bool) -> list[float]:
+def observe_from(T_map_base: FloatArray, *, polar: bool, in_camera: bool) -> list[float]:
     """The tag as a perfect sensor has it: range and bearing, or place."""
     mount = [ROBOT.mount.x_m, ROBOT.mount.y_m, ROBOT.mount.yaw_rad] if in_camera else [0.0, 0.0, 0.0]
     x, y = se2.apply(se2.inverse(se2.compose(T_map_base, np.array(mount))), TAG_M)
@@ -100,7 +100,7 @@ def test_a_late_stamp_shows_what_is_seen_farther_along_the_drive(
     step_s = 1e-4
     earlier, here, later = (
         read_one(
-            seen_from(se2.exp(t_s * np.array([TWIST[0, 0], 0.0, TWIST[0, 1]])), polar=polar, in_camera=in_camera),
+            observe_from(se2.exp(t_s * np.array([TWIST[0, 0], 0.0, TWIST[0, 1]])), polar=polar, in_camera=in_camera),
             polar=polar,
             in_camera=in_camera,
             covariance=covariance,
@@ -115,7 +115,7 @@ def test_a_late_stamp_shows_what_is_seen_farther_along_the_drive(
 @forms
 @frames
 def test_a_range_offset_is_taken_off_and_its_derivative_is_that(polar: bool, in_camera: bool) -> None:
-    value = seen_from(np.zeros(3), polar=polar, in_camera=in_camera)
+    value = observe_from(np.zeros(3), polar=polar, in_camera=in_camera)
     shorter = ROBOT.model_copy(update={"range_offset_m": 0.125})
     plain = read_one(value, polar=polar, in_camera=in_camera)
     less = read_one(value, polar=polar, in_camera=in_camera, robot=shorter)
@@ -138,7 +138,7 @@ def test_all_else_of_a_camera_is_nothing_to_a_position(polar: bool) -> None:
 
 def test_a_moving_robot_reads_less_well_by_what_stamps_scatter() -> None:
     """Errors of one stamp move range and bearing together; a covariance of the log's own is taken as it is."""
-    value = seen_from(np.zeros(3), polar=True, in_camera=True)
+    value = observe_from(np.zeros(3), polar=True, in_camera=True)
     readings = read_one(value, polar=True, in_camera=True, covariance=np.nan)
     by_stamp = NOISE.sigma_stamp_s * readings.by_camera[0, :, TIME]
     still = np.diag([NOISE.sigma_range_m**2 + (NOISE.sigma_range_per_m * value[0]) ** 2, NOISE.sigma_bearing_rad**2])

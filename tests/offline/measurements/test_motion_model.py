@@ -10,7 +10,7 @@ from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
-from tests.support.data.drives import START_NS, MadeDrive, S, made_drive
+from tests.support.data.drives import START_NS, MadeDrive, S, make_drive
 
 TRACK_M = 0.5
 NOISE = NoiseParameters()
@@ -18,7 +18,7 @@ WINDING = [(0.5, 0.6, 2.0), (0.8, 0.4, 1.5), (-0.3, 0.3, 1.0), (0.7, 0.7, 2.0), 
 
 
 def drive(step_ns: int = S // 100) -> MadeDrive:
-    return made_drive([0.0, 0.0, 0.0], WINDING, TRACK_M, step_ns)
+    return make_drive([0.0, 0.0, 0.0], WINDING, TRACK_M, step_ns)
 
 
 def odometry(made: MadeDrive, stamps_ns: object, noise: NoiseParameters = NOISE) -> ChainOdometry:
@@ -52,7 +52,7 @@ def test_how_finely_readings_are_spaced_makes_no_difference() -> None:
 @pytest.mark.parametrize("leg", [(0.5, 0.5), (0.3, 0.7), (-0.4, -0.2)])
 def test_covariance_is_that_of_the_noise_model(leg: tuple[float, float]) -> None:
     """Against 4000 drives with the noise that groundsbot.calib.robot.noise describes, small step by small step."""
-    made = made_drive([0.0, 0.0, 0.0], [(*leg, 2.0)], TRACK_M, S // 20)
+    made = make_drive([0.0, 0.0, 0.0], [(*leg, 2.0)], TRACK_M, S // 20)
     # Sideways noise beyond what robots have, so that it counts beside what the heading does.
     noise = NoiseParameters(sigma_lateral_m_per_sqrt_m=0.02)
     found = odometry(made, made.stamps_ns[[0, -1]], noise)
@@ -83,7 +83,7 @@ def _step_sigmas(left_m: FloatArray, right_m: FloatArray, noise: NoiseParameters
 
 
 def test_a_turn_on_the_spot_makes_the_heading_uncertain() -> None:
-    made = made_drive([0.0, 0.0, 0.0], [(-0.2, 0.2, 2.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(-0.2, 0.2, 2.0)])
     found = odometry(made, made.stamps_ns[[0, -1]])
     assert np.sqrt(found.covariance[0, 2, 2]) == pytest.approx(0.02 * np.sqrt(1.6), rel=1e-3)
     assert (np.sqrt(np.diag(found.covariance[0])[:2]) < 1e-3).all()
@@ -91,7 +91,7 @@ def test_a_turn_on_the_spot_makes_the_heading_uncertain() -> None:
 
 def test_covariance_of_a_chain_does_not_depend_on_where_it_is_cut() -> None:
     """Two steps composed are as uncertain as one, but for the ticks that each end is read to."""
-    made = made_drive([0.0, 0.0, 0.0], [(0.3, 0.7, 3.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(0.3, 0.7, 3.0)])
     whole = odometry(made, made.stamps_ns[[0, 300]])
     cut = odometry(made, made.stamps_ns[[0, 140, 300]])
     to_end = se2.adjoint(se2.inverse(cut.motion[1]))
@@ -132,7 +132,7 @@ def test_dead_reckoning_takes_a_calibration() -> None:
 
 def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
     """Counts bridge a gap: how far and how much turned is known, the path between is not."""
-    made = made_drive([0.0, 0.0, 0.0], [(0.5, 0.6, 6.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.6, 6.0)])
     kept = np.r_[0:200, 300:601]  # a second without readings
     with_gap = WheelTrack(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
     stamps = made.stamps_ns[[0, 150, 350, 600]]
@@ -144,7 +144,7 @@ def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
 
 
 def test_half_a_second_without_readings_is_no_gap_yet() -> None:
-    made = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     kept = np.r_[0:200, 249:401]
     track = WheelTrack(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
     stamps = made.stamps_ns[[0, 400]]
@@ -160,7 +160,7 @@ def test_one_keyframe_has_no_motion() -> None:
 
 
 def test_a_robot_that_stands_still_is_certain_but_not_infinitely() -> None:
-    made = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0)])
     found = odometry(made, made.stamps_ns[[0, 100, 200]])
     np.testing.assert_array_equal(found.motion, np.zeros((2, 3)))
     assert np.isfinite(np.linalg.inv(found.covariance)).all()
@@ -169,7 +169,7 @@ def test_a_robot_that_stands_still_is_certain_but_not_infinitely() -> None:
 
 def test_ticks_that_jump_between_wheels_do_not_add_up_to_a_turn() -> None:
     """Coarse counts read one by one show turns that never were; they must not add to the heading's noise."""
-    made = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
+    made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     tick_m = 0.02
     left_m, right_m = (np.floor((made.left_m + begin) / tick_m) * tick_m for begin in (0.0, 0.01))
     coarse = WheelTrack(made.stamps_ns, left_m, right_m, tick_m)

@@ -28,9 +28,9 @@ from groundsbot.onboard.log.messages import (
     WheelEncoders,
 )
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
+from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, make_drive, make_robot, write_drive
 
-ROBOT = made_robot(wheels={"radius_left_m": 0.1, "radius_right_m": 0.11, "track_m": 0.5, "ticks_per_turn": 1000.0})
+ROBOT = make_robot(wheels={"radius_left_m": 0.1, "radius_right_m": 0.11, "track_m": 0.5, "ticks_per_turn": 1000.0})
 CORNERS = [100.0, 100.0, 140.0, 100.0, 140.0, 140.0, 100.0, 140.0]
 
 
@@ -132,7 +132,7 @@ def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
 
 def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
     log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
-    write_robot_yaml(made_robot(time_offset_s=0.004), tmp_path / "robot.yaml")
+    write_robot_yaml(make_robot(time_offset_s=0.004), tmp_path / "robot.yaml")
     write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
     run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
     assert (run.picture_stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
@@ -148,7 +148,7 @@ def test_imported_positions_that_run_ahead_are_set_back(tmp_path: Path) -> None:
         )
         for stamp_ns, frame in ((10_000_000, "base"), (20_000_000, "camera_planar"))
     ]
-    robot = made_robot(time_offset_s=0.004)
+    robot = make_robot(time_offset_s=0.004)
     head = log_head(robot, robot.model_dump_json(), CAMERA, "one", START_NS, 0)
     run = load_run(write_log(tmp_path, [wheel_odometry(0.0, 0.0, 0.0), *messages, wheel_odometry(0.1, 0.1, 0.1)], head))
     assert (run.positions.stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
@@ -170,7 +170,7 @@ def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
 
 def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> None:
     log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
-    write_robot_yaml(made_robot(edge_shift_px=-0.25), tmp_path / "robot.yaml")
+    write_robot_yaml(make_robot(edge_shift_px=-0.25), tmp_path / "robot.yaml")
     write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
     run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
     plain = np.reshape(CORNERS, (1, 4, 2))
@@ -233,7 +233,7 @@ def test_wheel_distances_and_observations_of_an_imported_log(tmp_path: Path) -> 
 
 
 def test_odometry_poses_become_the_wheels_that_drove_them(tmp_path: Path) -> None:
-    drive = made_drive([1.0, 2.0, 3.0], [(0.5, 0.7, 1.0), (0.6, 0.2, 1.0)])
+    drive = make_drive([1.0, 2.0, 3.0], [(0.5, 0.7, 1.0), (0.6, 0.2, 1.0)])
     messages = [pose_odometry(0.01 * i, *pose) for i, pose in enumerate(drive.T_world_base.tolist())]
     run = load_run(write_log(tmp_path, messages))
     np.testing.assert_allclose(run.stretches[0].left_m, drive.left_m, atol=1e-9)
@@ -250,7 +250,7 @@ def test_sideways_motion_is_said() -> None:
 
 def test_a_given_robot_replaces_that_of_the_log(tmp_path: Path) -> None:
     log = write_log(tmp_path, TWO_READINGS)
-    other = made_robot(wheels={"radius_left_m": 0.2, "radius_right_m": 0.2, "track_m": 0.4, "ticks_per_turn": 1000.0})
+    other = make_robot(wheels={"radius_left_m": 0.2, "radius_right_m": 0.2, "track_m": 0.4, "ticks_per_turn": 1000.0})
     camera = replace(CAMERA, fx_px=500.0)
     write_robot_yaml(other, tmp_path / "robot.yaml")
     write_camera_yaml(camera, tmp_path / "camera.yaml")
@@ -347,12 +347,12 @@ def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: i
 
 
 def test_a_fast_robot_is_not_refused(tmp_path: Path) -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(20.0, 20.0, 1.0)], step_ns=S // 20)
+    drive = make_drive([0.0, 0.0, 0.0], [(20.0, 20.0, 1.0)], step_ns=S // 20)
     load_run(write_drive(tmp_path, drive))
 
 
 def test_a_run_that_saw_tags_and_one_that_saw_none(tmp_path: Path) -> None:
-    drive = made_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     run = load_run(write_drive(tmp_path, drive, [MadeTag(5, (4.0, 0.3, 0.5), np.pi)]))
     assert run.tags == (TagKey(FAMILY, 5),)
     assert len(run.detections.tag) == len(run.picture_stamps_ns)

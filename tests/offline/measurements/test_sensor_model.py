@@ -23,16 +23,16 @@ from tests.support.data.drives import (
     CAMERA,
     FAMILY,
     MadeTag,
-    made_drive,
-    made_robot,
-    made_run,
+    make_drive,
+    make_robot,
+    make_run,
     seen_corners_px,
 )
 
 NOISE = NoiseParameters()
 NO_TWIST = np.zeros((1000, 2))  # speed and turning rate at the keyframes
-STILL = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)])
-ROBOT = made_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4, "yaw_rad": 0.1, "pitch_rad": 0.05})
+STILL = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)])
+ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4, "yaw_rad": 0.1, "pitch_rad": 0.05})
 UPRIGHT = [MadeTag(i, (2.0 + 0.7 * i, 0.3 * i - 0.4, 0.4), np.pi + 0.2 * i - 0.3) for i in range(5)]
 
 
@@ -46,7 +46,7 @@ def corners_of(tag: MadeTag) -> FloatArray:
 
 
 def run_of(tags: list[MadeTag], robot: Robot = ROBOT) -> Run:
-    return made_run([STILL.track], robot=robot, tags=[TagKey(FAMILY, tag.tag_id) for tag in tags])
+    return make_run([STILL.track], robot=robot, tags=[TagKey(FAMILY, tag.tag_id) for tag in tags])
 
 
 def detections_of(corners_px: FloatArray, tag: list[int]) -> Detections:
@@ -116,7 +116,7 @@ def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_b
 def test_a_small_tag_is_left_out_rather_than_biased() -> None:
     """A tag of 5 cm at 8 m shows 5 px: its range would be worth nothing."""
     tiny = [*UPRIGHT, MadeTag(9, (8.4, 0.5, 0.4), np.pi, size_m=0.04)]
-    robot = made_robot(
+    robot = make_robot(
         mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.15, "sizes_m": {9: 0.04}}]
     )
     run = replace(run_of(tiny), robot=robot)
@@ -244,7 +244,7 @@ def test_two_tags_with_one_id_in_one_picture_are_two_readings() -> None:
 
 def test_a_tag_in_the_lens_is_a_phantom() -> None:
     close = MadeTag(3, (0.2 + 0.08, 0.058, 0.396), np.pi + 0.1, size_m=0.03)
-    robot = made_robot(mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.03}])
+    robot = make_robot(mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.03}])
     run = replace(run_of([close]), robot=robot)
     readings, _ = read_detections(run, detections_of(corners_of(close)[None], [0]), np.array([0]), NO_TWIST, NOISE)
     assert len(readings) == 0
@@ -262,7 +262,7 @@ def run_with_size(size_m: float | None, name: str = "carl", sizes_m: dict[int, f
     if size_m is not None:
         batch["default_size_m"] = size_m
     detections = detections_of(np.zeros((1, 4, 2)), [0])
-    run = made_run([STILL.track], robot=made_robot(name, tags=[batch]), tags=[TagKey(FAMILY, 4)], detections=detections)
+    run = make_run([STILL.track], robot=make_robot(name, tags=[batch]), tags=[TagKey(FAMILY, 4)], detections=detections)
     return replace(run, log=Path("logs") / name)
 
 

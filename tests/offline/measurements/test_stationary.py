@@ -16,7 +16,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import Component
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.drives import MadeDrive, MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import MadeDrive, MadeTag, make_drive, make_robot, write_drive
 
 HALL = [
     MadeTag(0, (6.0, 1.0, 0.5), np.pi),
@@ -71,7 +71,7 @@ def past_five_tags(stop_s: float) -> World:
     )
 
 
-def stopped(folder: Path, stop_s: float) -> tuple[Component, float]:
+def stop(folder: Path, stop_s: float) -> tuple[Component, float]:
     """The map of a rendered drive, and its tags NEES per dimension."""
     simulate(past_five_tags(stop_s), 1, folder, frame_rate_hz=2.0)
     result = build_map(read_runs(find_logs([folder])))
@@ -83,8 +83,8 @@ def stopped(folder: Path, stop_s: float) -> tuple[Component, float]:
 
 def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
     """More than a hundred pictures from one place repeat one error as often."""
-    short, _ = stopped(tmp_path / "short", 1.0)
-    long, nees = stopped(tmp_path / "long", 60.0)
+    short, _ = stop(tmp_path / "short", 1.0)
+    long, nees = stop(tmp_path / "long", 60.0)
     assert [tag.tag_id for tag in short.tags] == [tag.tag_id for tag in long.tags] == [0, 1, 2, 3, 4]
     sigmas = [np.sqrt([np.diag(tag.covariance) for tag in each.tags]) for each in (short, long)]
     np.testing.assert_allclose(sigmas[1], sigmas[0], rtol=0.1)
@@ -94,12 +94,12 @@ def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
 
 def test_a_controller_reset_of_twenty_seconds_is_worth_two_runs(tmp_path: Path) -> None:
     """Five metres of which nothing is known: a stretch joined by tags, and the map that two logs would have given."""
-    drive = made_drive([1.5, 1.5, 0.3], [*BEFORE, *MEANWHILE, *AFTER])
+    drive = make_drive([1.5, 1.5, 0.3], [*BEFORE, *MEANWHILE, *AFTER])
     n_before, n_meanwhile = (round(100 * sum(leg[2] for leg in legs)) for legs in (BEFORE, MEANWHILE))
     kept = np.r_[0:n_before, n_before + n_meanwhile : len(drive.stamps_ns)]
     cut = MadeDrive(drive.stamps_ns[kept], drive.left_m[kept], drive.right_m[kept], drive.T_world_base[kept])
     boots = np.where(kept < n_before, 1, 2).tolist()
-    log = write_drive(tmp_path, cut, HALL, made_robot("a"), boot_of=boots, corner_sigma_px=0.2)
+    log = write_drive(tmp_path, cut, HALL, make_robot("a"), boot_of=boots, corner_sigma_px=0.2)
     run = load_run(log)
     assert len(run.stretches) == 2
     one = build_map([run])

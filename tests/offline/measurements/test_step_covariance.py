@@ -11,15 +11,15 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack, compose_odometry
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances, growth
 from groundsbot.onboard.log.messages import PlanarOdometry
-from tests.support.data.drives import S, made_drive
-from tests.support.data.odometry_steps import accumulated, covariances_of_steps
+from tests.support.data.drives import S, make_drive
+from tests.support.data.odometry_steps import accumulate, covariances_of_steps
 
-POSES = made_drive([1.0, 2.0, 2.0], [(0.4, 0.3, 3.0), (0.0, 0.0, 1.0), (-0.2, 0.2, 2.0), (0.5, 0.5, 3.0)]).T_world_base
+POSES = make_drive([1.0, 2.0, 2.0], [(0.4, 0.3, 3.0), (0.0, 0.0, 1.0), (-0.2, 0.2, 2.0), (0.5, 0.5, 3.0)]).T_world_base
 
 
 def test_what_a_poses_covariance_grows_by_is_that_of_the_step() -> None:
     steps = covariances_of_steps(POSES)
-    found, told = growth(POSES, accumulated(POSES, steps))
+    found, told = growth(POSES, accumulate(POSES, steps))
     assert found is not None, told
     np.testing.assert_allclose(found, steps, atol=1e-13)
 
@@ -33,7 +33,7 @@ def test_a_pose_is_as_far_off_as_its_covariance_says() -> None:
     for motion, root in zip(motions, roots, strict=True):
         drawn = se2.compose(drawn, se2.compose(motion, se2.exp(rng.standard_normal((4000, 3)) @ root.T)))
     error = drawn - POSES[199]
-    expected = accumulated(POSES[:200], steps)[-1]
+    expected = accumulate(POSES[:200], steps)[-1]
     np.testing.assert_allclose(np.cov(error.T), expected, atol=0.08 * float(np.abs(expected).max()))
 
 
@@ -61,7 +61,7 @@ def test_a_pose_is_as_far_off_as_its_covariance_says() -> None:
     ],
 )
 def test_covariances_that_no_path_has_are_not_believed(spoil: Callable[[FloatArray], FloatArray], told: str) -> None:
-    found, said = growth(POSES, spoil(accumulated(POSES, covariances_of_steps(POSES))))
+    found, said = growth(POSES, spoil(accumulate(POSES, covariances_of_steps(POSES))))
     assert found is None
     assert said.startswith(told)
 

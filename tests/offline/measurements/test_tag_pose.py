@@ -11,19 +11,17 @@ from groundsbot.calib.foundation.arrays import BoolArray, FloatArray
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.sensor_model.sensor_model import MAX_RANGE_SIGMA_PER_M
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
-from tests.support.data.drives import CAMERA, MadeTag, made_robot, seen_corners_px
+from tests.support.data.drives import CAMERA, MadeTag, make_robot, seen_corners_px
 
 SIGMA_PX = 0.2
 N = 500
 SIZE_M = 0.15
-LEVEL = made_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4})
-TIPPED = made_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4, "yaw_rad": -0.2, "pitch_rad": 0.15, "roll_rad": 0.1})
+LEVEL = make_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4})
+TIPPED = make_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4, "yaw_rad": -0.2, "pitch_rad": 0.15, "roll_rad": 0.1})
 FISHEYE = CameraModel("f", 1280, 720, 500.0, 500.0, 640.0, 360.0, "equidistant", (-0.02, 0.004, -0.001, 0.0))
 
 
-def placed(
-    distance_m: float, turned_deg: float, bearing_deg: float, roll_deg: float, pitch_deg: float = 0.0
-) -> MadeTag:
+def place(distance_m: float, turned_deg: float, bearing_deg: float, roll_deg: float, pitch_deg: float = 0.0) -> MadeTag:
     """A tag that far from the camera at the origin, turned away from facing it."""
     bearing, turned = np.radians([bearing_deg, turned_deg])
     x_m, y_m = distance_m * np.cos(bearing), distance_m * np.sin(bearing)
@@ -43,14 +41,14 @@ def exact_corners(tag: MadeTag, robot: Robot, camera: CameraModel) -> FloatArray
     return corners
 
 
-def sized(n: int, camera: CameraModel, rotation: FloatArray) -> tuple[FloatArray, CameraModel, FloatArray, FloatArray]:
+def inputs(n: int, camera: CameraModel, rotation: FloatArray) -> tuple[FloatArray, CameraModel, FloatArray, FloatArray]:
     """The rest of what a reader of so many tags takes."""
     return np.full(n, SIZE_M), camera, rotation, np.full(n, SIGMA_PX)
 
 
 def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAMERA) -> TagReadings:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    return upright_readings(corners_px, *sized(len(corners_px), camera, rotation))
+    return upright_readings(corners_px, *inputs(len(corners_px), camera, rotation))
 
 
 def used(found: TagReadings) -> BoolArray:
@@ -79,7 +77,7 @@ def test_the_mean_reading_is_true_wherever_readings_are_used(robot: Robot, camer
     n_used = 0
     squares: list[FloatArray] = []
     for seed, cell in enumerate(GRID):
-        tag = placed(*cell)
+        tag = place(*cell)
         corners_px = seen_corners_px(tag, np.zeros(3), robot, camera)
         if corners_px is None:  # partly beside the picture
             continue
@@ -103,10 +101,10 @@ def test_the_full_pose_would_not_do() -> None:
 
     Should this ever fail, the upright model and its restrictions may have become needless.
     """
-    tag = placed(4.0, 5.0, 0.0, 0.0)
+    tag = place(4.0, 5.0, 0.0, 0.0)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 0)
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    full = general_readings(corners_px, *sized(N, CAMERA, rotation))
+    full = general_readings(corners_px, *inputs(N, CAMERA, rotation))
     error_m = full.range_bearing[:, 0] - truth(tag)[0]
     assert abs(error_m.mean()) > 0.15 * error_m.std()
 
@@ -114,7 +112,7 @@ def test_the_full_pose_would_not_do() -> None:
 @pytest.mark.parametrize("robot", [LEVEL, TIPPED])
 def test_exact_corners_give_the_exact_place_and_height(robot: Robot) -> None:
     for cell in GRID[::7]:
-        tag = placed(*cell)
+        tag = place(*cell)
         corners_px = seen_corners_px(tag, np.zeros(3), robot, CAMERA)
         if corners_px is not None:
             found = read(corners_px[None], robot)
@@ -124,26 +122,26 @@ def test_exact_corners_give_the_exact_place_and_height(robot: Robot) -> None:
 
 
 def test_residuals_have_the_two_degrees_of_freedom_that_test_the_model() -> None:
-    corners_px = noisy(exact_corners(placed(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA), 3)
+    corners_px = noisy(exact_corners(place(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA), 3)
     assert read(corners_px).chi2.mean() == pytest.approx(2.0, abs=0.4)
 
 
 def test_a_tag_that_hangs_askew_fails_the_upright_model() -> None:
-    corners_px = noisy(exact_corners(placed(3.0, 20.0, 5.0, 0.0, pitch_deg=40.0), LEVEL, CAMERA), 3)
+    corners_px = noisy(exact_corners(place(3.0, 20.0, 5.0, 0.0, pitch_deg=40.0), LEVEL, CAMERA), 3)
     assert read(corners_px).chi2.mean() > 20.0
 
 
 @pytest.mark.parametrize("pitch_deg", [-60.0, -25.0, 30.0, 55.0])
 @pytest.mark.parametrize("distance_m", [1.0, 2.0, 4.0, 6.0])
 def test_general_readings_of_askew_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
-    tag = placed(distance_m, 20.0, 5.0, 0.0, pitch_deg)
+    tag = place(distance_m, 20.0, 5.0, 0.0, pitch_deg)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 5)
     _general_reading_is_honest(corners_px, truth(tag), LEVEL)
 
 
 @pytest.mark.parametrize("x_m", [2.0, 3.0, 4.0])
 def test_general_readings_of_tags_on_the_ceiling_are_within_their_sigma(x_m: float) -> None:
-    upwards = made_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4, "pitch_rad": -0.6})
+    upwards = make_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4, "pitch_rad": -0.6})
     tag = MadeTag(1, (x_m, 0.4, 2.8), np.pi, -np.pi / 2, 0.0, SIZE_M)
     corners_px = noisy(exact_corners(tag, upwards, CAMERA), 5)
     _general_reading_is_honest(corners_px, truth(tag), upwards)
@@ -152,7 +150,7 @@ def test_general_readings_of_tags_on_the_ceiling_are_within_their_sigma(x_m: flo
 def _general_reading_is_honest(corners_px: FloatArray, true: FloatArray, robot: Robot) -> None:
     """Its sigma is meant to cover the pose's bias many times over, so there is no lower bound on the errors."""
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    found = general_readings(corners_px, *sized(len(corners_px), CAMERA, rotation))
+    found = general_readings(corners_px, *inputs(len(corners_px), CAMERA, rotation))
     assert found.valid.all()
     in_sigmas = (found.range_bearing - true) / np.sqrt(np.einsum("mii->mi", found.covariance))
     assert (np.abs(in_sigmas.mean(axis=0)) < 0.15).all(), in_sigmas.mean(axis=0)
@@ -161,7 +159,7 @@ def _general_reading_is_honest(corners_px: FloatArray, true: FloatArray, robot: 
 
 @pytest.mark.parametrize("reader", [upright_readings, general_readings])
 def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..., TagReadings]) -> None:
-    good = exact_corners(placed(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA)
+    good = exact_corners(place(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA)
     bad = [
         np.full((4, 2), np.nan),
         np.full((4, 2), np.inf),
@@ -170,10 +168,10 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
         good[[0, 2, 1, 3]],
     ]
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    found = reader(np.array([*bad, good]), *sized(len(bad) + 1, CAMERA, rotation))
+    found = reader(np.array([*bad, good]), *inputs(len(bad) + 1, CAMERA, rotation))
     assert not found.valid[: len(bad) - 1].any()
     assert found.valid[-1]
-    alone = reader(good[None], *sized(1, CAMERA, rotation))
+    alone = reader(good[None], *inputs(1, CAMERA, rotation))
     # All points are taken through the lens until the last is still, which may move a still one by its last bit.
     np.testing.assert_allclose(found.range_bearing[-1], alone.range_bearing[0], rtol=1e-14)
     assert not found.valid[len(bad) - 1] or found.chi2[len(bad) - 1] > 100.0
@@ -181,7 +179,7 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
 
 def test_no_readings_are_none() -> None:
     for reader in (upright_readings, general_readings):
-        found = reader(np.zeros((0, 4, 2)), *sized(0, CAMERA, np.eye(3)))
+        found = reader(np.zeros((0, 4, 2)), *inputs(0, CAMERA, np.eye(3)))
         assert found.range_bearing.shape == (0, 2)
 
 
@@ -189,12 +187,12 @@ def test_no_readings_are_none() -> None:
 @pytest.mark.parametrize("reader", [upright_readings, general_readings])
 def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Callable[..., TagReadings]) -> None:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    tags = [placed(3.0, 20.0, 15.0, 5.0), placed(2.0, -30.0, -12.0, 0.0), placed(4.0, 40.0, 3.0, 30.0)]
+    tags = [place(3.0, 20.0, 15.0, 5.0), place(2.0, -30.0, -12.0, 0.0), place(4.0, 40.0, 3.0, 30.0)]
     corners_px = np.stack([exact_corners(tag, robot, CAMERA) for tag in tags])
 
     def turned(w: FloatArray) -> TagReadings:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
-        return reader(corners_px, *sized(3, CAMERA, R_base_camera))
+        return reader(corners_px, *inputs(3, CAMERA, R_base_camera))
 
     found = turned(np.zeros(3))
     for axis, turn in enumerate(1e-5 * np.eye(3)):
@@ -204,11 +202,11 @@ def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Cal
 
 def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    corners_px = exact_corners(placed(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
+    corners_px = exact_corners(place(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
 
     def turned(w: FloatArray) -> TagReadings:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
-        return upright_readings(corners_px, *sized(1, CAMERA, R_base_camera))
+        return upright_readings(corners_px, *inputs(1, CAMERA, R_base_camera))
 
     by_turn = turned(np.zeros(3)).misfit_by_turn[0]
     for axis, turn in enumerate(1e-5 * np.eye(3)):

@@ -124,11 +124,11 @@ def test_jacobians_are_the_finite_differences(factors: StartFactors | DistanceFa
     np.testing.assert_array_equal(linearised.residual, factors.residual(state))
     for column in range(columns.n):
         step = 1e-6
-        slope = (factors.residual(_moved(state, column, step)) - factors.residual(_moved(state, column, -step))) / 2e-6
+        slope = (factors.residual(_move(state, column, step)) - factors.residual(_move(state, column, -step))) / 2e-6
         np.testing.assert_allclose(dense[..., column], slope, atol=1e-5)
 
 
-def _moved(state: State, column: int, step: float) -> State:
+def _move(state: State, column: int, step: float) -> State:
     tangent = np.zeros(10)
     tangent[column] = step
     poses: FloatArray = state.poses.copy()

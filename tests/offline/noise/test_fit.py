@@ -24,7 +24,7 @@ from groundsbot.offline.noise.likelihood import Looker
 from groundsbot.offline.noise.reweighing import fit_and_weigh, with_noise_of_map
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
-from tests.support.data.drives import MadeTag, made_drive, made_robot, write_drive
+from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
 
 PRIOR = NoiseParameters()
 HALL = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi), MadeTag(2, (0.0, 1.2, 0.45), 0.1)]
@@ -119,7 +119,7 @@ def _read_late(chain: Chain) -> Chain:
 def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     """Readings without any error: less noise than the best of encoders and lenses leave."""
     legs = [(0.4, 0.4, 4.0), (0.5, 0.3, 4.0), (-0.3, 0.3, 3.0), (0.4, 0.4, 3.0)]
-    log = write_drive(tmp_path, made_drive([1.0, 1.5, 0.3], legs), HALL, made_robot("a"))
+    log = write_drive(tmp_path, make_drive([1.0, 1.5, 0.3], legs), HALL, make_robot("a"))
     result = build_map(read_runs([log]))
     assert result.noise_fit is not None
     assert all(each.kept for each in result.noise_fit.parameters)

@@ -7,7 +7,7 @@ from scipy.stats import norm
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.noise.likelihood import Components, Part
 from groundsbot.offline.noise.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
-from tests.support.data.problems import MadeProblem, made_problem
+from tests.support.data.problems import MadeProblem, make_problem
 
 _NOISE = 0.7
 _SEEDS = range(12)
@@ -30,15 +30,15 @@ def _part(made: MadeProblem, *, useless: bool = False) -> Part:
     return Part(problem, made.truth, components)
 
 
-def _fitted(seed: int, start: FloatArray, n_parts: int = 2) -> FittedVariances:
-    return fit_variances([_part(made_problem(100 * seed + i, _NOISE)) for i in range(n_parts)], start)
+def _fit(seed: int, start: FloatArray, n_parts: int = 2) -> FittedVariances:
+    return fit_variances([_part(make_problem(100 * seed + i, _NOISE)) for i in range(n_parts)], start)
 
 
 @pytest.mark.parametrize("start", [[1.0, 1.0], [10.0, 10.0], [0.1, 0.1], [10.0, 0.1], [0.1, 10.0]])
 def test_sigmas_are_found_from_ten_times_too_large_and_too_small(start: list[float]) -> None:
     inside, deviations = 0, []
     for seed in _SEEDS:
-        fitted = _fitted(seed, np.array(start))
+        fitted = _fit(seed, np.array(start))
         low, high = fitted.interval(norm.ppf(0.995))
         inside += int(((low < _NOISE) & (high > _NOISE)).sum())
         deviations.append(np.log(fitted.sigma / _NOISE) / np.sqrt(np.diag(fitted.log_covariance)))
@@ -69,14 +69,14 @@ def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
 
 
 def test_where_the_search_begins_does_not_matter() -> None:
-    near, far = _fitted(3, np.array([0.7, 0.7])), _fitted(3, np.array([7.0, 0.07]))
+    near, far = _fit(3, np.array([0.7, 0.7])), _fit(3, np.array([7.0, 0.07]))
     assert near.converged
     assert far.sigma == pytest.approx(near.sigma, rel=0.05)
 
 
 def test_redundancy_counts_what_the_estimate_leaves() -> None:
-    fitted = _fitted(1, np.array([1.0, 1.0]), n_parts=1)
-    problem = made_problem(100, _NOISE).problem
+    fitted = _fit(1, np.array([1.0, 1.0]), n_parts=1)
+    problem = make_problem(100, _NOISE).problem
     n_unknown = problem.columns.n - int((problem.columns.calibration >= 0).sum())
     left = problem.n_residuals - n_unknown
     # Squares that share what is left count less than as many of their own; calibration takes eight at most.
@@ -84,13 +84,13 @@ def test_redundancy_counts_what_the_estimate_leaves() -> None:
 
 
 def test_a_sigma_that_no_residual_tells_of_stays_where_it_was() -> None:
-    fitted = fit_variances([_part(made_problem(5, _NOISE), useless=True)], np.array([1.0, 1.0, 0.03]))
+    fitted = fit_variances([_part(make_problem(5, _NOISE), useless=True)], np.array([1.0, 1.0, 0.03]))
     assert fitted.told.tolist() == [True, True, False]
     assert fitted.sigma[2] == pytest.approx(0.03)
     assert fitted.log_covariance[2, 2] == pytest.approx(PRIOR_SIGMA**2)
 
 
 def test_faults_do_not_count_as_noise() -> None:
-    clean = fit_variances([_part(made_problem(7, _NOISE))], np.array([1.0, 1.0]))
-    faulty = fit_variances([_part(made_problem(7, _NOISE, n_outliers=4))], np.array([1.0, 1.0]))
+    clean = fit_variances([_part(make_problem(7, _NOISE))], np.array([1.0, 1.0]))
+    faulty = fit_variances([_part(make_problem(7, _NOISE, n_outliers=4))], np.array([1.0, 1.0]))
     assert faulty.sigma == pytest.approx(clean.sigma, rel=0.15)

@@ -18,9 +18,9 @@ from tests.support.data.drives import (
     MadeDrive,
     MadeTag,
     S,
-    made_drive,
-    made_robot,
-    made_run,
+    make_drive,
+    make_robot,
+    make_run,
     picture_stamps,
     seen_corners_px,
 )
@@ -39,13 +39,13 @@ LOOK = (0.2, 0.2, 2.0)
 
 def drive_past(tags: list[MadeTag]) -> Run:
     """Forward, back and forward again, all tags in view."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 3.0), (-0.3, -0.28, 3.0), (0.3, 0.3, 3.0)])
-    return seen_by(drive, tags, picture_stamps(drive))
+    drive = make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 3.0), (-0.3, -0.28, 3.0), (0.3, 0.3, 3.0)])
+    return observe(drive, tags, picture_stamps(drive))
 
 
-def seen_by(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: MadeDrive | None = None) -> Run:
+def observe(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: MadeDrive | None = None) -> Run:
     """A drive past tags; `told`: what its wheels tell, where that is not the truth."""
-    robot, rng = made_robot(), np.random.default_rng(1)
+    robot, rng = make_robot(), np.random.default_rng(1)
     seen = []
     for stamp, pose in zip(stamps_ns, drive.at(stamps_ns), strict=True):
         for tag in rng.permutation(len(tags)):  # a detector's order says nothing
@@ -55,7 +55,7 @@ def seen_by(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: Ma
     stamps, ids, corners = zip(*seen, strict=True)
     detections = Detections(np.array(stamps), np.array(ids), np.array(corners))
     keys = [TagKey(FAMILY, i) for i in range(4)]
-    return made_run([(told or drive).track], robot=robot, tags=keys, pictures_ns=stamps_ns, detections=detections)
+    return make_run([(told or drive).track], robot=robot, tags=keys, pictures_ns=stamps_ns, detections=detections)
 
 
 def test_two_tags_in_one_picture_are_duplicated() -> None:
@@ -81,12 +81,12 @@ def test_each_keeps_its_readings_however_they_are_ordered() -> None:
 def back_and_forth(tags: list[MadeTag], slip_rad: float) -> LocalMap:
     """Tags in view, then 8 m without a picture, in which the wheels do not tell of a turn, and the same tags again."""
     drive, told = (
-        made_drive([0.0, 0.0, 0.0], [LOOK, (-0.4 - turn, -0.4 + turn, 10.0), (0.4, 0.4, 10.0), LOOK])
+        make_drive([0.0, 0.0, 0.0], [LOOK, (-0.4 - turn, -0.4 + turn, 10.0), (0.4, 0.4, 10.0), LOOK])
         for turn in (0.0, slip_rad / 40.0)
     )
     stamps_ns = picture_stamps(drive)
     looks = np.minimum(stamps_ns - drive.stamps_ns[0], drive.stamps_ns[-1] - stamps_ns) < 2 * S
-    run = seen_by(drive, tags, stamps_ns[looks], told)
+    run = observe(drive, tags, stamps_ns[looks], told)
     noise = NoiseParameters(sigma_heading_rad_per_sqrt_m=0.15)
     (chain,) = (split_duplicates(each) for each in chains_of(run, noise))
     return split_alone(solve_local_map(chain))

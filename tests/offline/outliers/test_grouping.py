@@ -15,7 +15,7 @@ from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.outliers import split_alone
 from groundsbot.offline.outliers.sightings import sightings_of
 from groundsbot.offline.sam.graph import Graph, build_graph
-from tests.support.data.drives import FAMILY, S, made_drive, made_positions, made_run
+from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_run
 
 TAGS_M = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0], [0.5, -1.5]])
 N_LAPS = 24
@@ -26,7 +26,7 @@ SIGMA_M = 0.02
 @cache
 def laps() -> Chain:
     """Round and round, each tag read once a lap; the last one is moved by a metre while a lap goes on."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.4, 0.6, N_LAPS * 5.0 * np.pi)], step_ns=S // 10)
+    drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.6, N_LAPS * 5.0 * np.pi)], step_ns=S // 10)
     lap_ns = int((drive.stamps_ns[-1] - drive.stamps_ns[0]) / N_LAPS)
     each = np.arange(N_LAPS)
     ids = np.tile(np.arange(4), N_LAPS)
@@ -35,9 +35,9 @@ def laps() -> Chain:
     places[3 + 4 * MOVED_AFTER :: 4] += [0.8, 0.6]
     seen = se2.apply(se2.inverse(drive.at(stamps_ns)), places)
     seen = seen + SIGMA_M * np.random.default_rng(4).standard_normal(seen.shape)
-    positions = made_positions(stamps_ns, ids, seen, SIGMA_M)
+    positions = make_positions(stamps_ns, ids, seen, SIGMA_M)
     tags = [TagKey(FAMILY, i) for i in range(4)]
-    (chain,) = chains_of(made_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    (chain,) = chains_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     return chain
 
 
@@ -47,7 +47,7 @@ def graph() -> Graph:
 
 
 @cache
-def solved() -> LocalMap:
+def solve_drives() -> LocalMap:
     return solve_local_map(laps())
 
 
@@ -86,7 +86,7 @@ def test_few_tags_leave_room_to_those_that_are_seen_often() -> None:
 def test_a_move_is_found_to_the_passing(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gathered or not: two places, of the readings before and after."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
-    found = split_alone(solved())
+    found = split_alone(solve_drives())
     tags = found.chain.tags
     assert [(tag.tag_id, bool(tag.instance)) for tag in tags] == [
         (0, False), (1, False), (2, False), (3, True), (3, True),

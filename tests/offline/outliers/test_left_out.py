@@ -13,7 +13,7 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.left_out import read_as_another, without_tags
 from groundsbot.offline.sam.graph import Graph, build_graph
-from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
+from tests.support.data.drives import FAMILY, START_NS, S, make_drive, make_positions, make_robot, make_run
 
 PLACES = {0: np.array([3.0, 1.0]), 1: np.array([4.0, -1.0]), 2: np.array([2.0, 2.0])}
 ONCE = TagKey(FAMILY, 2)
@@ -25,7 +25,7 @@ APART = 1  # of ten pictures, the one that shows tag 1 and what is read as tag 2
 
 def _run(once_m: NDArray[np.float64]) -> Run:
     """A robot that stands before tags 0 and 1, reads them in ten pictures, and tag 2 in one, there without tag 0."""
-    drive = made_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 2.0), (0.3, 0.3, 2.0)])
+    drive = make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 2.0), (0.3, 0.3, 2.0)])
     seen = [(START_NS + (k + 1) * S // 10, i) for k in range(10) for i in (0, 1) if (k, i) != (APART, 0)]
     seen.append((START_NS + (APART + 1) * S // 10, 2))
     places = PLACES | {2: once_m}
@@ -34,8 +34,8 @@ def _run(once_m: NDArray[np.float64]) -> Run:
     xy_m = np.array([places[i] for _, i in seen]) + 0.02 * rng.standard_normal((len(seen), 2))
     xy_m[:, 0] -= moved_m
     stamps_ns = np.array([stamp for stamp, _ in seen])
-    positions = made_positions(stamps_ns, np.array([i for _, i in seen]), xy_m)
-    return made_run([drive.track], robot=made_robot(), tags=[TagKey(FAMILY, i) for i in PLACES], positions=positions)
+    positions = make_positions(stamps_ns, np.array([i for _, i in seen]), xy_m)
+    return make_run([drive.track], robot=make_robot(), tags=[TagKey(FAMILY, i) for i in PLACES], positions=positions)
 
 
 def _map(once_m: NDArray[np.float64], n_misread: int) -> LocalMap:

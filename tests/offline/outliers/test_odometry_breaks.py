@@ -15,8 +15,8 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import Grown
 from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
-from tests.support.data.broken_odometry import made_clean_drive
-from tests.support.data.drives import FAMILY, made_drive, made_positions, made_robot, made_run
+from tests.support.data.broken_odometry import make_clean_drive
+from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
 from tests.support.data.long_drives import with_a_moved_tag
 
 
@@ -49,20 +49,20 @@ def test_the_map_is_as_good_as_that_of_two_runs() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_split_where_nothing_broke(seed: int) -> None:
-    local_map = solve_local_map(made_clean_drive(seed).chain)
+    local_map = solve_local_map(make_clean_drive(seed).chain)
     mended = split_at_breaks([local_map])
     assert mended.maps == [local_map]
     assert not mended.warnings
 
 
 def test_a_tag_that_was_moved_is_no_break() -> None:
-    drive = made_clean_drive(1)
+    drive = make_clean_drive(1)
     assert find_break(solve_local_map(with_a_moved_tag(drive))) is None
 
 
 @pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
 def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
-    drive = made_clean_drive(0).chain
+    drive = make_clean_drive(0).chain
     readings = drive.readings.where(np.arange(len(where)))
     chain = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
     whole = Grown(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
@@ -76,11 +76,11 @@ PLACES = {1: (2.0, 1.0), 2: (4.0, -2.0), 3: (7.0, 1.0), 4: (8.0, 3.0), 5: (0.0, 
 ROUND = [(0.5, 0.5, 6.0), (0.4, 0.5, 3.0), (0.5, 0.3, 4.0), (0.5, 0.5, 4.0)]
 
 
-def mapped(T_moved: tuple[float, float, float]) -> MapResult:
+def map_runs(T_moved: tuple[float, float, float]) -> MapResult:
     """Drives round, is moved while its wheels stand, and drives round again; all tags are seen all the time."""
-    first = made_drive((0.0, 0.0, 0.0), [*ROUND, (0.0, 0.0, 2.0)], step_ns=100_000_000)
+    first = make_drive((0.0, 0.0, 0.0), [*ROUND, (0.0, 0.0, 2.0)], step_ns=100_000_000)
     T_world_again = se2.compose(first.T_world_base[-1], np.array(T_moved))
-    second = made_drive(T_world_again.tolist(), [(0.0, 0.0, 2.0), *ROUND], step_ns=100_000_000)
+    second = make_drive(T_world_again.tolist(), [(0.0, 0.0, 2.0), *ROUND], step_ns=100_000_000)
     shift = first.stamps_ns[-1] - second.stamps_ns[0]
     stamps_ns = np.concatenate([first.stamps_ns, second.stamps_ns[1:] + shift])
     left_m, right_m = (
@@ -90,18 +90,18 @@ def mapped(T_moved: tuple[float, float, float]) -> MapResult:
     poses = np.concatenate([first.T_world_base, second.T_world_base[1:]])
     at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(stamps_ns) : 3, 0 : len(PLACES)])
     seen = se2.apply(se2.inverse(poses[at]), np.array(list(PLACES.values()))[tag])
-    run = made_run(
+    run = make_run(
         [WheelTrack(stamps_ns, left_m, right_m)],
-        robot=made_robot("carl"),
+        robot=make_robot("carl"),
         tags=[TagKey(FAMILY, key) for key in PLACES],
-        positions=made_positions(stamps_ns[at], tag, seen),
+        positions=make_positions(stamps_ns[at], tag, seen),
     )
     return build_map([run])
 
 
 @pytest.mark.parametrize("T_moved", [(0.0, 0.0, np.pi / 2), (-1.6, 1.2, 0.0)])
 def test_a_robot_carried_while_its_wheels_stand_becomes_two_stretches(T_moved: tuple[float, float, float]) -> None:
-    result = mapped(T_moved)
+    result = map_runs(T_moved)
     (component,) = result.components
     assert [(run.name, run.run) for run in component.runs] == [
         ("carl_one", "carl_one"),
@@ -121,11 +121,11 @@ def test_a_robot_carried_while_its_wheels_stand_becomes_two_stretches(T_moved: t
 
 
 def test_a_robot_that_was_not_moved_stays_one() -> None:
-    assert [run.name for run in mapped((0.0, 0.0, 0.0)).runs] == ["carl_one"]
+    assert [run.name for run in map_runs((0.0, 0.0, 0.0)).runs] == ["carl_one"]
 
 
 def test_stretches_of_several_runs_keep_their_names() -> None:
     one, other = (
-        solve_local_map(replace(made_clean_drive(seed).chain.prefix(200), name=f"r{seed}")) for seed in (0, 1)
+        solve_local_map(replace(make_clean_drive(seed).chain.prefix(200), name=f"r{seed}")) for seed in (0, 1)
     )
     assert [each.chain.name for each in split_at_breaks([one, other]).maps] == ["r0", "r1"]

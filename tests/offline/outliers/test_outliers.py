@@ -32,8 +32,8 @@ from groundsbot.offline.outliers.sightings import Sightings, instances, sighting
 from groundsbot.offline.sam.arrowhead import covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
-from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
-from tests.support.data.moved_tags import gain_of, made_scene
+from tests.support.data.drives import FAMILY, START_NS, S, make_drive, make_positions, make_robot, make_run
+from tests.support.data.moved_tags import gain_of, make_scene
 
 HALL = {i: np.array([2.0 * i, 3.0 * (-1) ** i + 0.3 * i]) for i in range(8)}
 STARTS = {"a": [0.0, 0.0, 0.0], "b": [5.0, 1.0, 2.0], "c": [9.0, -1.0, -3.0], "d": [4.0, 0.0, 1.0]}
@@ -42,9 +42,9 @@ SIGMA_M = 0.05
 NOISE = NoiseParameters()
 
 
-def stood(name: str, places: dict[int, FloatArray], seed: int = 0, hours: int = 0) -> Run:
+def observe_at(name: str, places: dict[int, FloatArray], seed: int = 0, hours: int = 0) -> Run:
     """A robot that sees each tag once from where it stands, with noise, and then drives on a little."""
-    drive = made_drive(STARTS[name], [(0.5, 0.5, 1.0)])
+    drive = make_drive(STARTS[name], [(0.5, 0.5, 1.0)])
     late_ns = 3600 * S * hours
     track = replace(drive.track, stamps_ns=drive.stamps_ns + late_ns)
     ids = sorted(places)
@@ -52,14 +52,14 @@ def stood(name: str, places: dict[int, FloatArray], seed: int = 0, hours: int = 
     turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     noise = SIGMA_M * np.random.default_rng([seed, hours]).standard_normal((len(ids), 2))
     seen = np.array([(places[i] - [x, y]) @ turn for i in ids]) + noise
-    positions = made_positions(np.full(len(ids), START_NS + late_ns), np.arange(len(ids)), seen, SIGMA_M)
+    positions = make_positions(np.full(len(ids), START_NS + late_ns), np.arange(len(ids)), seen, SIGMA_M)
     tags = [TagKey(FAMILY, i) for i in ids]
-    return made_run([track], robot=made_robot(name), tags=tags, positions=positions)
+    return make_run([track], robot=make_robot(name), tags=tags, positions=positions)
 
 
-def mapped(*halls: dict[int, FloatArray], keep_suspects: bool = False) -> MapResult:
+def map_runs(*halls: dict[int, FloatArray], keep_suspects: bool = False) -> MapResult:
     """One run after the other, each in a hall of its own."""
-    runs = [stood(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
+    runs = [observe_at(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
     return build_map(runs, keep_suspects=keep_suspects)
 
 
@@ -68,13 +68,13 @@ SWAPPED = {3: HALL[4], 4: HALL[3]}
 
 
 def test_a_hall_as_it_was_has_no_suspects() -> None:
-    result = mapped({}, {}, {}, {})
+    result = map_runs({}, {}, {}, {})
     assert result.suspects == ()
     assert all(tag.instance == "" for tag in result.components[0].tags)
 
 
 def test_a_moved_tag_is_named_and_has_two_places() -> None:
-    result = mapped({}, {}, MOVED, MOVED)
+    result = map_runs({}, {}, MOVED, MOVED)
     (suspect,) = result.suspects
     assert (suspect.tag_id, suspect.kind, suspect.runs) == (3, "moved", ("c_one", "d_one"))
     assert "by 1.0" in suspect.evidence
@@ -87,14 +87,14 @@ def test_a_moved_tag_is_named_and_has_two_places() -> None:
 
 
 def test_suspects_can_be_kept(tmp_path: Path) -> None:
-    result = mapped({}, {}, MOVED, MOVED, keep_suspects=True)
+    result = map_runs({}, {}, MOVED, MOVED, keep_suspects=True)
     assert [each.kind for each in result.suspects] == ["moved"]
     assert [tag.instance for tag in result.components[0].tags if tag.tag_id == 3] == [""]
     assert any(line.startswith("suspect: tag 3 (tag36h11) moved: by") for line in summary(result, tmp_path))
 
 
 def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
-    result = mapped({}, {}, SWAPPED, SWAPPED)
+    result = map_runs({}, {}, SWAPPED, SWAPPED)
     assert [(each.tag_id, each.kind, each.swapped_with) for each in result.suspects] == [
         (3, "swapped", 4),
         (4, "swapped", 3),
@@ -110,7 +110,7 @@ def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
 
 def test_there_and_back_is_two_tags_with_one_id() -> None:
     far = {3: HALL[3] + [4.0, -2.5]}
-    (suspect,) = mapped({}, far, {}, far).suspects
+    (suspect,) = map_runs({}, far, {}, far).suspects
     assert (suspect.tag_id, suspect.kind) == (3, "duplicated")
     assert suspect.runs == ("a_one", "b_one", "c_one", "d_one")
 
@@ -118,21 +118,21 @@ def test_there_and_back_is_two_tags_with_one_id() -> None:
 def test_a_run_that_has_most_of_its_tags_elsewhere_is_wrong_itself() -> None:
     angle = np.linspace(0.0, 6.0, 5)
     shifted = {i: HALL[i] + 1.5 * np.array([np.cos(angle[i]), np.sin(angle[i])]) for i in range(5)}
-    suspects = mapped({}, {}, shifted, {}).suspects
+    suspects = map_runs({}, {}, shifted, {}).suspects
     assert {(each.tag_id, each.kind, each.runs) for each in suspects} == {
         (i, "inconsistent", ("c_one",)) for i in range(5)
     }
     assert "c_one has this tag and 4 more" in suspects[0].evidence
-    assert "swapped_with" not in map_as_json(mapped({}, {}, MOVED, MOVED))["suspect_tags"][0]
+    assert "swapped_with" not in map_as_json(map_runs({}, {}, MOVED, MOVED))["suspect_tags"][0]
 
 
 @cache
 def local_maps() -> tuple[LocalMap, ...]:
-    return tuple(solve_local_map(drive.chain) for drive in made_scene(31).drives)
+    return tuple(solve_local_map(drive.chain) for drive in make_scene(31).drives)
 
 
 @cache
-def searched() -> Searched:
+def search() -> Searched:
     maps = local_maps()
     graph, solution = solve_global_map(maps, merge(maps).groups[0], Stages())
     found = split_together(graph, solution, maps)
@@ -143,7 +143,7 @@ def searched() -> Searched:
 @pytest.mark.parametrize("which", [0, 7, 30])
 def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
-    seen = searched()
+    seen = search()
     own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
     plain = linearise_observations(seen.graph, seen.solution.state, np.ones((4, 2)))
     bare = marginalise(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
@@ -161,7 +161,7 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
 
 def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few tags keep Z with its zeros, fleets without: blocks, sums and what gives way are the same by dense algebra."""
-    seen = searched()
+    seen = search()
     information = seen.evidence.information
     n = len(seen.evidence.score)
     whole = information.times(np.eye(n))
@@ -189,7 +189,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
 
 
 def test_all_splits_of_a_place_are_weighed_at_once() -> None:
-    places = searched().places
+    places = search().places
     held = next(each for each in places.tracks if len(each.members) > 3)
     masks = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
     masks = np.pad(masks, ((0, 0), (0, len(held.members) - 4)))
@@ -198,7 +198,7 @@ def test_all_splits_of_a_place_are_weighed_at_once() -> None:
 
 
 def test_sightings_end_where_a_tag_is_out_of_sight() -> None:
-    seen = searched()
+    seen = search()
     for s in range(len(seen.sightings)):
         readings = np.flatnonzero(seen.sightings.of_reading == s)
         assert len(readings) == seen.sightings.n_readings[s]
@@ -220,9 +220,9 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
     assert found[-1] > 0.05
 
 
-def _searched_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> Searched:
+def _search_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> Searched:
     """One run after the other, whose noise was fitted or not, solved together and searched."""
-    runs = [stood(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
+    runs = [observe_at(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
     maps = [replace(solve_local_map(chain), is_noisy=is_noisy) for run in runs for chain in chains_of(run, NOISE)]
     merged = merge(maps)
     maps = with_outliers_apart(maps, merged)
@@ -238,12 +238,12 @@ def test_places_within_sight_of_each_other_are_one_where_noise_was_fitted(
     off_m: float, is_noisy: bool, n_places: int
 ) -> None:
     there = {3: HALL[3] + [off_m, 0.0]}
-    found = _searched_as([{}, there, {}, there], is_noisy=is_noisy)
+    found = _search_as([{}, there, {}, there], is_noisy=is_noisy)
     assert sum(tag.whole.tag_id == 3 for tag in found.graph.tags) == n_places
 
 
 def test_a_tag_that_two_alignments_doubt_and_others_join_keeps_its_name() -> None:
-    maps = [solve_local_map(chain) for hall in NAMES[:3] for chain in chains_of(stood(hall, HALL), NOISE)]
+    maps = [solve_local_map(chain) for hall in NAMES[:3] for chain in chains_of(observe_at(hall, HALL), NOISE)]
     merged = merge(maps)
     tag = TagKey(FAMILY, 3)
 

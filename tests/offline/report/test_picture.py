@@ -14,7 +14,7 @@ from matplotlib.patches import Ellipse
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.report.label_places import place_labels
 from groundsbot.offline.report.picture import draw_map, write_picture
-from tests.support.data.maps import START_B, made_component, made_map, made_run
+from tests.support.data.maps import START_B, make_component, make_map, make_run
 
 
 def texts_of(result: MapResult) -> list[str]:
@@ -28,7 +28,7 @@ def with_sigma(component: Component, sigma_x_m: float, sigma_y_m: float) -> Comp
 
 def test_the_file_is_a_picture_1600_pixels_wide_and_always_the_same(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
-        write_picture(made_map(), tmp_path / name)
+        write_picture(make_map(), tmp_path / name)
     image = cv2.imread(str(tmp_path / "a.png"))
     assert image is not None
     assert image.shape[1] == 1600
@@ -38,7 +38,7 @@ def test_the_file_is_a_picture_1600_pixels_wide_and_always_the_same(tmp_path: Pa
 
 
 def test_trajectories_starts_and_tags_are_drawn_where_they_are() -> None:
-    result = made_map()
+    result = make_map()
     (axes,) = draw_map(result).axes
     drawn = [np.asarray(line.get_xydata()) for line in axes.lines]
     squares = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "s"]
@@ -50,7 +50,7 @@ def test_trajectories_starts_and_tags_are_drawn_where_they_are() -> None:
 
 
 def test_both_axes_have_the_same_scale() -> None:
-    (axes,) = draw_map(made_map()).axes
+    (axes,) = draw_map(make_map()).axes
     one = axes.transData.transform([(0, 0), (1, 0), (0, 1)])
     assert np.linalg.norm(one[1] - one[0]) == pytest.approx(np.linalg.norm(one[2] - one[0]))
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x in m", "y in m")
@@ -58,7 +58,7 @@ def test_both_axes_have_the_same_scale() -> None:
 
 @pytest.mark.parametrize(("sigmas", "factor"), [((0.3, 0.1), 1), ((0.004, 0.001), 20)])
 def test_ellipses_are_one_sigma_or_say_how_much_larger(sigmas: tuple[float, float], factor: int) -> None:
-    figure = draw_map(made_map(with_sigma(made_component(), *sigmas)))
+    figure = draw_map(make_map(with_sigma(make_component(), *sigmas)))
     ellipses = [patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)]
     assert len(ellipses) == 3
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -71,17 +71,17 @@ def test_ellipses_are_one_sigma_or_say_how_much_larger(sigmas: tuple[float, floa
 
 
 def test_an_ellipse_leans_as_its_covariance_does() -> None:
-    component = made_component()
+    component = make_component()
     covariance = np.array([[0.05, 0.03], [0.03, 0.05]])  # long axis at 45 degrees, variances 0.08 and 0.02
     tags = tuple(replace(tag, covariance=covariance) for tag in component.tags)
-    axes = draw_map(made_map(replace(component, tags=tags))).axes[0]
+    axes = draw_map(make_map(replace(component, tags=tags))).axes[0]
     ellipse = next(patch for patch in axes.patches if isinstance(patch, Ellipse))
     assert ellipse.angle % 180 == pytest.approx(45)
     assert ellipse.width / ellipse.height == pytest.approx(2)
 
 
 def test_runs_have_colours_and_shared_tags_another() -> None:
-    figure = draw_map(made_map())
+    figure = draw_map(make_map())
     lines = [line for line in figure.axes[0].lines if len(np.asarray(line.get_xydata())) == 20]
     colours = {to_rgb(line.get_color()) for line in lines}
     assert len(colours) == 2
@@ -94,44 +94,44 @@ def test_runs_have_colours_and_shared_tags_another() -> None:
 
 
 def test_the_title_has_the_figures() -> None:
-    suptitle = draw_map(made_map()).get_suptitle()
+    suptitle = draw_map(make_map()).get_suptitle()
     assert "3 tags, 2 runs, 4 m driven" in suptitle
     assert "start to start 10.20 m" in suptitle
 
 
 def test_ids_are_bare_where_there_is_one_family() -> None:
-    component = made_component()
+    component = make_component()
     rows = np.r_[0:10]
     one_family = replace(
         component, tags=component.tags[:2], joint_covariance=component.joint_covariance[np.ix_(rows, rows)]
     )
-    assert sorted(texts_of(made_map(one_family))) == ["3", "7"]
+    assert sorted(texts_of(make_map(one_family))) == ["3", "7"]
 
 
 def test_components_are_panels_of_their_own() -> None:
-    figure = draw_map(made_map(made_component(), made_component("green_one", "grey_two")))
+    figure = draw_map(make_map(make_component(), make_component("green_one", "grey_two")))
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
         "component 1: 3 tags, from the start of red_one",
         "component 2: 3 tags, from the start of green_one",
     ]
     assert "in 2 components" in figure.get_suptitle()
-    many = made_map(*(made_component(f"a_{k}", f"b_{k}") for k in range(8)))
+    many = make_map(*(make_component(f"a_{k}", f"b_{k}") for k in range(8)))
     assert len(draw_map(many).axes) == 6
     assert "the 6 largest drawn" in draw_map(many).get_suptitle()
 
 
 def test_a_run_that_never_moved_and_saw_nothing_can_be_drawn() -> None:
-    run = made_run("red_one", np.zeros(3), np.zeros((3, 3)), n=1)
+    run = make_run("red_one", np.zeros(3), np.zeros((3, 3)), n=1)
     component = Component("red_one", (run,), (), np.zeros((3, 3)), 0.0, 0)
-    figure = draw_map(made_map(component))
+    figure = draw_map(make_map(component))
     assert "0 tags, 1 run, 0 m driven" in figure.get_suptitle()
 
 
 def test_stretches_look_alike_and_count_as_one_run() -> None:
-    component = made_component()
+    component = make_component()
     stretch = replace(component.runs[1], name="blue_two_stretch2", T_map_start=START_B + np.array([5.0, 0.0, 0.0]))
-    figure = draw_map(made_map(replace(component, runs=(*component.runs, stretch))))
+    figure = draw_map(make_map(replace(component, runs=(*component.runs, stretch))))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "blue_two: 3.8 m, 3 tags, 2 stretches" in labels
     assert "2 runs" in figure.get_suptitle()

@@ -21,7 +21,7 @@ from groundsbot.offline.report.report import write_report
 from groundsbot.offline.report.sentences import _metres, sentences
 from groundsbot.offline.report.tables import tables
 from tests.support.browser import Page, browser, chromium
-from tests.support.data.drives import START_NS, S, made_robot, write_drive
+from tests.support.data.drives import START_NS, S, make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
 from tests.support.report_reader import Read, data_of
 
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def logs(folder: Path) -> list[Path]:
     return [
-        write_drive(folder / "logs", drive, TAGS, made_robot(name), corner_sigma_px=0.3, seed=i)
+        write_drive(folder / "logs", drive, TAGS, make_robot(name), corner_sigma_px=0.3, seed=i)
         for i, (name, drive) in enumerate(DRIVES.items())
     ]
 
@@ -58,7 +58,7 @@ def inside(logs: list[Path]) -> Inside:
     return build_map(read_runs(logs), workings=workings), workings
 
 
-def written(inside: Inside, folder: Path) -> Read:
+def write_file(inside: Inside, folder: Path) -> Read:
     write_report(*inside, folder / "report.html")
     return Read((folder / "report.html").read_text())
 
@@ -209,7 +209,7 @@ def test_nothing_is_fetched(made: Path) -> None:
 
 def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
     workings = Workings()
-    read = written((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
+    read = write_file((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
     assert read.words[0].startswith("One run, a_one, drove ")
     assert read.words[0].endswith("nothing was to be joined.")
     assert "before" not in {attributes.get("id") for _, attributes in read.elements}
@@ -218,18 +218,18 @@ def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
 
 
 def test_a_run_without_tags(tmp_path: Path) -> None:
-    log = write_drive(tmp_path / "logs", DRIVES["a"], [], made_robot("a"))
+    log = write_drive(tmp_path / "logs", DRIVES["a"], [], make_robot("a"))
     workings = Workings()
-    read = written((build_map(read_runs([log]), workings=workings), workings), tmp_path)
+    read = write_file((build_map(read_runs([log]), workings=workings), workings), tmp_path)
     assert "It places no tag, so that nothing corrects what the wheels say." in read.words
     assert data_of(tmp_path / "report.html")["components"][0]["tags"] == []
 
 
 def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
-    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, made_robot("c"))
+    alone = write_drive(tmp_path / "logs", DRIVES["a"], far, make_robot("c"))
     workings = Workings()
-    read = written((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
+    read = write_file((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
     assert "3 runs" in read.words[0]
     assert "fall into 2 components" in read.words[0]
     assert "the largest holds 2 runs and 4 tags" in read.words[0]

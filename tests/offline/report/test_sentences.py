@@ -9,15 +9,15 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.join_tables import essential_tags
 from groundsbot.offline.report.sentences import largest_sigma_m, sentences
 from groundsbot.offline.report.tables import tables
-from tests.support.data.maps import made_component, made_map
+from tests.support.data.maps import make_component, make_map
 
 
 def words_of(**changes: Any) -> str:
-    return " ".join(sentences(map_as_json(made_map()) | changes))
+    return " ".join(sentences(map_as_json(make_map()) | changes))
 
 
 def test_doubts_are_said() -> None:
-    document = map_as_json(made_map())
+    document = map_as_json(make_map())
     calm = words_of(warnings=[])
     assert "Nothing in it contradicts anything else" in calm
     assert "comes with 1 warning" in words_of()
@@ -36,15 +36,15 @@ def test_doubts_are_said() -> None:
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:
-    runs = map_as_json(made_map())["runs"]
+    runs = map_as_json(make_map())["runs"]
     parted = [*runs, runs[1] | {"run": "blue_two_stretch2", "stretch_of": "blue_two"}]
     assert "2 runs (red_one and blue_two; " in words_of(runs=parted)
 
 
 def test_unknown_numbers_are_not_said() -> None:
-    unknown = replace(made_component(), joint_covariance=np.full((12, 12), np.nan))
+    unknown = replace(make_component(), joint_covariance=np.full((12, 12), np.nan))
     tags = tuple(replace(tag, covariance=np.full((2, 2), np.nan)) for tag in unknown.tags)
-    document = map_as_json(made_map(replace(unknown, tags=tags)))
+    document = map_as_json(make_map(replace(unknown, tags=tags)))
     assert largest_sigma_m(document["tags"][0]["covariance"]) is None
     assert "nan" not in " ".join(sentences(document))
     (shown,) = [table for table in tables(document) if table.key == "tags"]
@@ -52,14 +52,14 @@ def test_unknown_numbers_are_not_said() -> None:
 
 
 def test_tags_without_which_runs_fall_apart() -> None:
-    document = map_as_json(made_map())
+    document = map_as_json(make_map())
     assert [tag["tag_id"] for tag in essential_tags(document, 0)] == [7, 3]
     more = [tag | {"runs": ["red_one", "blue_two"]} for tag in document["tags"]]
     assert essential_tags(document | {"tags": more}, 0) == []
 
 
 def test_fitted_noise_is_told() -> None:
-    document = map_as_json(made_map())
+    document = map_as_json(make_map())
     parameters = [
         {"name": "sigma_corner_px", "value": 0.31, "low": 0.28, "high": 0.35, "redundancy": 200.0, "kept": ""},
         {"name": "sigma_range_m", "value": 0.02, "low": None, "high": None, "redundancy": 0.0, "kept": "no reading"},

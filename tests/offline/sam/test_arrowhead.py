@@ -14,7 +14,7 @@ from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, Sta
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.support.data.graphs import made_graph, with_measured
+from tests.support.data.graphs import make_graph, with_measured
 
 LOSSES = (SQUARES, huber(1.5))
 
@@ -60,7 +60,7 @@ def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Los
     return hessian, gradient
 
 
-def allowed(condition: float) -> float:
+def tolerance(condition: float) -> float:
     return 1e-9 if condition < 1e6 else 100.0 * np.finfo(float).eps * condition
 
 
@@ -89,7 +89,7 @@ def test_steps_and_covariances_equal_dense_algebra(
     damping: float,
     n_measured: int,
 ) -> None:
-    problem, truth = made_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held)
+    problem, truth = make_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held)
     problem = with_measured(problem, truth, seed, n_measured)
     H, g = dense(problem, truth, odometry_loss, reading_loss)
     H += damping * np.diag(H.diagonal())
@@ -101,26 +101,26 @@ def test_steps_and_covariances_equal_dense_algebra(
     system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, reading_loss)
     factorisation = arrowhead_of(problem).factorise(system, damping)
     step, expected = factorisation.solve(g), np.linalg.solve(H, g)
-    assert np.linalg.norm(step - expected) <= allowed(condition) * np.linalg.norm(expected)
+    assert np.linalg.norm(step - expected) <= tolerance(condition) * np.linalg.norm(expected)
     several = factorisation.solve_many(np.column_stack([g, np.roll(g, 1), -g]))
     for one, column in zip(several.T, (g, np.roll(g, 1), -g), strict=True):
         alone = factorisation.solve(column)
-        assert np.linalg.norm(one - alone) <= allowed(condition) * np.linalg.norm(alone)
+        assert np.linalg.norm(one - alone) <= tolerance(condition) * np.linalg.norm(alone)
     wanted = np.random.default_rng(seed).permutation(len(g))[:40]
     inverse = np.linalg.inv(H)
     covariance = inverse[np.ix_(wanted, wanted)]
     sigma = np.sqrt(covariance.diagonal())
     found = factorisation.covariance(wanted)
-    assert (np.abs(found - covariance) / np.outer(sigma, sigma)).max() <= allowed(condition)
+    assert (np.abs(found - covariance) / np.outer(sigma, sigma)).max() <= tolerance(condition)
     columns = problem.columns.poses
     for own, marginal in zip(columns, factorisation.pose_covariances(np.arange(len(columns))), strict=True):
         expected = np.where(np.minimum.outer(own, own) >= 0, inverse[np.ix_(own, own)], 0.0)
         sigma = np.sqrt(np.where(own >= 0, expected.diagonal(), 1.0))
-        assert (np.abs(marginal - expected) / np.outer(sigma, sigma)).max() <= allowed(condition)
+        assert (np.abs(marginal - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
 
 
 def test_long_chains_pass_through_all_levels() -> None:
-    problem, truth = made_graph(4, [700, 40], 30, reach=0.04)
+    problem, truth = make_graph(4, [700, 40], 30, reach=0.04)
     H, g = plain_normal_equations(problem, truth, DEFAULT_LOSSES)
     arrowhead = arrowhead_of(problem)
     assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == {1, 2, 3}
@@ -136,7 +136,7 @@ def test_long_chains_pass_through_all_levels() -> None:
     sigma = np.sqrt(np.where(wanted >= 0, expected.diagonal(), 1.0))
     factorisation, condition = arrowhead.factorise(system), float(np.linalg.cond(H.toarray()))
     found = factorisation.covariance(wanted)
-    assert (np.abs(found - expected) / np.outer(sigma, sigma)).max() <= allowed(condition)
+    assert (np.abs(found - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
     # Of poses alone, all at once or some: in leaves, between them, at a cut of each level, in either chain.
     poses = np.r_[739:0:-7, 0]
     inverse = np.linalg.inv(H.toarray())
@@ -145,7 +145,7 @@ def test_long_chains_pass_through_all_levels() -> None:
     for pose, marginal in zip(poses[:-1], some, strict=False):
         own = problem.columns.poses[pose]
         sigma = np.sqrt(inverse[own, own])
-        assert (np.abs(marginal - inverse[np.ix_(own, own)]) / np.outer(sigma, sigma)).max() <= allowed(condition)
+        assert (np.abs(marginal - inverse[np.ix_(own, own)]) / np.outer(sigma, sigma)).max() <= tolerance(condition)
     assert not some[-1].any()
 
 
@@ -153,7 +153,7 @@ def test_long_chains_pass_through_all_levels() -> None:
 @settings(max_examples=20, deadline=None)
 def test_gradient_is_the_costs_derivative(seed: int, loss: Loss) -> None:
     """Far from the optimum too: residuals, Jacobians and losses belong together."""
-    problem, truth = made_graph(seed, [20, 9], 4)
+    problem, truth = make_graph(seed, [20, 9], 4)
     rng = np.random.default_rng(seed)
     start = problem.retract(truth, 0.1 * rng.standard_normal(problem.columns.n))
     arrowhead = arrowhead_of(problem)
@@ -168,7 +168,7 @@ def test_gradient_is_the_costs_derivative(seed: int, loss: Loss) -> None:
 @given(seed=st.integers(0, 1000), lengths=st.lists(st.integers(1, 2000), min_size=1, max_size=4))
 @settings(max_examples=10, deadline=None)
 def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
-    problem, _ = made_graph(seed, lengths, 5, reach=0.02)
+    problem, _ = make_graph(seed, lengths, 5, reach=0.02)
     tree = arrowhead_of(problem).tree
     in_leaves = [
         np.arange(3 * tree.first[node], 3 * tree.end[node]) for node in np.flatnonzero(tree.level == 0).tolist()
@@ -179,7 +179,7 @@ def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
 
 
 def test_what_nothing_ties_down_is_named() -> None:
-    problem, truth = made_graph(1, [50, 50], 3)
+    problem, truth = make_graph(1, [50, 50], 3)
     loose = problem.columns.tags[2, 0]
     arrowhead = arrowhead_of(problem)
     system, _ = arrowhead.linearise(truth)
@@ -194,7 +194,7 @@ def test_what_nothing_ties_down_is_named() -> None:
 @given(seed=st.integers(0, 10**6), lengths=st.lists(st.integers(1, 40), min_size=1, max_size=4))
 @settings(max_examples=10, deadline=None)
 def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
-    problem, truth = made_graph(seed, lengths, 4)
+    problem, truth = make_graph(seed, lengths, 4)
     problem = with_measured(problem, truth, seed, 3)
     H, g = dense(problem, truth, SQUARES, SQUARES)
     arrowhead = arrowhead_of(problem)
@@ -208,7 +208,7 @@ def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
 
 
 def test_a_distance_from_the_middle_of_a_chain_is_refused() -> None:
-    problem, truth = made_graph(3, [20], 3)
+    problem, truth = make_graph(3, [20], 3)
     problem = with_measured(problem, truth, 3, 1)
     distances = replace(problem.measured.distances, pose_a=np.array([5]), tag_a=np.array([-1]))
     with pytest.raises(ValueError, match="first pose of a chain"):

@@ -11,8 +11,8 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, huber
 from groundsbot.offline.sam.solver import Losses, Problem, solve
-from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, made_fleet
-from tests.support.data.graphs import made_graph, reordered
+from tests.benchmarks.speed.solver_world import SIGMA_START, Fleet, make_fleet
+from tests.support.data.graphs import make_graph, reorder
 
 PLAIN = Losses(SQUARES, SQUARES)
 
@@ -25,7 +25,7 @@ def our_start(fleet: Fleet) -> State:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_long_drives_end_in_the_optimum_that_is_reached_from_the_truth(seed: int) -> None:
-    fleet = made_fleet(seed, 3, 3000, 60)
+    fleet = make_fleet(seed, 3, 3000, 60)
     found = solve(fleet.problem, our_start(fleet), losses=PLAIN, relaxed_steps=2)
     best = solve(fleet.problem, fleet.truth, losses=PLAIN)
     assert found.converged
@@ -35,7 +35,7 @@ def test_long_drives_end_in_the_optimum_that_is_reached_from_the_truth(seed: int
 
 
 def test_start_is_nearer_than_dead_reckoning() -> None:
-    fleet = made_fleet(7, 2, 4000, 60)
+    fleet = make_fleet(7, 2, 4000, 60)
     start = our_start(fleet)
     error, before = (
         float(np.median(np.linalg.norm(state.tags - fleet.truth.tags, axis=1)))
@@ -45,7 +45,7 @@ def test_start_is_nearer_than_dead_reckoning() -> None:
 
 
 def test_costs_fall_and_the_reason_is_given() -> None:
-    fleet = made_fleet(2, 2, 500, 30)
+    fleet = make_fleet(2, 2, 500, 30)
     found = solve(fleet.problem, our_start(fleet), losses=PLAIN)
     assert found.reason == "converged"
     assert all(after < before for before, after in zip(found.costs, found.costs[1:], strict=False))
@@ -57,10 +57,10 @@ def test_costs_fall_and_the_reason_is_given() -> None:
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=8, deadline=None)
 def test_order_of_readings_does_not_matter(seed: int) -> None:
-    fleet = made_fleet(seed, 2, 400, 12)
+    fleet = make_fleet(seed, 2, 400, 12)
     problem, truth = fleet.problem, fleet.truth
     one = solve(problem, truth)
-    other = solve(reordered(problem, np.random.default_rng(seed)), truth)
+    other = solve(reorder(problem, np.random.default_rng(seed)), truth)
     np.testing.assert_allclose(other.state.tags, one.state.tags, atol=1e-6)
     np.testing.assert_allclose(se2.between(one.state.poses, other.state.poses), 0.0, atol=1e-6)
 
@@ -68,7 +68,7 @@ def test_order_of_readings_does_not_matter(seed: int) -> None:
 @given(seed=st.integers(0, 10**6), turn=st.floats(-3.0, 3.0))
 @settings(max_examples=8, deadline=None)
 def test_frame_does_not_matter(seed: int, turn: float) -> None:
-    fleet = made_fleet(seed, 2, 400, 12)
+    fleet = make_fleet(seed, 2, 400, 12)
     problem, truth = fleet.problem, fleet.truth
     T = np.array([30.0, -12.0, turn])
     moved = State(se2.compose(T, truth.poses), se2.apply(T, truth.tags), truth.calibration)
@@ -78,7 +78,7 @@ def test_frame_does_not_matter(seed: int, turn: float) -> None:
 
 
 def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
-    problem, truth = made_graph(3, [40, 40], 3, calibrated=False)
+    problem, truth = make_graph(3, [40, 40], 3, calibrated=False)
     only_first = problem.readings.pose < 40
     readings = replace(
         problem.readings,
@@ -94,7 +94,7 @@ def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
 
 
 def test_hubers_loss_bounds_what_a_wrong_reading_does() -> None:
-    fleet = made_fleet(5, 1, 400, 20)
+    fleet = make_fleet(5, 1, 400, 20)
     value = fleet.problem.readings.value.copy()
     value[::25, 0] += 1.5
     wrong = replace(fleet.problem, readings=replace(fleet.problem.readings, value=value))
@@ -105,9 +105,9 @@ def test_hubers_loss_bounds_what_a_wrong_reading_does() -> None:
 
 
 def test_other_weights_on_the_same_factors_solve_like_a_new_problem() -> None:
-    problem, truth = made_graph(6, [60, 40], 6, calibrated=True)
+    problem, truth = make_graph(6, [60, 40], 6, calibrated=True)
     rng = np.random.default_rng(0)
-    problem = reordered(problem, rng)
+    problem = reorder(problem, rng)
     odometry = problem.odometry.whitening * rng.uniform(0.5, 2.0, (len(problem.odometry.first), 1, 1))
     readings = problem.readings.whitening * rng.uniform(0.5, 2.0, (len(problem.readings.tag), 1, 1))
     anew = replace(

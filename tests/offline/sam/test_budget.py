@@ -20,15 +20,15 @@ from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
-from tests.support.data.long_drives import made_long_drive, made_town
-from tests.support.hostile.logs import MS, observed, resets
+from tests.support.data.long_drives import make_long_drive, make_town
+from tests.support.hostile.logs import MS, observe, resets
 
 # As few as noise can be packed into.
 BYTES_A_LOOK = 50
 BYTES_A_READING = 12
 
 
-def written(data: bytes, folder: Path) -> Path:
+def write_file(data: bytes, folder: Path) -> Path:
     path = folder / "made.mcap"
     path.write_bytes(data)
     return path
@@ -42,28 +42,28 @@ def refusal(log: Path) -> str:
 
 
 def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
-    line = refusal(written(observed(652), tmp_path))
+    line = refusal(write_file(observe(652), tmp_path))
     assert line.endswith(
         "made.mcap: 653 different tags, limit 652 (as many as all families have); are their numbers right?"
     )
-    assert len(load_run(written(observed(651), tmp_path)).tags) == 652
+    assert len(load_run(write_file(observe(651), tmp_path)).tags) == 652
 
 
 @pytest.mark.parametrize(("size_bytes", "most"), [(1 << 18, 17), (1 << 20, 25), (1 << 22, 40)])
 def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_refused(
     tmp_path: Path, size_bytes: int, most: int
 ) -> None:
-    log = written(resets(most + 2, 1, size_bytes=size_bytes), tmp_path)
+    log = write_file(resets(most + 2, 1, size_bytes=size_bytes), tmp_path)
     line = refusal(log)
     assert "made.mcap" in line
     assert f"restarted {most + 1} times, limit {most} for a log of {log.stat().st_size} bytes" in line
-    assert len(load_run(written(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).stretches) == most + 1
+    assert len(load_run(write_file(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).stretches) == most + 1
 
 
 def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = written(observed(4000, 10), tmp_path)
+    log = write_file(observe(4000, 10), tmp_path)
     assert len(load_run(log).positions.tag) == 8000
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_READINGS", 0)
     most = log.stat().st_size // 10
@@ -98,7 +98,7 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
 ) -> None:
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._BYTES_TO_USE", 64)
-    log = written(observed(2000, 10), tmp_path)
+    log = write_file(observe(2000, 10), tmp_path)
     size = log.stat().st_size
     every = -(-4000 // (size // 64))
     assert every > 1
@@ -117,14 +117,14 @@ def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
 ) -> None:
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._BYTES_TO_USE", 64)
-    run = load_run(written(resets(1, 3, 500), tmp_path))
+    run = load_run(write_file(resets(1, 3, 500), tmp_path))
     assert 0 < len(run.picture_stamps_ns) < 500
     assert len(run.detections.tag) == 3 * len(run.picture_stamps_ns)
     assert set(run.detections.stamps_ns) == set(run.picture_stamps_ns)
 
 
 def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
-    (chain,) = chains_of(load_run(written(observed(80, 650, 100), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(write_file(observe(80, 650, 100), tmp_path)), NoiseParameters())
     with pytest.raises(OfflineError) as refused:
         solve_local_map(chain)
     (line,) = str(refused.value).splitlines()
@@ -133,7 +133,7 @@ def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_pat
 
 
 def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
-    run = load_run(written(resets(3, 400, size_bytes=1_010_000), tmp_path))
+    run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
     effort = Effort.of_log(run.log_bytes)
     first, second, third = chains_of(run, NoiseParameters())
     for chain in (first, second):
@@ -143,7 +143,7 @@ def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp
 
 
 def test_stretches_share_what_their_log_is_worth() -> None:
-    chain = made_long_drive(4, 100.0).chain
+    chain = make_long_drive(4, 100.0).chain
     work = step_work(build_graph([chain]).problem)
     effort = Effort.of_log(0)
     effort.allowed = 2.5 * 30 * work
@@ -154,7 +154,7 @@ def test_stretches_share_what_their_log_is_worth() -> None:
 
 
 def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
-    run = load_run(written(resets(3, 10, 20), tmp_path))
+    run = load_run(write_file(resets(3, 10, 20), tmp_path))
     chains = [chain.part(0, 5 * (i + 1)) for i, chain in enumerate(chains_of(run, NoiseParameters()))]
     whole, efforts = Effort.of_log(run.log_bytes), efforts_of(chains)
     assert sum(each.allowed for each in efforts) == pytest.approx(whole.allowed)
@@ -166,7 +166,7 @@ def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path
 
 def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
     """A step may take seven, and one that was begun is ended."""
-    (chain,) = chains_of(load_run(written(resets(1, 10, 60), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(write_file(resets(1, 10, 60), tmp_path)), NoiseParameters())
     graph = build_graph([chain])
     start = graph.start(np.zeros((len(chain.stamps_ns), 3)), {}, {})
     whole, some = solve(graph.problem, start), solve(graph.problem, start, most_tries=5)
@@ -175,7 +175,7 @@ def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
 
 
 def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (chain,) = chains_of(load_run(written(resets(1, 10, 100), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
     effort = Effort(2e9, 2e9, 1e9)
     found, taken = solve_local_map(chain, effort), list[float]()
 
@@ -199,7 +199,7 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
 
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
-    (chain,) = chains_of(load_run(written(observed(1500, 20), tmp_path)), NoiseParameters())
+    (chain,) = chains_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
     effort = Effort(6e9, 6e9, 1e9)
     found = solve_local_map(chain, effort)
     assert not found.goodness.fits
@@ -210,7 +210,7 @@ def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_
 @pytest.mark.parametrize(("length_m", "picture_every"), [(250.0, 1), (500.0, 5)])
 def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every: int) -> None:
     """Even where its log is as small as it can be."""
-    chain = made_long_drive(3, length_m, picture_every, town=made_town(3, (0.5, 1.5))).chain
+    chain = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).chain
     log_bytes = BYTES_A_LOOK * len(chain.stamps_ns) + BYTES_A_READING * len(chain.readings.tag)
     effort = Effort.of_log(log_bytes)
     found = solve_local_map(chain, effort)

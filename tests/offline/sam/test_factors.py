@@ -17,7 +17,7 @@ from groundsbot.offline.sam.factors.robust_losses import (
 )
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.support.data.problems import BATCHES, CALIBRATION_SIGMA, N_CALIBRATION, WHEELS, made_problem, random_state
+from tests.support.data.problems import BATCHES, CALIBRATION_SIGMA, N_CALIBRATION, WHEELS, make_problem, random_state
 
 KINDS = ("odometry", "readings", "prior")
 SEEDS = range(5)
@@ -47,7 +47,7 @@ def numeric(residual: Callable[[State], FloatArray], problem: Problem, state: St
 @pytest.mark.parametrize("seed", SEEDS)
 def test_jacobian_blocks_agree_with_finite_differences(kind: str, seed: int) -> None:
     """Anywhere, far from where the measurements are met: nothing may be left out because it is small at the truth."""
-    problem = made_problem(seed).problem
+    problem = make_problem(seed).problem
     factors, state = getattr(problem, kind), random_state(seed + 100)
     linearised = factors.linearise(state, problem.columns)
     np.testing.assert_array_equal(linearised.residual, factors.residual(state))
@@ -60,7 +60,7 @@ def test_jacobian_blocks_agree_with_finite_differences(kind: str, seed: int) -> 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_block_of_every_kind_is_felt(seed: int) -> None:
     """Otherwise the test above could pass on columns of zeros."""
-    problem = made_problem(seed).problem
+    problem = make_problem(seed).problem
     state = random_state(seed + 100)
     felt = sum(
         np.abs(dense(getattr(problem, kind).linearise(state, problem.columns), problem.columns.n)).sum(axis=0)
@@ -72,7 +72,7 @@ def test_every_block_of_every_kind_is_felt(seed: int) -> None:
 @pytest.mark.parametrize("n_outliers", [0, 8])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
-    made = made_problem(seed, n_outliers=n_outliers)
+    made = make_problem(seed, n_outliers=n_outliers)
     state = random_state(seed, made.truth, spread=0.02)
     if n_outliers:
         lengths = np.linalg.norm(made.problem.readings.residual(state), axis=-1)
@@ -89,21 +89,21 @@ def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_residuals_vanish_at_the_truth_of_exact_measurements(seed: int) -> None:
-    made = made_problem(seed, noise=0.0)
+    made = make_problem(seed, noise=0.0)
     np.testing.assert_allclose(made.problem.odometry.residual(made.truth), 0.0, atol=1e-9)
     np.testing.assert_allclose(made.problem.readings.residual(made.truth), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_readings_put_their_tag_where_it_is(seed: int) -> None:
-    made = made_problem(seed, noise=0.0)
+    made = make_problem(seed, noise=0.0)
     readings = made.problem.readings
     np.testing.assert_allclose(readings.places_in_map(made.truth), made.truth.tags[readings.tag], atol=1e-12)
 
 
 def test_moving_the_whole_map_changes_no_residual() -> None:
     """Odometry and readings are relative: only the held start says where the map lies."""
-    made = made_problem(0)
+    made = make_problem(0)
     anywhere = np.array([3.0, -7.0, 2.8])
     state = random_state(1, made.truth, spread=0.05)
     moved = State(se2.compose(anywhere, state.poses), se2.apply(anywhere, state.tags), state.calibration)
@@ -114,7 +114,7 @@ def test_moving_the_whole_map_changes_no_residual() -> None:
 def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
     """Scale is a gauge that only priors hold: were residuals to shrink with the map, thousands of them would outvote
     the priors, and every map would come out too small."""
-    problem = made_problem(0).problem
+    problem = make_problem(0).problem
     straight, by_wheels = problem.odometry.motion * [1.0, 0.0, 0.0], np.zeros_like(problem.odometry.jacobian)
     by_wheels[:, 0, 0] = straight[:, 0]
     odometry = replace(problem.odometry, motion=straight, jacobian=by_wheels)
@@ -132,7 +132,7 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
 
 
 def test_the_prior_is_in_sigmas_and_holds_what_has_none() -> None:
-    made = made_problem(0)
+    made = make_problem(0)
     state = State(made.truth.poses, made.truth.tags, 2.0 * CALIBRATION_SIGMA)
     np.testing.assert_allclose(made.problem.prior.residual(state)[:, 0], [0.0, *[2.0] * (N_CALIBRATION - 1)])
 

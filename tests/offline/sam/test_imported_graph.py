@@ -23,16 +23,16 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph, build_graph
-from tests.support.data.drives import FAMILY, START_NS, S, made_drive, made_positions, made_robot, made_run
+from tests.support.data.drives import FAMILY, START_NS, S, make_drive, make_positions, make_robot, make_run
 
-DRIVE = made_drive([1.0, 1.5, 0.3], [(0.4, 0.5, 4.0)])
+DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.5, 4.0)])
 TAGS_M = np.array([[4.0, 2.0], [3.5, 5.0], [1.5, 4.0]])
 SIGMAS: Final[dict[str, object]] = {
     "time_offset_s_sigma": 0.3,
     "range_offset_m_sigma": 0.07,
     "imported_tag_scale_sigma": 0.02,
 }
-ROBOT = made_robot("carl", camera=None, tags=[], **SIGMAS)
+ROBOT = make_robot("carl", camera=None, tags=[], **SIGMAS)
 forms = pytest.mark.parametrize("polar", [True, False], ids=["polar", "cartesian"])
 frames = pytest.mark.parametrize("in_camera", [True, False], ids=["camera", "base"])
 
@@ -48,12 +48,12 @@ def imported_run(*, polar: bool, in_camera: bool, late_s: float = 0.0, too_long_
     places = range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)])
     value = np.column_stack([range_m, bearing_rad]) if polar else places
     positions = replace(
-        made_positions(np.repeat(stamps_ns, len(TAGS_M)) + round(late_s * S), tag, value, sigma_m=0.01),
+        make_positions(np.repeat(stamps_ns, len(TAGS_M)) + round(late_s * S), tag, value, sigma_m=0.01),
         polar=np.full(len(tag), polar),
         in_camera=np.full(len(tag), in_camera),
     )
     keys = [TagKey(FAMILY, i) for i in range(len(TAGS_M))]
-    return made_run([DRIVE.track], robot=ROBOT, camera=None, tags=keys, positions=positions)
+    return make_run([DRIVE.track], robot=ROBOT, camera=None, tags=keys, positions=positions)
 
 
 def chain_of(run: Run) -> Chain:
@@ -88,7 +88,7 @@ def test_what_is_open_is_what_positions_depend_on(polar: bool, in_camera: bool) 
 
 def test_a_robot_that_stands_tells_nothing_of_its_clock() -> None:
     run = imported_run(polar=True, in_camera=True)
-    still = made_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 4.0)])
+    still = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 4.0)])
     (chain,) = chains_of(replace(run, stretches=(still.track,)), NoiseParameters())
     names = [parameter.name for parameter in build_graph([chain]).parameters]
     assert TIME_OFFSET not in names

@@ -9,13 +9,13 @@ from groundsbot.offline.sam.arrowhead.system import Skeleton
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.benchmarks.speed.solver_world import made_fleet
-from tests.support.data.graphs import made_graph
+from tests.benchmarks.speed.solver_world import make_fleet
+from tests.support.data.graphs import make_graph
 
 
-def made_skeleton(seed: int, *, calibrated: bool = True) -> tuple[Problem, State, Skeleton]:
+def make_skeleton(seed: int, *, calibrated: bool = True) -> tuple[Problem, State, Skeleton]:
     """Chains of which most poses read nothing, one of them none at all, one of a single pose."""
-    problem, truth = made_graph(seed, [60, 1, 25], 3, calibrated=calibrated, reach=0.1)
+    problem, truth = make_graph(seed, [60, 1, 25], 3, calibrated=calibrated, reach=0.1)
     return problem, truth, problem.skeleton
 
 
@@ -26,7 +26,7 @@ def adjoint(pose: FloatArray) -> FloatArray:
 
 
 def test_motions_are_composed_with_their_covariances_and_derivatives() -> None:
-    problem, _, skeleton = made_skeleton(1)
+    problem, _, skeleton = make_skeleton(1)
     kept, composed = np.flatnonzero(skeleton.index >= 0), skeleton.arrowhead.odometry
     parts = problem.odometry
     assert np.diff(kept).max() > 5
@@ -45,7 +45,7 @@ def test_motions_are_composed_with_their_covariances_and_derivatives() -> None:
 
 def test_poses_between_are_laid_where_they_are_likeliest() -> None:
     """Moving them alone would gain next to nothing, where dead reckoning would leave all of it to the last motion."""
-    fleet = made_fleet(3, 2, 400, 12)
+    fleet = make_fleet(3, 2, 400, 12)
     problem, skeleton = fleet.problem, fleet.problem.skeleton
     state = skeleton.solve(skeleton.starting_values(fleet.dead_reckoned, np.full((2, 3), 0.1)), problem.anchor, 2)
     between = problem.columns.poses[skeleton.index < 0].reshape(-1)
@@ -64,7 +64,7 @@ def test_poses_between_are_laid_where_they_are_likeliest() -> None:
 
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_what_is_kept_stays_where_it_is(calibrated: bool) -> None:
-    problem, truth, skeleton = made_skeleton(2, calibrated=calibrated)
+    problem, truth, skeleton = make_skeleton(2, calibrated=calibrated)
     same = skeleton.solve(truth, problem.anchor, 0)
     kept = skeleton.index >= 0
     np.testing.assert_array_equal(same.poses[kept], truth.poses[kept])
@@ -76,7 +76,7 @@ def test_what_is_kept_stays_where_it_is(calibrated: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_relaxed_steps_lead_to_the_same_optimum_with_calibration_free(seed: int) -> None:
-    problem, truth = made_graph(seed, [80, 60], 6, reach=0.3)
+    problem, truth = make_graph(seed, [80, 60], 6, reach=0.3)
     start = problem.retract(truth, 0.02 * np.random.default_rng(seed).standard_normal(problem.columns.n))
     one, other = solve(problem, start, relaxed_steps=2), solve(problem, truth)
     assert one.converged

@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State, stack, whitening
 from groundsbot.offline.sam.factors.priors import KnownPlaces
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
-from tests.support.data.graphs import made_graph, with_measured
+from tests.support.data.graphs import make_graph, with_measured
 
 
 def with_known(problem: Problem, truth: State, seed: int, tags: list[int], numbers: list[int]) -> Problem:
@@ -43,7 +43,7 @@ def dense(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("n_measured", [0, 2])
 def test_steps_covariances_and_costs_are_those_of_dense_algebra(n_measured: int) -> None:
-    problem, truth = made_graph(3, [70, 40], 6)
+    problem, truth = make_graph(3, [70, 40], 6)
     problem = with_known(with_measured(problem, truth, 3, n_measured), truth, 5, [0, 2, 3, 5], [1, 4, 19])
     arrowhead = problem.arrowhead
     system, cost = arrowhead.linearise(truth)
@@ -61,7 +61,7 @@ def test_steps_covariances_and_costs_are_those_of_dense_algebra(n_measured: int)
 
 
 def test_a_solve_ends_where_its_gradient_is_nothing() -> None:
-    problem, truth = made_graph(4, [30], 4)
+    problem, truth = make_graph(4, [30], 4)
     problem = with_known(problem, truth, 6, [0, 1, 3], [2, 5])
     solution = solve(problem, truth, losses=PLAIN_SQUARES)
     assert solution.converged

@@ -17,8 +17,8 @@ from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors
 from groundsbot.offline.sam.factors.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
-from tests.support.data.drives import FAMILY, START_NS, made_positions, made_robot, made_run
-from tests.support.data.problems import CHAINS, N_TAGS, made_problem, random_state
+from tests.support.data.drives import FAMILY, START_NS, make_positions, make_robot, make_run
+from tests.support.data.problems import CHAINS, N_TAGS, make_problem, random_state
 
 SEEDS = range(3)
 ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
@@ -50,7 +50,7 @@ def distance(problem: Problem, a: State, b: State) -> float:
 @pytest.mark.parametrize("n_outliers", [0, 4])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_normal_equations_are_those_of_dense_algebra(seed: int, n_outliers: int) -> None:
-    made = made_problem(seed, n_outliers=n_outliers)
+    made = make_problem(seed, n_outliers=n_outliers)
     state = random_state(seed, made.truth, spread=0.02)
     hessian, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
     expected_hessian, expected_gradient = dense_normal_equations(made.problem, state)
@@ -61,7 +61,7 @@ def test_normal_equations_are_those_of_dense_algebra(seed: int, n_outliers: int)
 @pytest.mark.parametrize("n_outliers", [0, 4])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_optimum_is_where_dense_gauss_newton_ends(seed: int, n_outliers: int) -> None:
-    made = made_problem(seed, n_outliers=n_outliers)
+    made = make_problem(seed, n_outliers=n_outliers)
     start = random_state(seed, made.truth, spread=0.05)
     solution = solve(made.problem, start)
     assert solution.converged
@@ -78,7 +78,7 @@ def test_the_optimum_is_where_dense_gauss_newton_ends(seed: int, n_outliers: int
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
-    made = made_problem(seed)
+    made = make_problem(seed)
     solution = solve(made.problem, made.truth)
     hessian, _ = dense_normal_equations(made.problem, solution.state)
     columns = made.problem.columns
@@ -97,7 +97,7 @@ def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_steps_do_not_creep_where_many_readings_lie_beyond_the_threshold(seed: int) -> None:
-    made = made_problem(seed)
+    made = make_problem(seed)
     whitening = 5.0 * made.problem.readings.whitening  # sigmas told too small: most readings lie beyond 3 of them
     problem = made.problem.reweigh(made.problem.odometry.whitening, whitening)
     solution = solve(problem, made.truth)
@@ -109,7 +109,7 @@ def test_steps_do_not_creep_where_many_readings_lie_beyond_the_threshold(seed: i
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_start_nearby_leads_to_the_same_optimum(seed: int) -> None:
-    made = made_problem(seed, n_outliers=2)
+    made = make_problem(seed, n_outliers=2)
     reference = solve(made.problem, made.truth)
     for start_seed in range(5):
         start = random_state(start_seed, made.truth, spread=0.15)
@@ -123,7 +123,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     """Chi-square over 60 problems: measurements with Gaussian noise, so nothing but the solve can spoil it."""
     total, n = 0.0, 0
     for seed in range(60):
-        made = made_problem(seed)
+        made = make_problem(seed)
         solution = solve(made.problem, made.truth)
         columns = made.problem.columns
         error = (solution.state.tags - made.truth.tags).reshape(-1)
@@ -136,7 +136,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
-    made = made_problem(seed, noise=0.0, true_calibration=True)
+    made = make_problem(seed, noise=0.0, true_calibration=True)
     solution = solve(made.problem, random_state(seed, made.truth, spread=0.1))
     assert solution.cost < 1e-12
     assert distance(made.problem, solution.state, made.truth) < 1e-7
@@ -146,7 +146,7 @@ def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
     """One linearisation, no step: by the linear model there is nothing left to win."""
-    made = made_problem(seed, n_outliers=4)
+    made = make_problem(seed, n_outliers=4)
     found = solve(made.problem, made.truth, losses=losses)
     assert found.converged
     again = solve(made.problem, found.state, losses=losses)
@@ -156,14 +156,14 @@ def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_truth_of_exact_measurements_is_left_alone(seed: int) -> None:
-    made = made_problem(seed, noise=0.0, true_calibration=True)
+    made = make_problem(seed, noise=0.0, true_calibration=True)
     found = solve(made.problem, made.truth)
     assert found.converged
     assert found.n_linearised == 1
 
 
 def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
-    made = made_problem(0)
+    made = make_problem(0)
     value = made.problem.readings.value.copy()
     value[3] = np.nan
     spoilt = replace(made.problem, readings=replace(made.problem.readings, value=value))
@@ -175,7 +175,7 @@ def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_neither_order_of_chains_nor_of_tags_matters(seed: int) -> None:
     """The same factors and the same held pose, everything numbered anew."""
-    made = made_problem(seed, n_outliers=2)
+    made = make_problem(seed, n_outliers=2)
     problem, truth = made.problem, made.truth
     rng = np.random.default_rng(seed)
     n_first, n_poses = CHAINS[0], sum(CHAINS)
@@ -227,11 +227,11 @@ def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> Loca
     near = np.linalg.norm(place, axis=1) < 4.0
     read = place[near] + READING_SIGMA_M * rng.standard_normal((int(near.sum()), 2))
     keys = [TagKey(FAMILY, i) for i in range(len(TAGS_M))]
-    run = made_run(
+    run = make_run(
         [track],
-        robot=made_robot(),
+        robot=make_robot(),
         tags=keys,
-        positions=made_positions(stamps_ns[pose[near]], tag[near], read, READING_SIGMA_M),
+        positions=make_positions(stamps_ns[pose[near]], tag[near], read, READING_SIGMA_M),
     )
     (chain,) = chains_of(run, noise)
     return solve_local_map(chain)

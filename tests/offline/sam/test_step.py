@@ -10,13 +10,13 @@ from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from groundsbot.offline.sam.step import Before, take_step
-from tests.support.data.graphs import made_graph
-from tests.support.data.long_drives import made_long_drive
+from tests.support.data.graphs import make_graph
+from tests.support.data.long_drives import make_long_drive
 
 
 def both_ways(step: float) -> tuple[Arrowhead, State, State, State, FloatArray]:
     """A random step of some size: before, pose by pose, motion by motion, and the step."""
-    problem, state = made_graph(3, [40, 25], 6)
+    problem, state = make_graph(3, [40, 25], 6)
     random = step * np.random.default_rng(1).standard_normal(problem.columns.n)
     ordered = problem.arrowhead.in_order(random)
     moved = problem.arrowhead.retract(state, ordered, problem.anchor)
@@ -55,7 +55,7 @@ def test_motion_by_motion_each_motion_takes_its_own_part_of_the_step_alone() -> 
 
 
 def test_a_step_too_long_is_taken_in_part() -> None:
-    problem, truth = made_graph(3, [40, 25], 6)
+    problem, truth = make_graph(3, [40, 25], 6)
     arrowhead = problem.arrowhead
     system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
     step = -arrowhead.factorise(system).solve_in_order(system.gradient)
@@ -78,7 +78,7 @@ def test_a_step_too_long_is_taken_in_part() -> None:
 
 
 def test_a_long_drive_past_few_tags_arrives_in_few_steps() -> None:
-    drive = made_long_drive(25, 500.0)
+    drive = make_long_drive(25, 500.0)
     graph = build_graph([drive.chain])
     solution = solve(graph.problem, drive.true_state(graph))
     assert solution.converged

@@ -34,7 +34,7 @@ from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choo
 from groundsbot.offline.self_calibration.words import DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
-from tests.support.data.drives import CAMERA, MadeTag, made_drive, made_robot, picture_stamps, write_drive
+from tests.support.data.drives import CAMERA, MadeTag, make_drive, make_robot, picture_stamps, write_drive
 from tests.support.programs import Run as Program
 
 NOISE = NoiseParameters()
@@ -57,16 +57,16 @@ TAGS = [
 ]
 
 
-def driven(folder: Path, name: str, legs: Sequence[tuple[float, float, float]]) -> Path:
-    drive = made_drive([0.0, 0.0, 0.0], legs)
+def drive_legs(folder: Path, name: str, legs: Sequence[tuple[float, float, float]]) -> Path:
+    drive = make_drive([0.0, 0.0, 0.0], legs)
     pictures_ns = picture_stamps(drive, 3.7)
-    return write_drive(folder, drive, TAGS, made_robot(name), corner_sigma_px=0.2, pictures_ns=pictures_ns)
+    return write_drive(folder, drive, TAGS, make_robot(name), corner_sigma_px=0.2, pictures_ns=pictures_ns)
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
-    return driven(folder, "a", LEGS)
+    return drive_legs(folder, "a", LEGS)
 
 
 @pytest.mark.parametrize("corners", [False, True])
@@ -84,7 +84,7 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
 
 def mistaken(**changes: float) -> Robot:
     """The robot's file with some numbers wrong: of wheels by a share, of the mount as they are."""
-    robot = made_robot("a")
+    robot = make_robot("a")
     wheels = {name: getattr(robot.wheels, name) * (1.0 + off) for name, off in changes.items() if "radius" in name}
     if "track_m" in changes:
         wheels["track_m"] = robot.wheels.track_m * (1.0 + changes["track_m"])
@@ -94,12 +94,12 @@ def mistaken(**changes: float) -> Robot:
     )
 
 
-def mapped(log: Path, robot: Robot, calibrate: Calibrate = AUTO, *, corners: bool = False) -> MapResult:
+def map_runs(log: Path, robot: Robot, calibrate: Calibrate = AUTO, *, corners: bool = False) -> MapResult:
     files = {"a": RobotFile(robot, CAMERA)}
     return build_map(read_runs([log], files), NOISE, corners=corners, calibrate=calibrate)
 
 
-def freed(result: MapResult) -> set[str]:
+def freed_names(result: MapResult) -> set[str]:
     return {each.name for each in result.choices if each.is_freed}
 
 
@@ -108,13 +108,13 @@ def value_of(result: MapResult, name: str) -> float:
 
 
 def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
-    result = mapped(log, made_robot("a"))
+    result = map_runs(log, make_robot("a"))
     assert {each.name for each in result.choices} == set(NAMES) - {FOCAL_SCALE}
-    assert freed(result) == set()
+    assert freed_names(result) == set()
     assert all(each.reason for each in result.choices)
     assert AGREES in {each.verdict for each in result.robot_numbers}
     assert verdict_lines(result.robot_numbers) == ["what these drives say of the robots: all as robot.yaml has it"]
-    off = mapped(log, made_robot("a"), Calibrate())
+    off = map_runs(log, make_robot("a"), Calibrate())
     assert off.choices == ()
     for a, b in zip(off.components[0].tags, result.components[0].tags, strict=True):
         np.testing.assert_allclose(a.position_m, b.position_m, atol=1e-9)
@@ -122,8 +122,8 @@ def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
 
 def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
     wrong = mistaken(track_m=0.08, yaw_rad=0.06)
-    result = mapped(log, wrong)
-    assert freed(result) == {"track_scale", "mount_yaw_rad"}
+    result = map_runs(log, wrong)
+    assert freed_names(result) == {"track_scale", "mount_yaw_rad"}
     assert value_of(result, "track_scale") == pytest.approx(1.0 / 1.08 - 1.0, abs=2e-3)
     assert value_of(result, "mount_yaw_rad") == pytest.approx(-0.06, abs=3e-3)
     prior = {each.name: each.prior_sigma for each in result.calibration}
@@ -132,8 +132,8 @@ def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
 
 
 def test_a_camera_that_is_late_is_found_where_turns_tell_it(log: Path) -> None:
-    result = mapped(log, made_robot("a").model_copy(update={"time_offset_s": -0.02}))
-    assert freed(result) == {"time_offset_s"}
+    result = map_runs(log, make_robot("a").model_copy(update={"time_offset_s": -0.02}))
+    assert freed_names(result) == {"time_offset_s"}
     assert value_of(result, "time_offset_s") == pytest.approx(0.02, abs=2e-3)
 
 
@@ -149,21 +149,21 @@ def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(t
 
 def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_the_scale(log: Path) -> None:
     long_wheels = mistaken(radius_left_m=0.05, radius_right_m=0.05)
-    assert freed(mapped(log, long_wheels)) == {
+    assert freed_names(map_runs(log, long_wheels)) == {
         TAG_SCALE,
         "track_scale",
     }  # robot.yaml trusts wheels to 0.35 %, tags to 0.5 %
     sure = [each.model_copy(update={"sigma_size_m": 1e-4}) for each in long_wheels.tags]
-    result = mapped(log, long_wheels.model_copy(update={"tags": sure}))
-    assert freed(result) == {"wheel_scale"}
+    result = map_runs(log, long_wheels.model_copy(update={"tags": sure}))
+    assert freed_names(result) == {"wheel_scale"}
     assert value_of(result, "wheel_scale") == pytest.approx(1.0 / 1.05 - 1.0, abs=3e-3)
     (metre,) = result.metres
     assert metre.shares["tags"] > 0.9
 
 
 def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path) -> None:
-    result = mapped(log, made_robot("a"), Calibrate(is_on=True, names=("wheel_ratio", "wheel_scale")))
-    assert freed(result) == {"wheel_ratio"}
+    result = map_runs(log, make_robot("a"), Calibrate(is_on=True, names=("wheel_ratio", "wheel_scale")))
+    assert freed_names(result) == {"wheel_ratio"}
     reasons = {each.name: each.reason for each in result.choices}
     assert reasons["wheel_scale"] == TELLS_LESS
     assert {each.name for each in result.robot_numbers if each.verdict == ASKED} == {"wheel_ratio"}
@@ -178,14 +178,14 @@ def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> No
     robot = mistaken(pitch_rad=0.06).model_copy(update={"focal_scale_sigma": 0.002})
     files = {"a": RobotFile(robot, camera)}
     result = build_map(read_runs([log], files), NOISE, corners=True, calibrate=AUTO)
-    assert freed(result) >= {FOCAL_SCALE, "mount_pitch_rad"}
+    assert freed_names(result) >= {FOCAL_SCALE, "mount_pitch_rad"}
     assert value_of(result, FOCAL_SCALE) == pytest.approx(0.03, abs=3e-3)
     assert value_of(result, "mount_pitch_rad") == pytest.approx(-0.06, abs=1e-3)
     assert "mount_z_m" not in {each.name for each in result.choices}
     assert result.warnings == ()
 
 
-def told(values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]) -> Told:
+def stack_information(values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]) -> Told:
     """Stretches that each tell of each number on its own."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
@@ -195,7 +195,7 @@ def told(values: list[list[float]], sigmas: list[list[float]], priors: dict[str,
 def choice(
     values: list[float], sigmas: list[float], prior: float = 0.01, name: str = "track_scale"
 ) -> CalibrationChoice:
-    (found,) = choose(told([[each] for each in values], [[each] for each in sigmas], {name: prior}))
+    (found,) = choose(stack_information([[each] for each in values], [[each] for each in sigmas], {name: prior}))
     return found
 
 
@@ -238,27 +238,27 @@ def test_a_file_that_is_right_is_called_wrong_once_in_a_hundred_maps() -> None:
     for _ in range(400):
         true = 0.01 * rng.standard_normal(len(NAMES))
         values = [(true + each * rng.standard_normal(len(NAMES))).tolist() for each in sigmas]
-        choices = choose(told(values, [each.tolist() for each in sigmas], dict.fromkeys(NAMES, 0.01)))
+        choices = choose(stack_information(values, [each.tolist() for each in sigmas], dict.fromkeys(NAMES, 0.01)))
         n_freed += any(each.is_freed for each in choices)
     assert n_freed <= 11  # of 400 at 1 %: more happens once in 500 times
 
 
 def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     wrong = mistaken(track_m=0.08, radius_left_m=0.02, yaw_rad=0.06, pitch_rad=-0.01)
-    result = mapped(log, wrong)
+    result = map_runs(log, wrong)
     learnt = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in result.calibration}
     better = correct_robot(wrong, learnt)
     assert better.wheels.radius_left_m == pytest.approx(0.1, rel=1e-2)
     assert better.wheels.radius_left_m / better.wheels.radius_right_m == pytest.approx(1.0, rel=2e-3)
     assert better.wheels.track_m == pytest.approx(0.5, rel=1e-2)
-    again = mapped(log, better, Calibrate())
+    again = map_runs(log, better, Calibrate())
     for each in again.calibration:
         assert abs(each.value) < each.sigma, each  # the same drive tells it once more
         assert each.prior_sigma == pytest.approx(learnt[Owned(each.owner, each.name)].sigma, rel=1e-2)
 
 
 def test_what_was_learnt_of_edges_is_written() -> None:
-    robot = made_robot("a", edge_shift_px=0.02)
+    robot = make_robot("a", edge_shift_px=0.02)
     better = correct_robot(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
     assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
     assert open_parameters(robot, {Owned("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
@@ -266,7 +266,7 @@ def test_what_was_learnt_of_edges_is_written() -> None:
 
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
     assert set(NAMES) == set(OPEN_SIGMAS) == set(DRIVES)
-    robot = made_robot("a")
+    robot = make_robot("a")
     batch = Owned(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
     everything = open_parameters(
         robot, {Owned("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15}
@@ -288,8 +288,8 @@ def test_a_name_that_is_none_is_refused() -> None:
 
 
 def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(log: Path, tmp_path: Path) -> None:
-    result = mapped(log, mistaken(track_m=0.08))
-    other = driven(tmp_path / "logs", "b", LEGS[:1])
+    result = map_runs(log, mistaken(track_m=0.08))
+    other = drive_legs(tmp_path / "logs", "b", LEGS[:1])
     write_map(result, tmp_path)
     again = read_map(tmp_path)
     assert again.choices == result.choices
@@ -317,7 +317,7 @@ def test_the_command_writes_files_that_the_next_drive_is_mapped_with(log: Path, 
 
 
 def test_robots_get_a_file_each_in_a_folder(log: Path, tmp_path: Path, run: Program) -> None:
-    other = driven(tmp_path, "b", LEGS[:2])
+    other = drive_legs(tmp_path, "b", LEGS[:2])
     refused = run("calibrate", log, other, "-o", tmp_path / "robot.yaml")
     assert refused.code == 1
     assert "several robots (a, b)" in refused.err

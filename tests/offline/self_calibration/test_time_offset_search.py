@@ -15,7 +15,7 @@ from groundsbot.offline.self_calibration.pass_model import PARAMETERS, linearise
 from groundsbot.offline.self_calibration.passes import WheelAxis, gather_passes
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.drives import FAMILY, S, made_drive, made_positions, made_robot, made_run
+from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_robot, make_run
 
 ROUND = [(0.5, 0.5, 5.0), (0.1, 0.5, 1.9), (0.4, 0.4, 3.0), (0.6, 0.45, 5.0), (-0.2, 0.2, 2.0), (0.5, 0.3, 2.0)]
 DRIVE = tuple(6 * ROUND)
@@ -46,7 +46,7 @@ def position_run(
         heading_rad_per_sqrt_m: by which the robot truly turns away from what wheels tell.
         lasting: what readings of one tag err by alike for 5 s, in sigmas of their noise.
     """
-    rng, drive, robot = np.random.default_rng(seed), made_drive([0.0, 0.0, 0.0], legs), made_robot()
+    rng, drive, robot = np.random.default_rng(seed), make_drive([0.0, 0.0, 0.0], legs), make_robot()
     driven_m = np.diff((drive.left_m + drive.right_m) / 2, prepend=0.0)
     astray = np.cumsum(heading_rad_per_sqrt_m * np.sqrt(np.abs(driven_m)) * rng.standard_normal(len(driven_m)))
     heading = drive.T_world_base[:, 2] + astray
@@ -66,17 +66,17 @@ def position_run(
     read = np.stack([range_m[look, tag] + 0.03 * error[0], bearing_rad[look, tag] + 0.01 * error[1]], axis=-1)
     value = read[:, :1] * np.stack([np.cos(read[:, 1]), np.sin(read[:, 1])], axis=-1)
     tag = np.where(rng.random(len(tag)) < wrong_ids, rng.integers(0, len(TAGS_M), len(tag)), tag)
-    positions = made_positions(taken_ns[look] + round(late_s * S), tag, value)
+    positions = make_positions(taken_ns[look] + round(late_s * S), tag, value)
     if in_camera:
         about_camera = np.stack([read[:, 0], read[:, 1] - robot.mount.yaw_rad], axis=-1)
         every = np.ones(len(tag), dtype=np.bool_)
         diagonal = np.broadcast_to(np.diag([0.03**2, 0.01**2]), (len(tag), 2, 2)).copy()
         positions = replace(positions, value=about_camera, polar=every, in_camera=every, covariance=diagonal)
     keys = [TagKey(FAMILY, i) for i in range(len(TAGS_M))]
-    return made_run([drive.track], robot=robot, camera=None, tags=keys, positions=positions)
+    return make_run([drive.track], robot=robot, camera=None, tags=keys, positions=positions)
 
 
-def found_in(*runs: Run) -> TimeOffsetSearch:
+def tags_by_picture(*runs: Run) -> TimeOffsetSearch:
     found = search_time_offset(runs)
     assert found is not None
     return found
@@ -94,7 +94,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, float]:
 @pytest.mark.parametrize("late_s", [-0.1, 0.3, 0.6])
 def test_an_offset_of_a_camera_is_found(simulated: tuple[Run, float], late_s: float) -> None:
     run, drawn_s = simulated
-    found = found_in(run.shift_stamps(-late_s))
+    found = tags_by_picture(run.shift_stamps(-late_s))
     assert found.offset_s == pytest.approx(late_s + drawn_s, abs=3.0 * found.sigma_s)
     assert found.sigma_s < 0.02
 
@@ -102,7 +102,7 @@ def test_an_offset_of_a_camera_is_found(simulated: tuple[Run, float], late_s: fl
 @pytest.mark.parametrize("in_camera", [False, True])
 @pytest.mark.parametrize("late_s", [-0.45, 0.0, 0.8])
 def test_an_offset_of_imported_positions_is_found(late_s: float, in_camera: bool) -> None:
-    found = found_in(position_run(late_s, in_camera=in_camera))
+    found = tags_by_picture(position_run(late_s, in_camera=in_camera))
     assert found.offset_s == pytest.approx(late_s, abs=3.0 * found.sigma_s)
     assert found.sigma_s < 0.01
     assert len(found.grid_s) == len(found.cost) == 21
@@ -112,7 +112,7 @@ def test_an_offset_of_imported_positions_is_found(late_s: float, in_camera: bool
 
 @pytest.mark.parametrize("share", [0.01, 0.05])
 def test_some_ids_may_be_wrong(share: float) -> None:
-    found = found_in(position_run(0.3, wrong_ids=share))
+    found = tags_by_picture(position_run(0.3, wrong_ids=share))
     assert found.offset_s == pytest.approx(0.3, abs=0.01)
     assert found.sigma_s < 0.012
 
@@ -127,9 +127,9 @@ def test_stretches_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
     )
     cut = replace(run, stretches=(first, second))
     apart = [replace(run, stretches=(each,)) for each in (first, second)]
-    for found in (found_in(cut), found_in(*apart)):
+    for found in (tags_by_picture(cut), tags_by_picture(*apart)):
         assert found.offset_s == pytest.approx(0.3, abs=3.0 * found.sigma_s)
-    assert found_in(run, position_run(0.3, seed=1)).sigma_s < found_in(run).sigma_s + 1e-3
+    assert tags_by_picture(run, position_run(0.3, seed=1)).sigma_s < tags_by_picture(run).sigma_s + 1e-3
 
 
 NO_READINGS = position_run(legs=[(0.0, 0.0, 1.0)])
@@ -156,7 +156,7 @@ def test_what_is_no_number_is_no_reading() -> None:
     value = run.positions.value.copy()
     value[::3] = np.nan
     some = replace(run, positions=replace(run.positions, value=value))
-    assert found_in(some).offset_s == pytest.approx(0.3, abs=0.02)
+    assert tags_by_picture(some).offset_s == pytest.approx(0.3, abs=0.02)
     none = replace(run.positions, value=np.full_like(value, np.nan))
     assert search_time_offset([replace(run, positions=none)]) is None
     (track,) = run.stretches
@@ -174,7 +174,7 @@ def test_one_tag_that_is_read_once_in_a_while_tells_nothing() -> None:
 
 def test_sigma_is_what_estimates_err_by() -> None:
     found = [
-        found_in(position_run(0.2, seed=seed, heading_rad_per_sqrt_m=0.05, lasting=3.0, legs=4 * ROUND))
+        tags_by_picture(position_run(0.2, seed=seed, heading_rad_per_sqrt_m=0.05, lasting=3.0, legs=4 * ROUND))
         for seed in range(24)
     ]
     off = np.array([(each.offset_s - 0.2) / each.sigma_s for each in found])

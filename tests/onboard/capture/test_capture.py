@@ -29,7 +29,7 @@ from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import StampSource
 from groundsbot.onboard.log.picture import Picture
 from groundsbot.onboard.process.clock import RunClock
-from tests.support.board_views import good_views, rendered
+from tests.support.board_views import good_views, render_views
 from tests.support.devices.live_recording import PATIENCE_S, until
 from tests.support.programs import running
 
@@ -38,13 +38,13 @@ STEP_NS = 110 * MS
 EMPTY = np.full((480, 640), 120, np.uint8)
 
 
-def shown(guide: CaptureGuide, pictures: Sequence[NDArray[np.uint8]], start_ns: int = 0) -> list[Advice]:
+def show_all(guide: CaptureGuide, pictures: Sequence[NDArray[np.uint8]], start_ns: int = 0) -> list[Advice]:
     return [guide.handle_frame(each, start_ns + index * STEP_NS) for index, each in enumerate(pictures)]
 
 
 def test_a_picture_is_taken_when_the_board_is_still_and_only_once() -> None:
     guide = CaptureGuide(DEFAULT_BOARD, 30)
-    advice = shown(guide, [rendered()[0]] * 5)
+    advice = show_all(guide, [render_views()[0]] * 5)
     assert [each.keep for each in advice] == [False, False, True, False, False]
     assert [each.text for each in advice[:2]] == ["hold the board still"] * 2
     assert advice[2].text.startswith("taken; show the board at the picture's")
@@ -54,30 +54,30 @@ def test_a_picture_is_taken_when_the_board_is_still_and_only_once() -> None:
 
 def test_nothing_is_taken_while_the_board_moves_or_is_away() -> None:
     guide = CaptureGuide(DEFAULT_BOARD, 30)
-    start = rendered()[4]
+    start = render_views()[4]
     moving = [np.roll(start, 3 * index, axis=1) for index in range(8)]  # 27 px/s
-    assert not any(each.keep for each in shown(guide, moving))
+    assert not any(each.keep for each in show_all(guide, moving))
     creeping = [np.roll(start, index // 2, axis=1) for index in range(8)]
-    assert sum(each.keep for each in shown(guide, creeping, 60_000 * MS)) == 1
-    gone = shown(guide, [rendered()[0], EMPTY] * 3, 120_000 * MS)
+    assert sum(each.keep for each in show_all(guide, creeping, 60_000 * MS)) == 1
+    gone = show_all(guide, [render_views()[0], EMPTY] * 3, 120_000 * MS)
     assert not any(each.keep for each in gone)
     assert gone[1].text == "no board 7x9-25mm-18mm-5x5_100 in view; show more of it"
     # Between pictures that far apart the board may have been anywhere.
-    assert not any(guide.handle_frame(rendered()[0], (200 + 5 * index) * 1000 * MS).keep for index in range(4))
+    assert not any(guide.handle_frame(render_views()[0], (200 + 5 * index) * 1000 * MS).keep for index in range(4))
 
 
 def test_it_is_enough_when_nothing_is_missing() -> None:
     guide = CaptureGuide(DEFAULT_BOARD, 8)
-    for index, picture in enumerate(rendered()):
+    for index, picture in enumerate(render_views()):
         assert not guide.enough
-        taken = shown(guide, [picture] * 3, index * 10_000 * MS)[-1]
+        taken = show_all(guide, [picture] * 3, index * 10_000 * MS)[-1]
         assert taken.keep, (index, taken)
         assert (taken.text == "taken; that is enough") == guide.enough
     assert guide.kept == len(good_views())
     assert guide.missing == []
     assert guide.enough
     few = CaptureGuide(DEFAULT_BOARD, 8)
-    for picture in rendered()[:-2]:
+    for picture in render_views()[:-2]:
         assert few.remember(picture)
     assert few.kept == 10
     assert few.missing == ["bring the board nearer"]
@@ -140,7 +140,7 @@ def jpeg(picture: NDArray[np.uint8]) -> bytes:
 
 
 def thrice(*indices: int) -> list[NDArray[np.uint8]]:
-    return [rendered()[index] for index in indices for _ in range(3)]
+    return [render_views()[index] for index in indices for _ in range(3)]
 
 
 def test_pictures_are_kept_as_they_came_or_without_loss(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_pictures_are_kept_as_they_came_or_without_loss(tmp_path: Path) -> None:
     assert taken.said == ["camera_fps is 30, asked for 15", "video is over"]
     assert taken.names == ["0001.jpg", "0002.jpg", "0003.png"]
     assert (taken.folder / "0002.jpg").read_bytes() == files[3]
-    np.testing.assert_array_equal(cv2.imread(str(taken.folder / "0003.png"), cv2.IMREAD_GRAYSCALE), rendered()[2])
+    np.testing.assert_array_equal(cv2.imread(str(taken.folder / "0003.png"), cv2.IMREAD_GRAYSCALE), render_views()[2])
     looked_at = cv2.imread(str(taken.looked_at))
     assert looked_at is not None
     green = (looked_at[:, :, 1] > 150) & (looked_at[:, :, 0] < 120) & (looked_at[:, :, 2] < 120)
@@ -161,7 +161,7 @@ def test_pictures_are_kept_as_they_came_or_without_loss(tmp_path: Path) -> None:
 
 
 def test_it_ends_when_there_are_enough(tmp_path: Path) -> None:
-    everything = [picture for picture in rendered() for _ in range(3)]
+    everything = [picture for picture in render_views() for _ in range(3)]
     taken = Taken(tmp_path, [*everything, EMPTY], wanted=12)
     assert taken.guide.enough
     assert len(taken.names) == 12
@@ -176,7 +176,7 @@ def test_a_capture_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
 
 
 def test_a_picture_that_came_broken_is_passed_over(tmp_path: Path) -> None:
-    whole = jpeg(rendered()[0])
+    whole = jpeg(render_views()[0])
     taken = Taken(tmp_path, [whole, whole[: len(whole) // 2], whole, whole])
     assert "cut short" in taken.advice[1].text
     assert taken.names == ["0001.jpg"]
@@ -278,7 +278,7 @@ def program(folder: Path, *options: str) -> Iterator["subprocess.Popen[str]"]:
 def hold_up(camera: PictureFolder, pictures: Path, process: "subprocess.Popen[str]", which: Iterable[int]) -> None:
     """Holds up one view after the other, each until it was taken."""
     for before, index in enumerate(which, start=len(list(pictures.glob("0*")))):
-        picture = jpeg(rendered()[index])
+        picture = jpeg(render_views()[index])
 
         def taken(picture: bytes = picture, before: int = before) -> bool:
             camera.show(picture)
@@ -291,7 +291,7 @@ def hold_up(camera: PictureFolder, pictures: Path, process: "subprocess.Popen[st
 def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> None:
     camera, pictures = PictureFolder(tmp_path / "camera", keep=20), tmp_path / "pictures"
     pictures.mkdir()
-    for number, picture in enumerate(rendered()[:-2], start=1):  # of an earlier time
+    for number, picture in enumerate(render_views()[:-2], start=1):  # of an earlier time
         (pictures / f"{number:04}.jpg").write_bytes(jpeg(picture))
     with program(tmp_path, "--views", "8") as process:
         hold_up(camera, pictures, process, [10, 11])

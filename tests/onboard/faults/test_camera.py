@@ -42,7 +42,7 @@ from tests.support.devices.recorder_cores import (
     events_of,
     frames_of,
     line_of,
-    made_core,
+    make_core,
     wheels_of,
 )
 
@@ -127,7 +127,7 @@ def test_row_34_a_stamp_that_cannot_be_is_replaced_and_the_source_recorded(
 
 
 def test_row_34_each_picture_says_where_its_stamp_comes_from_and_a_change_is_told(tmp_path: Path) -> None:
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     sources = [StampSource.STAMP_SOURCE_CAMERA] * 5 + [StampSource.STAMP_SOURCE_ARRIVAL] * 5
     for index, source in enumerate(sources):
         core.on_detections([], (160, 120), START_NS + index * 50 * MS, START_NS + index * 50 * MS + MS, source, index)
@@ -222,7 +222,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
 
 @pytest.mark.parametrize("to_ns", [START_NS + HOUR_NS, START_NS - HOUR_NS, 0, 2_145_916_800 * S])
 def test_row_37_steps_of_the_wall_clock_are_told_and_the_log_goes_on_evenly(tmp_path: Path, to_ns: int) -> None:
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     for index in range(400):
         now_ns = START_NS + index * 10 * MS
         core.on_serial_bytes(format_line(line_of(index)), now_ns)
@@ -250,7 +250,7 @@ def test_row_37_the_runs_clock_does_not_step_with_the_wall_clock(monkeypatch: py
 
 
 def test_row_37_slewing_is_no_step(tmp_path: Path) -> None:
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     for index in range(400):
         now_ns = START_NS + index * 100 * MS
         core.tick(now_ns, now_ns + round(0.08 * (now_ns - START_NS)))  # chrony at its fastest

@@ -43,7 +43,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_threads, "_RETRY_S", 0.02)
 
 
-def held() -> Counts:
+def resources_in_use() -> Counts:
     """Threads, open files and children of this process, once what is on its way out has gone."""
     looks = []
     for _ in range(8):
@@ -98,7 +98,7 @@ def test_row_21_twenty_replugs_leave_nothing_behind(tmp_path: Path, wheels_only:
             driver.plug_in()
             made.wait_for(EventKind.PORT_CONNECTED, replug + 1)
             made.wait_for_messages("/wheels", made.recorder.core.counts["/wheels"] + 5)
-            counts.append(held())
+            counts.append(resources_in_use())
             driver.unplug()
             made.wait_for(EventKind.PORT_LOST, replug + 1)
     check_nothing_is_left(counts)
@@ -158,7 +158,7 @@ def test_row_32_twenty_reconnects_of_a_camera_leave_nothing_behind(tmp_path: Pat
             camera = PictureFolder(folder)
             made.wait_for(EventKind.CAMERA_CONNECTED, reconnect + 1)
             show_until(camera, picture, made, made.recorder.core.counts["/tags/detections"] + 1)
-            counts.append(held())
+            counts.append(resources_in_use())
             shutil.rmtree(folder)
             made.wait_for(EventKind.CAMERA_LOST, reconnect + 1)
     check_nothing_is_left(counts)

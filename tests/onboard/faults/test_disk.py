@@ -17,9 +17,9 @@ from groundsbot.onboard.recorder.disk import log_thread as log_thread_module
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import one_recorder
-from tests.support.data.logs import MS, START_NS, drive, picture_entry, read_all, seen, wheel_entry, write_log
+from tests.support.data.logs import MS, START_NS, drive, facts, picture_entry, read_all, wheel_entry, write_log
 from tests.support.devices.fake_disks import MortalDisk, TroubledDisk
-from tests.support.devices.kept_logs import CORE, LIMIT_S, S, make_keeper, names, record, seen_in, stepped, texts
+from tests.support.devices.kept_logs import CORE, LIMIT_S, S, contents_of, make_keeper, names, record, step, texts
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
@@ -29,11 +29,11 @@ def test_row_01b_a_power_cut_at_any_point(tmp_path: Path, count: int) -> None:
     entries = drive(6.0, picture_hz=10, picture_bytes=9000)
     keeper = make_keeper(Path("logs"), disk, SegmentLimits(1700 * MS, 1 << 40), pictures=True)
     done_ns: list[int] = []  # by act: when it was done
-    for at_ns in stepped(keeper, entries):
+    for at_ns in step(keeper, entries):
         done_ns += [at_ns] * (len(disk.acts) - len(done_ns))
     keeper.finish(10.0)
     done_ns += [entries[-1].log_time_ns + S] * (len(disk.acts) - len(done_ns))
-    written = seen(entries)
+    written = facts(entries)
     rng = np.random.default_rng(1)
     for trial, n_acts in enumerate(np.linspace(1, len(disk.acts), count).astype(int).tolist()):
         folder = tmp_path / str(trial)
@@ -56,7 +56,7 @@ def test_row_10_a_start_after_a_kill_leaves_what_was_there(tmp_path: Path) -> No
     left = (tmp_path / "run1" / f"{CORE}.active").read_bytes()
     record(make_keeper(tmp_path, TroubledDisk(), run_id="run2"), drive(1.0))
     assert (tmp_path / "run1" / f"{CORE}.active").read_bytes() == left
-    assert read_all(tmp_path / "run1")[0] == seen(drive(2.0))
+    assert read_all(tmp_path / "run1")[0] == facts(drive(2.0))
     assert list(read_log(tmp_path / "run2"))
     # And within the same run, as after a failure of the disk: another file, not the one that is there.
     record(make_keeper(tmp_path, TroubledDisk(), run_id="run1"), drive(1.0))
@@ -71,12 +71,12 @@ def test_row_14_a_file_that_fails(tmp_path: Path, act: str, number: int) -> None
     disk = TroubledDisk()
     keeper = make_keeper(tmp_path, disk, SegmentLimits(3 * S, 1 << 40))
     entries = drive(8.0)
-    for at_ns in stepped(keeper, entries):
+    for at_ns in step(keeper, entries):
         if at_ns == START_NS + 2 * S:
             acts = (act, "truncate") if number == errno.EROFS else (act,)
             disk.fails = lambda what, path, acts=acts: number if what in acts and "0000" in path.name else 0  # type: ignore[misc]  # mypy: lambda's default
     keeper.finish(100.0)
-    assert seen_in(tmp_path) == seen(entries)
+    assert contents_of(tmp_path) == facts(entries)
     assert f"{CORE}.active" in names(tmp_path / "run1")
     n_stored = sum(len(read_all(file)[0]) for file in (tmp_path / "run1").iterdir())
     assert (n_stored > len(entries)) == (number == errno.EROFS and act == "sync")
@@ -110,8 +110,8 @@ def test_row_15_a_sync_that_blocks_holds_up_no_reading(tmp_path: Path) -> None:
         assert taken == sorted(taken, reverse=True)  # the first fit, then none
         assert True in taken
         assert taken.count(False) == thread.status.lost["/camera/image"]
-    found = seen_in(tmp_path)
-    assert [each for each in found if each[0] == "/wheels"] == seen(readings)
+    found = contents_of(tmp_path)
+    assert [each for each in found if each[0] == "/wheels"] == facts(readings)
     assert len([each for each in found if each[0] == "/camera/image"]) == taken.count(True)
     assert {"/camera/image": taken.count(False)} in [note.lost for note in thread.take_notes()]
 
@@ -142,8 +142,8 @@ def test_row_39_new_segments_under_load(tmp_path: Path) -> None:
     assert not [file for file in files if file.suffix == ".active"]
     for file in files:
         assert [each.topic for each in read_log(file)][:3] == ["/run", "/camera/calibration", "/tf"]
-    assert sorted(seen_in(tmp_path)) == sorted(seen(entries))
-    log_times = [each[1] for each in seen_in(tmp_path)]
+    assert sorted(contents_of(tmp_path)) == sorted(facts(entries))
+    log_times = [each[1] for each in contents_of(tmp_path)]
     assert log_times == sorted(log_times)
 
 
@@ -161,7 +161,7 @@ def test_row_40_a_stalled_disk_shows_and_earlier_data_are_intact(tmp_path: Path)
         assert disk.syncing.wait(LIMIT_S)
         wait_until(lambda: thread.stalled_s > 1.0)
         found, losses = read_all(tmp_path / "run1")  # as a restarted recorder's user finds it
-        assert found[:100] == seen(early)
+        assert found[:100] == facts(early)
         assert not losses.n_lost
         disk.may_sync.set()
         wait_until(lambda: thread.stalled_s < 1.0)

@@ -16,14 +16,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, paced, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, pace, wheel_line
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.monitoring.status import read_status
 from tests.support.devices.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import frames_of, wheels_of
 from tests.support.paths import ROOT
-from tests.support.processor_wait import ended_within
+from tests.support.processor_wait import wait_for_end
 from tests.support.programs import running
 
 LIMIT_S = 5.0
@@ -138,11 +138,11 @@ def full_load(folder: Path) -> Iterator[None]:
     over = threading.Event()
 
     def drive() -> None:
-        for index in takewhile(lambda _: not over.is_set(), paced(1000.0)):
+        for index in takewhile(lambda _: not over.is_set(), pace(1000.0)):
             port.send(wheel_line(index, time.monotonic_ns()))
 
     def show() -> None:
-        for _ in takewhile(lambda _: not over.is_set(), paced(30.0)):
+        for _ in takewhile(lambda _: not over.is_set(), pace(30.0)):
             camera.show(picture)
 
     threads = [threading.Thread(target=each, daemon=True) for each in (drive, show)]
@@ -168,7 +168,7 @@ def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: sig
     with full_load(tmp_path), recorder(tmp_path, both, PATIENT) as process:
         wait_for_load(tmp_path)
         os.killpg(process.pid, number)
-        said = ended_within(process, LIMIT_S)
+        said = wait_for_end(process, LIMIT_S)
     assert process.returncode == 0, said
     log = only_log(tmp_path)
     check_finished(log)
@@ -184,7 +184,7 @@ def test_row_17_told_again_and_again_while_closing(tmp_path: Path, both: Path) -
         wait_for_load(tmp_path)
         insisting = threading.Thread(target=tell_until_it_ends, args=(process,), daemon=True)
         insisting.start()
-        said = ended_within(process, LIMIT_S)
+        said = wait_for_end(process, LIMIT_S)
         insisting.join()
     assert process.returncode in (0, -signal.SIGTERM, -signal.SIGINT), said  # the latter: as it was leaving already
     check_finished(only_log(tmp_path))
@@ -206,7 +206,7 @@ def test_row_18_told_to_end_while_port_camera_and_detection_block(tmp_path: Path
         (tmp_path / "block").touch()
         wait_for(process, "blocked EncoderPort", "blocked FolderCamera")
         process.send_signal(signal.SIGTERM)
-        said = ended_within(process, LIMIT_S)
+        said = wait_for_end(process, LIMIT_S)
     assert process.returncode == 3, said  # the pictures that the detection had
     assert "detection had not ended" in said
     log = only_log(tmp_path)
@@ -227,7 +227,7 @@ def test_row_18_a_terminal_that_takes_no_more_lines_holds_up_neither_recording_n
         os.close(write_fd)
         until(lambda: counts(tmp_path).get("/wheels", 0) > 1000, "readings")
         process.send_signal(signal.SIGTERM)
-        ended_within(process, LIMIT_S)
+        wait_for_end(process, LIMIT_S)
     os.close(read_fd)
     assert process.returncode == 0
     check_finished(only_log(tmp_path))
@@ -287,7 +287,7 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
             systemd.wait_for("READY=1")
             systemd.wait_for("WATCHDOG=1")
             process.send_signal(signal.SIGTERM)
-            ended_within(process, LIMIT_S)
+            wait_for_end(process, LIMIT_S)
     said = systemd.rest()
     assert said.count("STOPPING=1") == 1
     assert not [each for each in said[said.index("STOPPING=1") :] if "WATCHDOG=1" in each]

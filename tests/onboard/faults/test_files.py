@@ -37,7 +37,7 @@ def times(short: int, full: int) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("count", [short, pytest.param(full, marks=pytest.mark.long)])
 
 
-def damaged(source: Path, folder: Path, damage: Damage) -> Path:
+def damage_file(source: Path, folder: Path, damage: Damage) -> Path:
     path = folder / source.name
     path.write_bytes(damage(source.read_bytes()))
     return path
@@ -71,7 +71,7 @@ def test_row_02_truncated_at_every_offset_of_a_small_log(small: Path, tmp_path: 
     size = small.stat().st_size
     edges = {place + shift for chunk in chunks for place in chunk[:2] for shift in (-1, 0, 1, 9, 10)}
     for end in sorted({*range(9, size, max(1, size // count)), *edges}):
-        path = damaged(small, tmp_path, cut(end, size))
+        path = damage_file(small, tmp_path, cut(end, size))
         found, losses = read_all(path)
         assert found == messages_of([chunk for chunk in chunks if chunk.end <= end])
         assert losses
@@ -82,7 +82,7 @@ def test_row_02_truncated_at_places_of_a_large_log(large: Path, tmp_path: Path, 
     for name in ("0000.core.mcap", "0000.camera.mcap"):
         chunks, size = chunks_of(large / name), (large / name).stat().st_size
         for end in offsets(size, count // 2):
-            path = damaged(large / name, tmp_path, cut(end, size))
+            path = damage_file(large / name, tmp_path, cut(end, size))
             assert read_all(path)[0] == messages_of([chunk for chunk in chunks if chunk.end <= end])
 
 
@@ -90,7 +90,7 @@ def test_row_02_truncated_at_places_of_a_large_log(large: Path, tmp_path: Path, 
 def test_row_03_a_tail_of_zeros(small: Path, tmp_path: Path, count: int) -> None:
     chunks = chunks_of(small)
     for end in offsets(chunks[-1].end, count):
-        path = damaged(small, tmp_path, cut(end, 1 << 30, bytes(100 + 7 * end)))
+        path = damage_file(small, tmp_path, cut(end, 1 << 30, bytes(100 + 7 * end)))
         whole = [chunk for chunk in chunks if chunk.end <= end]
         found, losses = read_all(path)
         if end < 8:
@@ -107,7 +107,7 @@ def test_row_04_a_flipped_bit_loses_its_chunk_and_no_other(small: Path, tmp_path
     chunks = chunks_of(small)
     rng = np.random.default_rng(4)
     for at in offsets(small.stat().st_size, count):
-        path = damaged(small, tmp_path, flip(at, int(rng.integers(8))))
+        path = damage_file(small, tmp_path, flip(at, int(rng.integers(8))))
         found, losses = read_all(path)
         everything, least = messages_of(chunks), apart_from(chunks, at, at + 1)
         assert found in (everything, least)
@@ -121,7 +121,7 @@ def test_row_04_every_bit_of_every_record_head(small: Path, tmp_path: Path) -> N
         places = [*range(first.start, first.start + 9), *range(first.end, first.end + 9), second.start - 1]
         for at in places:
             for bit in range(8):
-                found, _ = read_all(damaged(small, tmp_path, flip(at, bit)))
+                found, _ = read_all(damage_file(small, tmp_path, flip(at, bit)))
                 assert found in (messages_of(chunks), apart_from(chunks, at, at + 1)), (at, bit)
 
 
@@ -132,7 +132,7 @@ def test_row_05_a_page_of_zeros(large: Path, tmp_path: Path, count: int) -> None
         pages = chunks[-1].end // PAGE_BYTES
         for page in sorted(set(offsets(pages, count // 2))):
             start, end = page * PAGE_BYTES, (page + 1) * PAGE_BYTES
-            path = damaged(large / name, tmp_path, cut(start, end, bytes(PAGE_BYTES)))
+            path = damage_file(large / name, tmp_path, cut(start, end, bytes(PAGE_BYTES)))
             found, losses = read_all(path)
             assert found == apart_from(chunks, start, end)
             assert losses.n_lost
@@ -140,9 +140,9 @@ def test_row_05_a_page_of_zeros(large: Path, tmp_path: Path, count: int) -> None
 
 def test_row_06_first_chunk_destroyed_without_a_summary(small: Path, tmp_path: Path, run: Run) -> None:
     first, *rest = chunks_of(small)
-    broken = damaged(small, tmp_path, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
+    broken = damage_file(small, tmp_path, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
     assert read_all(broken)[0] == messages_of(rest)  # the index still tells the channels
-    unfinished = damaged(broken, tmp_path, cut(rest[-1].end, 1 << 30))
+    unfinished = damage_file(broken, tmp_path, cut(rest[-1].end, 1 << 30))
     found, losses = read_all(unfinished)
     assert found == []
     assert losses.n_undecodable == len(messages_of(rest))
@@ -158,7 +158,7 @@ def test_row_06_the_other_file_says_whose_run_it_is(large: Path, tmp_path: Path)
     shutil.copytree(large, folder)
     core = folder / "0000.core.mcap"
     first, *rest = chunks_of(core)
-    damaged(core, folder, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
+    damage_file(core, folder, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
     assert run_info_of(folder).run_id == "run1"
     found, losses = read_all(folder)
     assert [each for each in found if each[0] != "/camera/image"] == messages_of(rest)
@@ -170,7 +170,7 @@ def test_row_07_footer_and_summary_destroyed(small: Path, tmp_path: Path, kept: 
     chunks = chunks_of(small)
     end = chunks[-1].end + round((small.stat().st_size - chunks[-1].end) * kept)
     for damage in (cut(end, 1 << 30), cut(end, 1 << 30, b"\xff" * 5000)):
-        found, losses = read_all(damaged(small, tmp_path, damage))
+        found, losses = read_all(damage_file(small, tmp_path, damage))
         assert found == messages_of(chunks)
         assert losses
 

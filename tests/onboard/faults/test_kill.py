@@ -17,7 +17,7 @@ from groundsbot.fixtures.recording.devices import PtyPort
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.recorder.recorder import RecorderCore, Run
-from tests.support.data.logs import CAMERA, MS, ROBOT_YAML, START_NS, drive, read_all, seen, wheel_entry, write_log
+from tests.support.data.logs import CAMERA, MS, ROBOT_YAML, START_NS, drive, facts, read_all, wheel_entry, write_log
 from tests.support.paths import ROOT
 
 LIMIT_S = 60.0  # only what hangs comes near
@@ -92,7 +92,7 @@ def check_promise(folder: Path, killed_s: float) -> None:
     told = np.array([line.split() for line in (folder / "told").read_text().splitlines()], dtype=float)
     found, _ = read_all(folder / "run1")
     readings = {each for each in found if each[0] == "/wheels"}
-    written = {index: seen([wheel_entry(index, START_NS + index * 10 * MS)])[0] for index in range(len(told) + 1)}
+    written = {index: facts([wheel_entry(index, START_NS + index * 10 * MS)])[0] for index in range(len(told) + 1)}
     assert readings <= set(written.values())
     held_up_s = max(np.diff(told[:, 1], append=killed_s).max() - 0.01, 0.0)
     promised = told[:, 1] <= killed_s - 1.0 - held_up_s
@@ -108,7 +108,7 @@ def test_row_43_salvage_killed_at_any_time(tmp_path: Path, count: int) -> None:
     delays_us = np.unique(np.geomspace(500, 300_000, count).astype(int))
     command = [sys.executable, "-c", SALVAGER, str(source), str(tmp_path), *map(str, delays_us)]
     subprocess.run(command, check=True, cwd=ROOT)
-    whole = seen(drive(20.0, picture_hz=5))
+    whole = facts(drive(20.0, picture_hz=5))
     n_done = 0
     for delay_us in delays_us:
         output = tmp_path / f"out{delay_us}"
@@ -139,10 +139,10 @@ def test_row_43_killed_around_the_rename(tmp_path: Path) -> None:
     entries = drive(3.0)
     run = write_log(tmp_path / "run1", entries)
     finished = run / "0000.core.mcap"
-    assert read_all(run)[0] == seen(entries)
+    assert read_all(run)[0] == facts(entries)
     finished.rename(run / "0000.core.mcap.active")
     found, losses = read_all(run)
-    assert found == seen(entries)
+    assert found == facts(entries)
     assert not losses  # whole to its end mark, whatever its name
 
 

@@ -18,19 +18,19 @@ from tests.support.devices.recorder_cores import (
     S,
     events_of,
     line_of,
-    made_core,
+    make_core,
     send,
     wheels_of,
 )
 from tests.support.guided_fuzz import fuzz
-from tests.support.wheel_line_fuzz import MODULES, check, renumbered, sealed, seeds
+from tests.support.wheel_line_fuzz import MODULES, check, renumber, seal, seeds
 
 HOST_NS = START_NS
 
 
 def test_row_23_ten_megabytes_of_noise(tmp_path: Path) -> None:
     chance = random.Random(23)
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     tracemalloc.start()
     for index in range(2500):
         core.on_serial_bytes(chance.randbytes(4096), START_NS + index * 4 * MS)
@@ -47,13 +47,13 @@ def test_row_23_ten_megabytes_of_noise(tmp_path: Path) -> None:
 
 
 def test_row_23_fuzzing_finds_nothing() -> None:
-    done = fuzz(check, seeds(), MODULES, seed=23, runs=400, mutations=(sealed, renumbered))
+    done = fuzz(check, seeds(), MODULES, seed=23, runs=400, mutations=(seal, renumber))
     assert done.edges > 150
 
 
 def test_row_24_all_intact_lines_come_out_of_noise_and_only_those(tmp_path: Path) -> None:
     chance = random.Random(24)
-    core, intact = made_core(tmp_path), []
+    core, intact = make_core(tmp_path), []
     for index in range(1500):
         whole = format_line(line_of(index))
         data = [whole, chance.randbytes(chance.randrange(60)).replace(b"\n", b"$") + whole][chance.randrange(2)]
@@ -72,7 +72,7 @@ def test_row_24_all_intact_lines_come_out_of_noise_and_only_those(tmp_path: Path
 
 def test_row_25_wrong_digits_are_rejected_counted_and_kept_now_and_then(tmp_path: Path) -> None:
     chance = random.Random(25)
-    core, wrong = made_core(tmp_path), set(chance.sample(range(10, 990), 200))
+    core, wrong = make_core(tmp_path), set(chance.sample(range(10, 990), 200))
     spoilt: list[bytes] = []
     for index in range(1000):
         data = format_line(line_of(index))
@@ -92,7 +92,7 @@ def test_row_25_wrong_digits_are_rejected_counted_and_kept_now_and_then(tmp_path
 
 def test_row_26_lost_lines_lose_no_distance(tmp_path: Path) -> None:
     chance = random.Random(26)
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     lost = set(chance.sample(range(1, 1999), 200))
     for index in range(2000):
         if index not in lost:
@@ -112,7 +112,7 @@ def test_row_27_duplicates_and_reordered_lines_move_nothing(tmp_path: Path) -> N
         order[at], order[at + 1] = order[at + 1], order[at]
     for at in range(480, 20, -31):  # says some again, a little later
         order.insert(at + chance.randrange(1, 9), order[at])
-    core, now_ns = made_core(tmp_path), START_NS
+    core, now_ns = make_core(tmp_path), START_NS
     for place, index in enumerate(order):
         now_ns = START_NS + place * PERIOD_NS
         core.on_serial_bytes(format_line(line_of(index)), now_ns)
@@ -130,7 +130,7 @@ def test_row_27_duplicates_and_reordered_lines_move_nothing(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("slow_hz", [100, 2])
 def test_row_28_time_and_ticks_wrap_around(tmp_path: Path, slow_hz: int) -> None:
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     step_us, now_ns = 1_000_000 // slow_hz, START_NS
     for index in range(400):
         wire = WheelLine(
@@ -156,7 +156,7 @@ def test_row_28_time_and_ticks_wrap_around(tmp_path: Path, slow_hz: int) -> None
 
 def test_row_30_a_wrong_baud_rate_is_told_of_within_three_seconds(tmp_path: Path) -> None:
     chance = random.Random(30)
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     core.on_port_connected("port", START_NS)
     for index in range(100):  # bits sampled at the wrong moments
         now_ns = START_NS + index * 50 * MS
@@ -170,7 +170,7 @@ def test_row_30_a_wrong_baud_rate_is_told_of_within_three_seconds(tmp_path: Path
 
 
 def test_row_30_silence_is_told_of_each_time_it_begins(tmp_path: Path) -> None:
-    core = made_core(tmp_path)
+    core = make_core(tmp_path)
     for index in [*range(100), *range(600, 700)]:
         for idle in range(index - 499 if index == 600 else index, index):
             core.tick(START_NS + idle * PERIOD_NS)

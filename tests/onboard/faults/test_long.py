@@ -15,7 +15,7 @@ from groundsbot.onboard.log.messages import StampSource
 from groundsbot.onboard.process.clock import RunClock
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
-from tests.support.devices.recorder_cores import MS, START_NS, S, made_core
+from tests.support.devices.recorder_cores import MS, START_NS, S, make_core
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
@@ -25,7 +25,7 @@ def test_row_42_a_day_of_readings_and_pictures_takes_no_more_memory_than_its_beg
     tmp_path: Path, minutes: int
 ) -> None:
     """The recorder's core as fast as it goes, a new file every 15 s; noise, gaps and clock steps among the readings."""
-    core, jpeg, in_use = made_core(tmp_path), tag_jpeg(), []
+    core, jpeg, in_use = make_core(tmp_path), tag_jpeg(), []
     tracemalloc.start()
     for index in range(minutes * 6000):
         now_ns = START_NS + index * 10 * MS
@@ -46,7 +46,7 @@ def test_row_42_a_day_of_readings_and_pictures_takes_no_more_memory_than_its_beg
     assert max(in_use[-third:]) < max(in_use[:third]) + 100_000, in_use
 
 
-def held() -> tuple[int, int, int]:
+def resources_in_use() -> tuple[int, int, int]:
     """Threads, open files and children of this process."""
     files = len(list(Path("/proc/self/fd").iterdir()))
     return threading.active_count(), files, len(multiprocessing.active_children())
@@ -71,7 +71,7 @@ def test_row_42_a_live_day_at_ten_times_the_speed(tmp_path: Path, n_looks: int) 
                 for _ in range(50):
                     camera.show(picture)
                     time.sleep(0.018)
-                looks.append((memory_mb(), *held()))
+                looks.append((memory_mb(), *resources_in_use()))
                 if len(looks) % 4 == 0:
                     lost = made.count("port_lost")
                     driver.unplug()

@@ -17,7 +17,7 @@ from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.messages import EventKind
 from groundsbot.onboard.log.reading.reader import find_logs
 from groundsbot.onboard.wheels.protocol import format_line, parse_line
-from tests.support.devices.recorder_cores import PERIOD_NS, START_NS, S, events_of, line_of, made_core, send, wheels_of
+from tests.support.devices.recorder_cores import PERIOD_NS, START_NS, S, events_of, line_of, make_core, send, wheels_of
 from tests.support.programs import Run
 
 AWAY_S = 20.0
@@ -95,7 +95,7 @@ def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
 
 
 def test_row_29_the_recorder_tells_of_the_reset_and_counts_anew(tmp_path: Path) -> None:
-    core, now_ns = made_core(tmp_path), START_NS
+    core, now_ns = make_core(tmp_path), START_NS
     for index in range(300):
         now_ns = send(core, index)
     for index in range(200):

@@ -9,9 +9,9 @@ import pytest
 
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, SpacePolicy
-from tests.support.data.logs import MS, START_NS, drive, picture_entry, read_all, seen, wheel_entry
+from tests.support.data.logs import MS, START_NS, drive, facts, picture_entry, read_all, wheel_entry
 from tests.support.devices.fake_disks import TroubledDisk
-from tests.support.devices.kept_logs import CORE, MB, S, make_keeper, names, record, seen_in, stepped, texts
+from tests.support.devices.kept_logs import CORE, MB, S, contents_of, make_keeper, names, record, step, texts
 from tests.support.paths import ROOT
 
 
@@ -19,7 +19,7 @@ def test_row_11_disk_full_in_mid_chunk(tmp_path: Path) -> None:
     disk = TroubledDisk(BALLAST_BYTES + 5 * MB)
     keeper = make_keeper(tmp_path, disk, pictures=True)
     entries = drive(6.0, picture_hz=10, picture_bytes=300_000)
-    red = [keeper.status.problem for _ in stepped(keeper, entries)][-1]
+    red = [keeper.status.problem for _ in step(keeper, entries)][-1]
     assert red is not None
     assert "No space left" in red
     assert names(tmp_path / "run1") == ["0000.camera.mcap", CORE]  # finished, with the ballast's room
@@ -48,11 +48,11 @@ def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
     disk = GreedyDisk(BALLAST_BYTES + 5 * MB)
     entries = drive(6.0, picture_hz=10, picture_bytes=300_000)
     keeper = make_keeper(tmp_path, disk, pictures=True)
-    for _ in stepped(keeper, entries):
+    for _ in step(keeper, entries):
         pass
     assert names(tmp_path / "run1") == ["0000.camera.mcap.active", f"{CORE}.active"]
     found, losses = read_all(tmp_path / "run1")
-    assert set(found) < set(seen(entries))
+    assert set(found) < set(facts(entries))
     assert len(losses.unfinished) == 2
     assert not losses.n_lost
 
@@ -86,7 +86,7 @@ def test_row_12_disk_full_from_the_start(tmp_path: Path) -> None:
     disk = TroubledDisk(capacity_bytes=100)
     keeper = make_keeper(tmp_path, disk)
     entries = drive(8.0)
-    for at_ns in stepped(keeper, entries):
+    for at_ns in step(keeper, entries):
         if at_ns < START_NS + 4 * S:
             assert keeper.status.problem is not None
         elif at_ns == START_NS + 4 * S:
@@ -94,7 +94,7 @@ def test_row_12_disk_full_from_the_start(tmp_path: Path) -> None:
     assert keeper.status.problem is None
     keeper.finish(100.0)
     assert names(tmp_path / "run1") == [CORE]
-    assert seen_in(tmp_path) == seen(entries)
+    assert contents_of(tmp_path) == facts(entries)
     assert [text for text in texts(keeper) if "recording again" in text]
 
 
@@ -112,7 +112,7 @@ def test_row_12_what_memory_cannot_hold_is_counted(tmp_path: Path) -> None:
     assert 0 < lost["/wheels"] < n_readings
     disk.capacity_bytes = 1 << 40
     keeper.finish(100.0)
-    readings = [each for each in seen_in(tmp_path) if each[0] == "/wheels"]
+    readings = [each for each in contents_of(tmp_path) if each[0] == "/wheels"]
     assert len(readings) == n_readings - lost["/wheels"]
     assert readings[-1][2] == START_NS + S + (n_readings - 1) * MS  # the oldest went
     told = {topic: count for note in keeper.take_notes() for topic, count in note.lost.items()}
@@ -138,12 +138,12 @@ def test_row_13_little_space(tmp_path: Path, allowed: bool) -> None:
     expected = {f"{run}/{name}" for run in ("new", "middle", "old") for name in files_of_old()} - gone
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.glob("[mno]*/*")}
     assert left == expected
-    kept = [each for each in seen_in(tmp_path) if each[0] == "/camera/image"]
+    kept = [each for each in contents_of(tmp_path) if each[0] == "/camera/image"]
     assert len(kept) + keeper.status.lost.get("/camera/image", 0) == 24
     assert (len(kept) > 20) == allowed
     assert any("pictures" in text for text in texts(keeper))
-    wheels = [each for each in seen(entries) if each[0] == "/wheels"]
-    assert [each for each in seen_in(tmp_path) if each[0] == "/wheels"] == wheels
+    wheels = [each for each in facts(entries) if each[0] == "/wheels"]
+    assert [each for each in contents_of(tmp_path) if each[0] == "/wheels"] == wheels
 
 
 def files_of_old() -> tuple[str, ...]:

@@ -111,7 +111,7 @@ def test_a_decoder_that_knows_foxgloves_schemas_only(tmp_path: Path) -> None:
             for schema, channel, message in make_reader(stream).iter_messages():
                 assert schema is not None
                 if schema.name.startswith("foxglove."):
-                    found[channel.topic] = decoded_by_schema(schema.data, schema.name, message.data)
+                    found[channel.topic] = decode_by_schema(schema.data, schema.name, message.data)
     assert set(found) == {"/camera/image", "/camera/calibration", "/tf"}
     image, calibration, mount = (found[topic] for topic in ("/camera/image", "/camera/calibration", "/tf"))
     assert (image.format, image.frame_id, image.data[:2]) == ("jpeg", "camera", b"\xff\xd8")  # type: ignore[attr-defined]  # built at run time
@@ -120,7 +120,7 @@ def test_a_decoder_that_knows_foxgloves_schemas_only(tmp_path: Path) -> None:
     assert (mount.parent_frame_id, mount.child_frame_id, mount.translation.x) == ("base", "camera", 0.1)  # type: ignore[attr-defined]  # same
 
 
-def decoded_by_schema(schema: bytes, name: str, data: bytes) -> object:
+def decode_by_schema(schema: bytes, name: str, data: bytes) -> object:
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
         pool.Add(file)
@@ -202,7 +202,7 @@ def test_what_was_discarded_leaves_nothing(tmp_path: Path) -> None:
         LogWriter(tmp_path / "file", {"/run": RunInfo()}, 0)
 
 
-def flipped(data: bytes, at: int) -> bytes:
+def flip(data: bytes, at: int) -> bytes:
     return data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
 
 
@@ -230,7 +230,7 @@ def test_no_flipped_bit_gives_a_wrong_message(tmp_path: Path) -> None:
     expected = list(read_log(path))
     refused = 0
     for at in range(8, len(good), 37):
-        path.write_bytes(flipped(good, at))
+        path.write_bytes(flip(good, at))
         got: list[LogMessage] = []
         try:
             for each in read_log(path):

@@ -16,9 +16,9 @@ from groundsbot.onboard.log.writing.writer import head_records
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
-from tests.support.data.logs import MS, START_NS, head, picture_entry, seen, wheel_entry
+from tests.support.data.logs import MS, START_NS, facts, head, picture_entry, wheel_entry
 from tests.support.devices.fake_disks import TroubledDisk
-from tests.support.devices.kept_logs import LIMIT_S, MB, S, make_keeper, seen_in, texts
+from tests.support.devices.kept_logs import LIMIT_S, MB, S, contents_of, make_keeper, texts
 from tests.support.devices.live_recording import until
 
 READINGS = [wheel_entry(index, START_NS + index * 10 * MS) for index in range(300)]
@@ -51,7 +51,7 @@ def test_an_error_that_is_none_of_the_disks_costs_a_new_file_and_nothing_else(
             keeper.write(*entry)
         keeper.step(0.0)
     keeper.finish(0.0)
-    assert sorted(seen_in(tmp_path)) == sorted(seen(READINGS))
+    assert sorted(contents_of(tmp_path)) == sorted(facts(READINGS))
     assert [text for text in texts(keeper) if "MemoryError" in text]
 
 
@@ -72,7 +72,7 @@ def test_a_reading_that_no_file_takes_is_lost_alone_and_counted(
         keeper.write(*entry)
     keeper.step(0.0)
     keeper.finish(0.0)
-    assert seen_in(tmp_path) == seen([*READINGS[:50], *READINGS[51:]])
+    assert contents_of(tmp_path) == facts([*READINGS[:50], *READINGS[51:]])
     assert keeper.status.lost == {"/wheels": 1}
 
 
@@ -84,7 +84,7 @@ def test_a_fault_in_the_logs_thread_does_not_end_it(tmp_path: Path, monkeypatch:
         log.write(*entry)
     until(lambda: log.status.waiting_bytes == 0, "the readings on the disk")
     log.close()
-    assert seen_in(tmp_path) == seen(READINGS)
+    assert contents_of(tmp_path) == facts(READINGS)
     (note,) = [note for note in log.take_notes() if "MemoryError" in note.text]
     assert note.lost
 
@@ -220,4 +220,4 @@ def test_a_new_segment_costs_a_step_no_finishing_of_the_old_one(tmp_path: Path) 
         counts.append(disk.n_syncs)
     assert counts[1:7] == [2, 2, 5, 4, 4, 2]
     keeper.finish(9.0)
-    assert len(seen_in(tmp_path)) == 36
+    assert len(contents_of(tmp_path)) == 36

@@ -49,7 +49,7 @@ class SteppedLog:
         self.keeper.finish(self.last_log_time_ns / S)
 
 
-def recorded(
+def record(
     folder: Path, rng: np.random.Generator, lines_hz: int, pictures_hz: int, picture_bytes: int
 ) -> tuple[Path, float]:
     """A drive whose speed and clock are uneven, and pictures with six tags: the run's folder, and seconds."""
@@ -94,7 +94,7 @@ def test_check_foresees_what_status_measures(
 ) -> None:
     rates = Rates()
     rates.add(Look(START_NS, {}, {}, 0))
-    folder, seconds = recorded(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
+    folder, seconds = record(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
     written = sum(each.stat().st_size for each in folder.iterdir())
     rates.add(Look(START_NS + round(seconds * S), {}, {}, written))
     foreseen = hours_until_full(10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes).bytes_per_s)

@@ -77,7 +77,7 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
     assert sorted(each.name for each in (tmp_path / "logs").iterdir() if "status" in each.name) == [path.name]
 
 
-def made_status(**changes: object) -> Status:
+def make_status(**changes: object) -> Status:
     device = {"name": "port", "rate_hz": 100.0, "age_s": 0.0, "expected": True}
     disk = {"free_bytes": 10**9, "bytes_per_s": 1e4, "hours_left": 27.8, "waiting_bytes": 0, "problem": None}
     values: dict[str, object] = {
@@ -102,7 +102,7 @@ def made_status(**changes: object) -> Status:
 def test_the_command_says_it_in_plain_lines(
     tmp_path: Path, changes: dict[str, object], code: int, words: list[str]
 ) -> None:
-    assert write_status(made_status(**changes), tmp_path / "gb1.status.json") is None
+    assert write_status(make_status(**changes), tmp_path / "gb1.status.json") is None
     said = CliRunner().invoke(app, ["status", "--once", str(tmp_path)])
     assert said.exit_code == code
     assert [word for word in words if word not in said.output] == []
@@ -121,13 +121,13 @@ def test_a_status_is_never_written_through_a_link(tmp_path: Path) -> None:
     victim.write_text("precious")
     path.symlink_to(victim)
     (tmp_path / f".{path.name}.{os.getpid()}.partial").symlink_to(victim)
-    assert write_status(made_status(), path) is None
+    assert write_status(make_status(), path) is None
     assert victim.read_text() == "precious"
     assert read_status(path).robot_id == "gb1"
 
 
 def test_a_disk_that_will_not_have_the_status_does_not_stop_the_recorder(tmp_path: Path) -> None:
-    assert write_status(made_status(), tmp_path / "absent" / "gb1.status.json") == "No such file or directory"
+    assert write_status(make_status(), tmp_path / "absent" / "gb1.status.json") == "No such file or directory"
 
 
 class FakeRecorder:

@@ -29,7 +29,7 @@ print(stop.wait(0.2))
 """
 
 
-def told(code: str) -> str:
+def exit_line(code: str) -> str:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -37,8 +37,8 @@ def told(code: str) -> str:
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_told_while_the_main_thread_holds_the_events_lock(name: str) -> None:
-    assert told(TOLD_WHILE_LOCKED.format(name=name)) == "True\n"
+    assert exit_line(TOLD_WHILE_LOCKED.format(name=name)) == "True\n"
 
 
 def test_what_it_was_started_to_ignore_stays_ignored() -> None:
-    assert told(TOLD_WHAT_IS_IGNORED) == "False\n"
+    assert exit_line(TOLD_WHAT_IS_IGNORED) == "False\n"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.fixtures.recording.devices import PtyPort, paced, wheel_line
+from groundsbot.fixtures.recording.devices import PtyPort, pace, wheel_line
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.recorder.pictures import PictureSchedule
@@ -50,7 +50,7 @@ def wait_for(output: IO[str] | None, *words: str) -> list[str]:
 
 
 def feed_wheels(port: PtyPort, seconds: float) -> list[int | None]:
-    return [send(port, index) for index in islice(paced(100.0), round(100.0 * seconds))]
+    return [send(port, index) for index in islice(pace(100.0), round(100.0 * seconds))]
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def wheels_fed(port: PtyPort) -> Iterator[None]:
     enough = threading.Event()
 
     def feed() -> None:
-        for index in takewhile(lambda _: not enough.is_set(), paced(100.0)):
+        for index in takewhile(lambda _: not enough.is_set(), pace(100.0)):
             send(port, index)
 
     feeder = threading.Thread(target=feed)
@@ -79,7 +79,7 @@ def feed_pictures(folder: Path, seconds: float) -> list[tuple[int, int]]:
     """
     picture = cv2.imencode(".png", draw_tag("tag36h11", 9, CORNERS, (120, 160)))[1].tobytes()
     exposed = []
-    for index in islice(paced(15.0), round(15.0 * seconds)):
+    for index in islice(pace(15.0), round(15.0 * seconds)):
         before_ns, realtime_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         path = folder / f"{realtime_ns}.png"
         if index % 3 == 0:

@@ -119,7 +119,7 @@ def step_by_step(time: LogicalTime, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_thread, "time", SimpleNamespace(monotonic=lambda: time.now_ns / 1e9))
 
 
-def recorded(
+def record(
     monkeypatch: pytest.MonkeyPatch, *, wheels: bool, camera: bool, expect_wheels: bool
 ) -> tuple[SlowDisk, list[tuple[int, int]]]:
     """A recording of 11 s; its disk, and how much had been done to it at which time."""
@@ -161,7 +161,7 @@ def recorded(
     return disk, kills
 
 
-def left(disk: MortalDisk, n_acts: int, folder: Path) -> set[Found]:
+def remains(disk: MortalDisk, n_acts: int, folder: Path) -> set[Found]:
     """What a power cut after so many acts leaves for sure."""
     for path, content in disk.after_power_cut(n_acts, cast(np.random.Generator, Nothing())).items():
         if path.suffix != ".ballast":
@@ -189,13 +189,13 @@ def test_row_01_whatever_was_measured_a_second_ago_is_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wheels: bool, camera: bool, expect_wheels: bool
 ) -> None:
     """While the controller's clock is learnt, while tags wait for wheels, and while a new segment begins."""
-    disk, kills = recorded(monkeypatch, wheels=wheels, camera=camera, expect_wheels=expect_wheels)
+    disk, kills = record(monkeypatch, wheels=wheels, camera=camera, expect_wheels=expect_wheels)
     found: dict[int, set[Found]] = {}
     late: set[Found] = set()
     for at_ns, n_acts in kills:
         n_synced = sum(act.what.startswith("sync") for act in disk.acts[:n_acts])
         if n_synced not in found:
-            found[n_synced] = left(disk, n_acts, tmp_path / str(n_synced))
+            found[n_synced] = remains(disk, n_acts, tmp_path / str(n_synced))
         promised = {("/wheels", each) for each in range(100, (at_ns - S) // (10 * MS) + 1)} if wheels else set()
         if camera:
             promised |= {("/tags/detections", each) for each in range((at_ns - S - 5 * MS) // FRAME_NS + 1)}

@@ -41,7 +41,7 @@ _ROS1_TYPES = {
 _EMPTY: dict[str, Any] = {"float": 0.0, "string": "", "bool": False}
 
 
-def made_stores() -> tuple[Typestore, Typestore]:
+def make_stores() -> tuple[Typestore, Typestore]:
     """Of ROS 1 and ROS 2, with the types of AprilTag detectors."""
     ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
     for name, text in _ROS1_TYPES.items():
@@ -52,7 +52,7 @@ def made_stores() -> tuple[Typestore, Typestore]:
     return ros1, ros2
 
 
-STORE1, STORE2 = made_stores()
+STORE1, STORE2 = make_stores()
 
 
 class Sent(NamedTuple):
@@ -64,17 +64,17 @@ class Sent(NamedTuple):
     fields: dict[str, Any]
 
 
-def made_message(store: Typestore, msgtype: str, fields: dict[str, Any]) -> Any:
+def make_message(store: Typestore, msgtype: str, fields: dict[str, Any]) -> Any:
     """A message of a store's class; fields by name, messages within as such mappings."""
     unknown = set(fields) - {name for name, _ in store.fielddefs[msgtype][1]}
     assert not unknown, f"{msgtype} has no {unknown}"
-    values = {name: _made(store, kind, fields.get(name)) for name, kind in store.fielddefs[msgtype][1]}
+    values = {name: _make(store, kind, fields.get(name)) for name, kind in store.fielddefs[msgtype][1]}
     return store.types[msgtype](**values)
 
 
-def _made(store: Typestore, kind: Any, value: Any) -> Any:
+def _make(store: Typestore, kind: Any, value: Any) -> Any:
     if kind[0] == Nodetype.NAME:
-        return made_message(store, kind[1], value or {})
+        return make_message(store, kind[1], value or {})
     if kind[0] == Nodetype.BASE:
         name = kind[1][0]
         return value if value is not None else _EMPTY.get(name.rstrip("0123456789"), 0)
@@ -83,7 +83,7 @@ def _made(store: Typestore, kind: Any, value: Any) -> Any:
         dtype = np.dtype(inner[1][0].replace("bool", "bool_"))
         return np.zeros(length, dtype) if value is None else np.asarray(value, dtype)
     given = list(value) if value is not None else [None] * length
-    return [_made(store, inner, each) for each in given]
+    return [_make(store, inner, each) for each in given]
 
 
 def write_bag(path: Path, messages: Iterable[Sent]) -> Path:
@@ -99,7 +99,7 @@ def write_bag(path: Path, messages: Iterable[Sent]) -> Path:
             key = (each.topic, each.msgtype)
             if key not in connections:
                 connections[key] = writer.add_connection(*key, typestore=store)
-            message = made_message(store, each.msgtype, _of_ros1(each.fields) if is_ros1 else each.fields)
+            message = make_message(store, each.msgtype, _of_ros1(each.fields) if is_ros1 else each.fields)
             data = store.serialize_ros1(message, key[1]) if is_ros1 else store.serialize_cdr(message, key[1])
             writer.write(connections[key], each.received_ns, data)
     return path

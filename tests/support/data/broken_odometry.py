@@ -10,7 +10,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
-from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town
+from tests.support.data.long_drives import LongDrive, Town, make_long_drive, make_town
 
 NOISE = NoiseParameters()
 LENGTH_M = 250.0
@@ -26,14 +26,14 @@ class BrokenDrive:
     begin: int = 0
 
 
-def made_clean_drive(seed: int, spacing_m: tuple[float, float] = (3.0, 8.0), town: Town | None = None) -> LongDrive:
+def make_clean_drive(seed: int, spacing_m: tuple[float, float] = (3.0, 8.0), town: Town | None = None) -> LongDrive:
     """A quarter of a kilometre past tags a few metres apart; noise as told."""
-    return made_long_drive(
-        seed, LENGTH_M, town=town or made_town(1000 + seed, spacing_m), noise=NOISE, noise_factors=(1.0, 1.0)
+    return make_long_drive(
+        seed, LENGTH_M, town=town or make_town(1000 + seed, spacing_m), noise=NOISE, noise_factors=(1.0, 1.0)
     )
 
 
-def carried(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
+def carry(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     """After a share of the way the robot is lifted and set down where it would have been some metres on."""
     along_m = np.append(0.0, np.cumsum(drive.chain.odometry.distance_m))
     first = int(np.searchsorted(along_m, share * along_m[-1]))
@@ -41,10 +41,10 @@ def carried(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     chain = drive.chain
     before, after = chain.part(0, first + 1), chain.part(begin, len(chain.stamps_ns))
     still = _motionless(chain.odometry, first)
-    return _joined(drive, before, after, still, np.r_[0 : first + 1, begin : len(chain.stamps_ns)], PAUSE_S)
+    return _join(drive, before, after, still, np.r_[0 : first + 1, begin : len(chain.stamps_ns)], PAUSE_S)
 
 
-def slipped(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
+def slip(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     """After a share of the way the wheels turn on the spot for some metres; nothing is read meanwhile."""
     chain = drive.chain
     first = int(share * len(chain.stamps_ns))
@@ -53,7 +53,7 @@ def slipped(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))
     begin = int(np.searchsorted(along_m, along_m[first] - length_m))
     spun = chain.odometry.part(begin, first)
-    return _joined(
+    return _join(
         drive,
         before,
         after,
@@ -76,7 +76,7 @@ def _motionless(odometry: ChainOdometry, step: int) -> ChainOdometry:
     )
 
 
-def _joined(
+def _join(
     drive: LongDrive, before: Chain, after: Chain, between: ChainOdometry, pose: IntArray, pause_s: float
 ) -> BrokenDrive:
     """Two parts with other motions between them, which take a while: len(between) - 1 keyframes without readings."""

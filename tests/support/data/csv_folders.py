@@ -22,7 +22,7 @@ def folder_with(tmp_path: Path, files: dict[str, str], name: str = "drive") -> P
     return folder
 
 
-def imported(
+def import_run(
     tmp_path: Path, odometry: str = ODOMETRY, observations: str = OBSERVATIONS, options: ImportOptions = TRACK
 ) -> ImportReport:
     folder = folder_with(tmp_path, {"odometry.csv": odometry, "observations.csv": observations})

@@ -29,7 +29,7 @@ _HALF_SIDE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.
 _FACE_TOWARDS_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def made_robot(robot_id: str = "carl", **sections: object) -> Robot:
+def make_robot(robot_id: str = "carl", **sections: object) -> Robot:
     """A robot whose ticks are as fine as a nanometre; whole sections can be replaced."""
     content: dict[str, object] = {
         "robot_id": robot_id,
@@ -101,7 +101,7 @@ class MadeDrive:
         return WheelTrack(self.stamps_ns, self.left_m, self.right_m)
 
 
-def made_drive(
+def make_drive(
     start: Sequence[float], legs: Sequence[tuple[float, float, float]], track_m: float = 0.5, step_ns: int = S // 100
 ) -> MadeDrive:
     """Legs of (left speed, right speed, seconds), a wheel reading each step."""
@@ -160,7 +160,7 @@ def write_drive(
         boot_of: (N,) the controller's boot id at each wheel reading; one for all by default.
         seed: of the noise.
     """
-    robot = robot or made_robot()
+    robot = robot or make_robot()
     rng = np.random.default_rng(seed)
     entries: list[tuple[int, str, WheelEncoders | TagDetections]] = []
     left_m_per_tick, right_m_per_tick = robot.wheels.metres_per_tick
@@ -190,7 +190,7 @@ def write_drive(
     return log
 
 
-def made_run(
+def make_run(
     tracks: Sequence[WheelTrack],
     *,
     robot: Robot | None = None,
@@ -201,7 +201,7 @@ def made_run(
     positions: Positions | None = None,
 ) -> Run:
     """A run as if it had been read from a log."""
-    robot = robot or made_robot()
+    robot = robot or make_robot()
     none = np.zeros(0, dtype=np.int64)
     return Run(
         name=f"{robot.robot_id}_one",
@@ -214,13 +214,13 @@ def made_run(
         picture_stamps_ns=none if pictures_ns is None else pictures_ns,
         tags=tuple(tags),
         detections=detections or Detections(none, none, np.zeros((0, 4, 2))),
-        positions=positions or made_positions(none, none, np.zeros((0, 2))),
+        positions=positions or make_positions(none, none, np.zeros((0, 2))),
         warnings=(),
         log_bytes=1 << 24,
     )
 
 
-def made_positions(stamps_ns: IntArray, tag: IntArray, xy_m: FloatArray, sigma_m: float = 0.05) -> Positions:
+def make_positions(stamps_ns: IntArray, tag: IntArray, xy_m: FloatArray, sigma_m: float = 0.05) -> Positions:
     """Tag places (M, 2) in base, with a covariance."""
     n = len(stamps_ns)
     return Positions(

@@ -26,7 +26,7 @@ _BATCH_SIGMA: Final = (0.005, 0.005)
 N_ROBOTS: Final = 2
 
 
-def made_graph(
+def make_graph(
     seed: int, lengths: list[int], n_tags: int, *, calibrated: bool = True, reach: float = 0.3, held: float = 0.0
 ) -> tuple[Problem, State]:
     """A problem and the state that its measurements are of, but for their noise.
@@ -41,8 +41,8 @@ def made_graph(
     """
     rng = np.random.default_rng(seed)
     sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
-    poses, first, chain_of = _driven(rng, lengths)
-    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _drawn(rng))
+    poses, first, chain_of = _drive(rng, lengths)
+    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _draw(rng))
     readings = _readings(rng, truth, lengths, chain_of, reach)
     problem = Problem(
         odometry=_odometry(rng, truth, first, chain_of),
@@ -54,7 +54,7 @@ def made_graph(
     return problem, truth
 
 
-def _drawn(rng: np.random.Generator) -> FloatArray:
+def _draw(rng: np.random.Generator) -> FloatArray:
     """Calibration in sigmas; of each robot all but nine numbers by a generator of their own."""
     others = rng.standard_normal(1 + N_ROBOTS * 9 + len(_BATCH_SIGMA))
     at = np.tile([1 + (i + 1) * 9 for i in range(N_ROBOTS)], _OF_ROBOT - 9)
@@ -62,7 +62,7 @@ def _drawn(rng: np.random.Generator) -> FloatArray:
     return drawn
 
 
-def reordered(problem: Problem, rng: np.random.Generator) -> Problem:
+def reorder(problem: Problem, rng: np.random.Generator) -> Problem:
     """The same with the readings in another order."""
     order = rng.permutation(len(problem.readings.pose))
     readings = problem.readings
@@ -92,7 +92,7 @@ def with_measured(problem: Problem, truth: State, seed: int, n: int) -> Problem:
     return replace(problem, measured=Measured(starts, distances))
 
 
-def _driven(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, IntArray, IntArray]:
+def _drive(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, IntArray, IntArray]:
     poses: list[FloatArray] = []
     first = []
     for length in lengths:

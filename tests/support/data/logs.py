@@ -101,7 +101,7 @@ def write_log(path: Path, entries: Sequence[Entry], run_id: str = "run1", finish
     return path
 
 
-def seen(entries: Sequence[Entry]) -> list[Seen]:
+def facts(entries: Sequence[Entry]) -> list[Seen]:
     return [(each[0], each[2], each[3], each[1].SerializeToString(deterministic=True)) for each in entries]
 
 

@@ -17,7 +17,7 @@ from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
 from groundsbot.offline.measurements.tags import Positions, TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph
-from tests.support.data.drives import FAMILY, START_NS, S, made_robot, made_run
+from tests.support.data.drives import FAMILY, START_NS, S, make_robot, make_run
 
 ROAD_M: Final = 25.0
 N_CROSSINGS: Final = 5  # along each side of the town
@@ -77,7 +77,7 @@ class LongDrive:
         )
 
 
-def made_long_drive(
+def make_long_drive(
     seed: int,
     length_m: float = 1000.0,
     picture_every: int = 5,
@@ -103,7 +103,7 @@ def made_long_drive(
     """
     rng = np.random.default_rng(seed)
     robot = _robot(radius_sigma, "carl" if town is None else f"carl{seed}")
-    driven = _driven(rng, length_m, N_CROSSINGS if town is None else town.n_crossings)
+    driven = _drive(rng, length_m, N_CROSSINGS if town is None else town.n_crossings)
     poses = se2.compose(se2.inverse(driven[0]), driven)
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses), dtype=np.int64)
     placed = _placed_tags(rng, TAG_SPACING_M) if town is None else town.tags_m
@@ -128,7 +128,7 @@ def made_long_drive(
         np.tile(np.diag(SIGMA_READING**2), (n, 1, 1)), np.ones(n, dtype=np.bool_),
     )  # fmt: skip
     track = _wheel_track(stamps_ns, poses, robot, calibration)
-    run = made_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
+    run = make_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
     (chain,) = chains_of(replace(run, log_bytes=MESSAGE_BYTES * (len(stamps_ns) + len(pictures))), noise)
     return LongDrive(
         _with_noise(rng, chain, odometry_factor),
@@ -170,11 +170,11 @@ def with_a_moved_tag(drive: LongDrive, chain: Chain | None = None) -> Chain:
     return replace(chain, readings=replace(readings, value=value))
 
 
-def made_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_crossings: int = N_CROSSINGS) -> Town:
+def make_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_crossings: int = N_CROSSINGS) -> Town:
     """Roads with tags so far apart, and their batch a draw from its prior."""
     rng = np.random.default_rng(seed)
     placed = _placed_tags(rng, spacing_m, n_crossings)
-    return Town(placed, made_robot().tags[0].relative_sigma * float(rng.standard_normal()), n_crossings)
+    return Town(placed, make_robot().tags[0].relative_sigma * float(rng.standard_normal()), n_crossings)
 
 
 def _is_there(town: Town, tag: IntArray, share: FloatArray) -> BoolArray:
@@ -185,7 +185,7 @@ def _is_there(town: Town, tag: IntArray, share: FloatArray) -> BoolArray:
 
 
 def _robot(radius_sigma: float | None, robot_id: str) -> Robot:
-    robot = made_robot(robot_id)
+    robot = make_robot(robot_id)
     if radius_sigma is None:
         return robot
     wheels_section = robot.wheels.model_copy(
@@ -197,7 +197,7 @@ def _robot(radius_sigma: float | None, robot_id: str) -> Robot:
     return robot.model_copy(update={"wheels": wheels_section})
 
 
-def _driven(rng: np.random.Generator, length_m: float, n_crossings: int) -> FloatArray:
+def _drive(rng: np.random.Generator, length_m: float, n_crossings: int) -> FloatArray:
     """(N, 3) true poses at the wheel readings: along roads, turning on the spot."""
     place, way = rng.integers(0, n_crossings, 2), int(rng.integers(0, 4))
     turns, steps = round(0.5 * np.pi / STEP_RAD), round(ROAD_M / STEP_M)

@@ -10,7 +10,7 @@ from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.drives import FAMILY, START_NS, MadeTag, S, made_drive, made_robot, write_drive
+from tests.support.data.drives import FAMILY, START_NS, MadeTag, S, make_drive, make_robot, write_drive
 
 TAGS = [
     MadeTag(0, (6.0, 1.0, 0.5), np.pi),
@@ -19,12 +19,12 @@ TAGS = [
     MadeTag(3, (5.0, 3.0, 0.45), -2.2),
 ]
 AHEAD = [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.5, 0.44, 2.0)]
-DRIVES = {"a": made_drive([0.0, 0.0, 0.2], AHEAD), "b": made_drive([0.5, 1.0, -0.1], AHEAD)}
+DRIVES = {"a": make_drive([0.0, 0.0, 0.2], AHEAD), "b": make_drive([0.5, 1.0, -0.1], AHEAD)}
 
 
-def made_logs(folder: Path) -> dict[str, Path]:
+def make_logs(folder: Path) -> dict[str, Path]:
     """Both drives, by robot."""
-    return {name: write_drive(folder, drive, TAGS, made_robot(name)) for name, drive in DRIVES.items()}
+    return {name: write_drive(folder, drive, TAGS, make_robot(name)) for name, drive in DRIVES.items()}
 
 
 def rewritten(
@@ -45,7 +45,7 @@ def rewritten(
 
 
 def imported_log(folder: Path, odometry_m: float = 0.2, place_m: float = 3.0) -> Path:
-    robot = made_robot("i")
+    robot = make_robot("i")
     head = log_head(robot, robot.model_dump_json(), None, "one", START_NS, 0)
     log = folder / "one"
     with LogWriter(log, head, START_NS, durable=False) as writer:
@@ -59,7 +59,7 @@ def imported_log(folder: Path, odometry_m: float = 0.2, place_m: float = 3.0) ->
     return log
 
 
-def spliced(parts: list[Path], folder: Path) -> Path:
+def splice(parts: list[Path], folder: Path) -> Path:
     """Pictures in turn from several versions of one drive: something in them moves."""
     per_part = [list(read_log(part)) for part in parts]
     pictures = [i for i, entry in enumerate(per_part[0]) if isinstance(entry.message, TagDetections)]

@@ -18,7 +18,7 @@ START_B = np.array([10.0, 2.0, np.pi / 2])
 TAG_PLACES = {("tag36h11", 3): (4.0, 1.0), ("tag36h11", 7): (6.0, -2.0), ("tag25h9", 3): (9.0, 5.0)}
 
 
-def made_run(name: str, T_map_start: FloatArray, covariance: FloatArray, n: int = 20) -> RunResult:
+def make_run(name: str, T_map_start: FloatArray, covariance: FloatArray, n: int = 20) -> RunResult:
     """A run that drives an arc from its start, a keyframe every STEP_NS."""
     steps = np.arange(n)[:, np.newaxis] * np.array([0.1, 0.0, 0.02])
     robot_id, run_id = name.split("_")
@@ -36,13 +36,13 @@ def made_run(name: str, T_map_start: FloatArray, covariance: FloatArray, n: int 
     )
 
 
-def made_component(a: str = "red_one", b: str = "blue_two") -> Component:
+def make_component(a: str = "red_one", b: str = "blue_two") -> Component:
     """Two runs and three tags, exactly right, with a joint covariance that couples everything but the frame's start."""
     n = 3 + 2 * len(TAG_PLACES)
     root = 0.02 * np.random.default_rng(5).normal(size=(n, n)) + 0.05 * np.eye(n)
     joint = np.zeros((3 + n, 3 + n))
     joint[3:, 3:] = root @ root.T
-    runs = (made_run(a, np.zeros(3), np.zeros((3, 3))), made_run(b, START_B, joint[3:6, 3:6]))
+    runs = (make_run(a, np.zeros(3), np.zeros((3, 3))), make_run(b, START_B, joint[3:6, 3:6]))
     tags = []
     for index, ((family, tag_id), place) in enumerate(TAG_PLACES.items()):
         rows = slice(6 + 2 * index, 8 + 2 * index)
@@ -52,9 +52,9 @@ def made_component(a: str = "red_one", b: str = "blue_two") -> Component:
     return Component(a, runs, tuple(tags), joint, cost=12.5, n_residuals=40, start_to_start=(start,))
 
 
-def made_map(*components: Component) -> MapResult:
+def make_map(*components: Component) -> MapResult:
     """A whole map; of one component unless others are given."""
-    components = components or (made_component(),)
+    components = components or (make_component(),)
     return MapResult(
         components=components,
         alignments=(AlignmentResult("red_one", "blue_two", START_B, 2, 2, 0.03, (("tag36h11", 9),)),),
@@ -96,7 +96,7 @@ def made_map(*components: Component) -> MapResult:
     )
 
 
-def made_truth(component: Component, T_world_map: FloatArray | None = None) -> Truth:
+def make_truth(component: Component, T_world_map: FloatArray | None = None) -> Truth:
     """The truth that a component would be exactly right by, the world's frame lying anywhere."""
     T = np.zeros(3) if T_world_map is None else T_world_map
     return Truth(

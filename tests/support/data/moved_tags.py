@@ -16,7 +16,7 @@ from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.places import NOWHERE, Places
 from tests.support.data.drives import FAMILY, S
-from tests.support.data.long_drives import LongDrive, Town, made_long_drive, made_town
+from tests.support.data.long_drives import LongDrive, Town, make_long_drive, make_town
 
 N_TAGS: Final = 40
 N_RUNS: Final = 4
@@ -60,7 +60,7 @@ class Scene:
         return np.asarray(np.linalg.norm(seen - self.other_m[tag_id], axis=1) < far)
 
 
-def made_scene(seed: int, kind: str = CLEAN, n_tags: int = 0, shift_m: float = 0.0) -> Scene:
+def make_scene(seed: int, kind: str = CLEAN, n_tags: int = 0, shift_m: float = 0.0) -> Scene:
     """Four drives; what is done is done after the second, or halfway through it to moving tags.
 
     Args:
@@ -92,7 +92,7 @@ def made_scene(seed: int, kind: str = CLEAN, n_tags: int = 0, shift_m: float = 0
         towns = [replace(town, tag_ids=ids)] * N_RUNS
     drives = tuple(
         _later(
-            made_long_drive(
+            make_long_drive(
                 1000 * seed + i, LENGTH_M, _EVERY, town=each, noise=NoiseParameters(), noise_factors=(1.0, 1.0)
             ),
             i,
@@ -115,7 +115,7 @@ def _town(seed: int) -> Town:
     """Of the towns with so many tags at least, the first N_TAGS, in any order."""
     rng = np.random.default_rng([seed, 0])
     while True:
-        town = made_town(int(rng.integers(2**31)), _SPACING_M, n_crossings=2)
+        town = make_town(int(rng.integers(2**31)), _SPACING_M, n_crossings=2)
         if len(town.tags_m) >= N_TAGS:
             return replace(town, tags_m=town.tags_m[rng.permutation(len(town.tags_m))[:N_TAGS]])
 

@@ -13,7 +13,7 @@ def covariances_of_steps(poses: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros((1, 3, 3)), steps])
 
 
-def accumulated(poses: FloatArray, steps: FloatArray) -> FloatArray:
+def accumulate(poses: FloatArray, steps: FloatArray) -> FloatArray:
     """(N, 3, 3) in odom, of poses reached by such steps: that of the one before, carried on, and the step's own."""
     found = [np.zeros((3, 3))]
     for before, after, step in zip(poses[:-1], poses[1:], steps[1:], strict=True):

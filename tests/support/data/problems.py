@@ -29,7 +29,7 @@ class MadeProblem:
     truth: State
 
 
-def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_calibration: bool = False) -> MadeProblem:
+def make_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_calibration: bool = False) -> MadeProblem:
     """Two chains past six tags; readings polar and cartesian, about a mounted camera and about base.
 
     Args:
@@ -48,19 +48,19 @@ def made_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
         for _ in range(length - 1):
             first.append(len(poses) - 1)
             poses.append(se2.compose(poses[-1], [rng.uniform(0.2, 0.6), rng.normal(0, 0.02), rng.normal(0, 0.4)]))
-    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else _drawn(rng))
+    calibration = CALIBRATION_SIGMA * (0.0 if true_calibration else _draw(rng))
     truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
     problem = Problem(
         odometry=odometry_of(truth, np.array(first), np.tile(WHEELS, (len(first), 1)), rng, by_wheels=0.4, noise=noise),
         readings=_readings(truth, noise, n_outliers, rng),
         prior=CalibrationPrior(CALIBRATION_SIGMA),
-        columns=made_columns(n_poses),
+        columns=make_columns(n_poses),
         anchor=rng.integers(0, n_poses, N_TAGS),
     )
     return MadeProblem(problem, truth)
 
 
-def made_columns(n_poses: int) -> Columns:
+def make_columns(n_poses: int) -> Columns:
     """Poses, tags, calibration; the first pose and the first calibration number are held."""
     poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
     poses[0] = -1
@@ -83,7 +83,7 @@ def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> S
     return State(poses, tags, np.r_[0.0, 0.1 * spread * rng.standard_normal(N_CALIBRATION - 1)])
 
 
-def _drawn(rng: np.random.Generator) -> FloatArray:
+def _draw(rng: np.random.Generator) -> FloatArray:
     """Calibration in sigmas; all but twelve numbers by a generator of their own."""
     others, more = rng.standard_normal(12), rng.spawn(1)[0].standard_normal(N_CALIBRATION - 12)
     return np.concatenate([others, more])

@@ -29,7 +29,7 @@ def make_keeper(
     return LogKeeper(folder / run_id, head(run_id), START_NS, disk, room, keep_pictures=pictures, limits=limits)
 
 
-def stepped(keeper: LogKeeper, entries: list[Entry]) -> Iterator[int]:
+def step(keeper: LogKeeper, entries: list[Entry]) -> Iterator[int]:
     """Writes entries, and steps every half second of log time; yields the time after each step."""
     next_ns = START_NS
     for entry in entries:
@@ -43,7 +43,7 @@ def stepped(keeper: LogKeeper, entries: list[Entry]) -> Iterator[int]:
 
 
 def record(keeper: LogKeeper, entries: list[Entry]) -> None:
-    for _ in stepped(keeper, entries):
+    for _ in step(keeper, entries):
         pass
     keeper.finish(1e6)
 
@@ -56,7 +56,7 @@ def texts(keeper: LogKeeper) -> list[str]:
     return [note.text for note in keeper.take_notes()]
 
 
-def seen_in(folder: Path) -> list[Seen]:
+def contents_of(folder: Path) -> list[Seen]:
     found, losses = read_all(folder / "run1")
     assert not losses.n_lost
     return found

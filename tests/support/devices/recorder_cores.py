@@ -25,7 +25,7 @@ MS = 1_000_000
 S = 1_000_000_000
 
 
-def made_core(folder: Path, camera: CameraModel | None = CAMERA) -> RecorderCore:
+def make_core(folder: Path, camera: CameraModel | None = CAMERA) -> RecorderCore:
     """A core whose run folder is `folder/run1`."""
     run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, camera, "run1", START_NS, START_NS - UPTIME_NS)
     return RecorderCore(folder, run, durable=False)

@@ -59,7 +59,7 @@ class SimulatedRobot:
         self._lines = Controller(self._session.world.wheel_link, _SEED, self._session.nominal.robot_id).lines(
             self._session.drive, self._session.true.wheels
         )
-        self._pictures = list(_rendered(self._session))
+        self._pictures = list(_render(self._session))
         self._board = _board_pictures(self.camera)
 
     @contextmanager
@@ -121,7 +121,7 @@ def _session(robot_yaml: dict[str, Any]) -> Session:
     return prepare(world, robot, tags, Options(_SEED, frame_rate_hz=_PICTURE_RATE_HZ))
 
 
-def _rendered(session: Session) -> Iterator[tuple[Picture, bytes]]:
+def _render(session: Session) -> Iterator[tuple[Picture, bytes]]:
     eye, world, rng = session.eye, session.world, np.random.default_rng(_SEED)
     assert eye is not None
     renderer = Renderer(world.pictures, world.ceiling_height_m, session.tags, session.faces, eye)

@@ -18,8 +18,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 
 from groundsbot.offline.maps.files import ARRAYS_FILE, JSON_FILE, write_map
-from tests.support.data.bags import STORE1, STORE2, Sent, header, made_message, write_bag
-from tests.support.data.maps import made_map
+from tests.support.data.bags import STORE1, STORE2, Sent, header, make_message, write_bag
+from tests.support.data.maps import make_map
 from tests.support.hostile.folders import FOLDERS, RUN_FOLDERS
 from tests.support.hostile.logs import HOSTILE, yaml_bomb
 
@@ -31,7 +31,7 @@ _TAGS2 = "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray"
 
 
 def truth_and_survey(folder: Path) -> tuple[Path, Path]:
-    """Of `made_map`."""
+    """Of `make_map`."""
     runs = {"red_one": {"poses": [[1_800_000_000_000_000_000, 0.0, 0.0, 0.0]]}}
     truth, survey = folder / "truth.json", folder / "survey.csv"
     truth.write_text(json.dumps({"runs": runs, "tags": []}))
@@ -55,7 +55,7 @@ LOGS = {name: _log(make) for name, make in HOSTILE.items()}
 
 def _map(folder: Path) -> Path:
     folder.mkdir()
-    write_map(made_map(), folder)
+    write_map(make_map(), folder)
     return folder
 
 
@@ -95,7 +95,7 @@ def long_exponent(folder: Path) -> Path:
     return folder
 
 
-def nested(folder: Path) -> Path:
+def nest(folder: Path) -> Path:
     """JSON deeper than Python calls itself."""
     (_map(folder) / JSON_FILE).write_text("[" * 500_000)
     return folder
@@ -114,7 +114,7 @@ MAPS: dict[str, Callable[[Path], Path]] = {
     ),
     "one run many times": one_run_many_times,
     "a long exponent": long_exponent,
-    "nested JSON": nested,
+    "nested JSON": nest,
 }
 
 
@@ -141,7 +141,7 @@ def many_rows(path: Path) -> Path:
     return _csv(path, f"t_s,left_m_s,right_m_s\n{rows}\n", f"t_s,tag_id,x_m,y_m\n{seen}\n")
 
 
-def _sent(topic: str, msgtype: str) -> Sent:
+def _send(topic: str, msgtype: str) -> Sent:
     return Sent(topic, msgtype, _S, {"header": header(_S, topic[1:])})
 
 
@@ -154,14 +154,14 @@ def _ros1_bag(path: Path, data: bytes, count: int) -> Path:
         for index in range(count):
             writer.write(odometry, _S + index, data)
         tags = writer.add_connection("/tags", _TAGS1, typestore=STORE1)
-        sent = _sent("/tags", _TAGS1)
-        writer.write(tags, _S, STORE1.serialize_ros1(made_message(STORE1, _TAGS1, sent.fields), _TAGS1))
+        sent = _send("/tags", _TAGS1)
+        writer.write(tags, _S, STORE1.serialize_ros1(make_message(STORE1, _TAGS1, sent.fields), _TAGS1))
     return path
 
 
 def _in_sqlite(path: Path, view: str) -> Path:
     """A bag of ROS 2 whose messages are what a query makes up."""
-    folder = write_bag(path.with_name("made_db3"), [_sent("/odom", _ODOMETRY), _sent("/tags", _TAGS2)])
+    folder = write_bag(path.with_name("made_db3"), [_send("/odom", _ODOMETRY), _send("/tags", _TAGS2)])
     (found,) = folder.glob("*.db3")
     shutil.move(found, path)
     shutil.rmtree(folder)
@@ -188,8 +188,8 @@ def _in_mcap(path: Path, messages: Iterable[bytes], definition: str | None = Non
             writer.add_message(channels[0], _S, data, _S)
             if stream.tell() > 900_000:
                 break
-        sent = _sent("/tags", _TAGS2)
-        data = bytes(STORE2.serialize_cdr(made_message(STORE2, _TAGS2, sent.fields), _TAGS2))
+        sent = _send("/tags", _TAGS2)
+        data = bytes(STORE2.serialize_cdr(make_message(STORE2, _TAGS2, sent.fields), _TAGS2))
         writer.add_message(channels[1], _S, data, _S)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
     return path
@@ -197,14 +197,14 @@ def _in_mcap(path: Path, messages: Iterable[bytes], definition: str | None = Non
 
 def all_alike(path: Path) -> Path:
     """As many messages as zstd makes of 1 MiB."""
-    sent = _sent("/odom", _ODOMETRY)
-    data = bytes(STORE2.serialize_cdr(made_message(STORE2, _ODOMETRY, sent.fields), _ODOMETRY))
+    sent = _send("/odom", _ODOMETRY)
+    data = bytes(STORE2.serialize_cdr(make_message(STORE2, _ODOMETRY, sent.fields), _ODOMETRY))
     return _in_mcap(path, (data for _ in range(400_000)))
 
 
 def long_metadata(path: Path) -> Path:
     """YAML that takes a parser long."""
-    folder = write_bag(path, [_sent("/odom", _ODOMETRY), _sent("/tags", _TAGS2)])
+    folder = write_bag(path, [_send("/odom", _ODOMETRY), _send("/tags", _TAGS2)])
     metadata = folder / "metadata.yaml"
     metadata.write_text(metadata.read_text() + "more: [" + "{a: [1]}, " * 90_000 + "]\n")
     return folder

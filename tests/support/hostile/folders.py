@@ -15,7 +15,7 @@ from groundsbot.onboard.log.messages import (
     WheelEncoders,
 )
 from tests.support.data.logs import ROBOT_YAML, START_NS
-from tests.support.hostile.logs import LIMIT_BYTES, MS, NUMBERS, bytes_of, chunk, log, message, observed
+from tests.support.hostile.logs import LIMIT_BYTES, MS, NUMBERS, bytes_of, chunk, log, message, observe
 
 _MANY: Final = 1000
 _TOPICS: Final = ("/run", "/wheels", "/odometry", "/tags/observations")
@@ -35,7 +35,7 @@ def _small(records: bytes, run_id: str, robot_yaml: str = ROBOT_YAML) -> bytes:
     return log(chunk(bytes_of(*schemas, *channels) + run + records))
 
 
-def _driven(looks: int, n_tags: int, first_tag: int) -> bytes:
+def _drive(looks: int, n_tags: int, first_tag: int) -> bytes:
     """The messages of a drive of a metre past tags that stay where they are."""
     records = b""
     for index in range(looks):
@@ -76,7 +76,7 @@ def _full_runs(count: int, make: Callable[[_Of], bytes]) -> Callable[[Path], Pat
     return _runs(lambda number: make(_Of(run_id=str(number), size_bytes=size_bytes)), count)
 
 
-def _mirrored(of: _Of) -> float:
+def _mirror(of: _Of) -> float:
     """Tags lie to the left in every second run: each two are as far apart in all, and no three fit."""
     return -0.5 if int(of["run_id"]) % 2 else 0.5
 
@@ -103,32 +103,30 @@ def _long_yaml(number: int) -> bytes:
 
 
 FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
-    "a thousand runs past ten tags": _runs(lambda number: _small(_driven(10, 10, 0), str(number))),
-    "a thousand runs that share nothing": _runs(lambda number: _small(_driven(10, 10, 10 * number), str(number))),
-    "a thousand runs without a tag": _runs(lambda number: _small(_driven(10, 0, 0), str(number))),
-    "a thousand copies of a run": _runs(lambda _: _small(_driven(10, 10, 0), "r")),
+    "a thousand runs past ten tags": _runs(lambda number: _small(_drive(10, 10, 0), str(number))),
+    "a thousand runs that share nothing": _runs(lambda number: _small(_drive(10, 10, 10 * number), str(number))),
+    "a thousand runs without a tag": _runs(lambda number: _small(_drive(10, 0, 0), str(number))),
+    "a thousand copies of a run": _runs(lambda _: _small(_drive(10, 10, 0), "r")),
     "a thousand bombs": _runs(lambda number: _small(_empty_readings(30_000), str(number))),
     "a thousand long robot.yamls": _runs(_long_yaml),
-    "as many runs as may be": _full_runs(40, lambda of: observed(50, 18, 18, 0.041, agree=True, apart_m=0.5, **of)),
-    "as many runs as may be, at odds": _full_runs(40, lambda of: observed(50, 18, 18, **of)),
+    "as many runs as may be": _full_runs(40, lambda of: observe(50, 18, 18, 0.041, agree=True, apart_m=0.5, **of)),
+    "as many runs as may be, at odds": _full_runs(40, lambda of: observe(50, 18, 18, **of)),
     "as many runs as may be, mirrored": _full_runs(
-        40, lambda of: observed(50, 18, 18, 0.041, agree=True, apart_m=_mirrored(of), **of)
+        40, lambda of: observe(50, 18, 18, 0.041, agree=True, apart_m=_mirror(of), **of)
     ),
-    "as many long runs as may be": _full_runs(
-        40, lambda of: observed(230, 18, 4, 0.041, agree=True, apart_m=0.5, **of)
-    ),
-    "ten runs past eighty tags": _full_runs(10, lambda of: observed(100, 80, 40, 0.041, agree=True, apart_m=0.5, **of)),
+    "as many long runs as may be": _full_runs(40, lambda of: observe(230, 18, 4, 0.041, agree=True, apart_m=0.5, **of)),
+    "ten runs past eighty tags": _full_runs(10, lambda of: observe(100, 80, 40, 0.041, agree=True, apart_m=0.5, **of)),
     "two runs past four hundred tags": _full_runs(
-        2, lambda of: observed(50, 400, 400, 0.041, agree=True, apart_m=0.5, **of)
+        2, lambda of: observe(50, 400, 400, 0.041, agree=True, apart_m=0.5, **of)
     ),
     "two runs past four hundred tags, mirrored": _full_runs(
-        2, lambda of: observed(50, 400, 400, 0.041, agree=True, apart_m=_mirrored(of), **of)
+        2, lambda of: observe(50, 400, 400, 0.041, agree=True, apart_m=_mirror(of), **of)
     ),
 }
 """Of several runs."""
 
 RUN_FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
-    "a thousand files of one run": _segments(lambda _: _small(_driven(10, 10, 0), "r")),
+    "a thousand files of one run": _segments(lambda _: _small(_drive(10, 10, 0), "r")),
     "a thousand bombs of one run": _segments(lambda _: _small(_empty_readings(30_000), "r")),
 }
 """Of one run."""

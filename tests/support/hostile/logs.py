@@ -40,7 +40,7 @@ def bytes_of(*records: object) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
 
 
-def declared() -> bytes:
+def declare() -> bytes:
     schemas = [
         Schema(id=number, data=b"", encoding="protobuf", name=TOPICS[name].schema.DESCRIPTOR.full_name)
         for name, number in NUMBERS.items()
@@ -59,7 +59,7 @@ def message(topic: str, content: Message | bytes, at_ns: int = START_NS) -> byte
 
 
 def run(robot_yaml: str = ROBOT_YAML, run_id: str = "r") -> bytes:
-    return declared() + message("/run", RunInfo(run_id=run_id, robot_id="gb1", robot_yaml=robot_yaml))
+    return declare() + message("/run", RunInfo(run_id=run_id, robot_id="gb1", robot_yaml=robot_yaml))
 
 
 def chunk(records: bytes, compressed: bool = True, claimed: int | None = None) -> bytes:
@@ -187,7 +187,7 @@ def tags_seen(count: int, per_message: int) -> bytes:
     return of_messages(*contents)
 
 
-def observed(
+def observe(
     count: int,
     n_tags: int | None = None,
     per_message: int = 2,
@@ -264,10 +264,10 @@ def readings_in_one_picture(count: int) -> bytes:
 
 def honest() -> bytes:
     """No hostile one: a drive past five tags that stay where they are."""
-    return observed(40, 5, step_m=0.041, agree=True, run_id="honest")
+    return observe(40, 5, step_m=0.041, agree=True, run_id="honest")
 
 
-def driven(count: int) -> bytes:
+def drive(count: int) -> bytes:
     """Nothing but keyframes."""
     contents: list[Content] = []
     for index in range(count):
@@ -350,17 +350,17 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "long calibration": lambda: of_messages(("/camera/calibration", CameraCalibration(K=[1.0] * 3_000_000), START_NS)),
     "tags in one picture": lambda: full(lambda n: tags_seen(n, n)),
     "a new tag in each picture": lambda: full(lambda n: tags_seen(n, 1)),
-    "tags in a row": lambda: full(observed),
+    "tags in a row": lambda: full(observe),
     "all tags in one picture": lambda: tags_seen(650, 650),
-    "all tags in a row": lambda: observed(650),
-    "all tags again and again": lambda: observed(2000, 650),
-    "few tags all along": lambda: full(lambda n: observed(n, 50)),
-    "a hundred tags a look": lambda: observed(2000, 600, 100),
-    "a hundred tags a look that fit": lambda: observed(2000, 600, 100, step_m=0.041, agree=True),
-    "twenty tags a look": lambda: full(lambda n: observed(n, 600, 20)),
-    "tags a look, far apart": lambda: observed(2000, 600, 100, step_m=2.0),
-    "few tags, far apart": lambda: full(lambda n: observed(n, 50, step_m=10.0)),
-    "few tags that fit": lambda: full(lambda n: observed(n, 50, step_m=0.041, agree=True)),
+    "all tags in a row": lambda: observe(650),
+    "all tags again and again": lambda: observe(2000, 650),
+    "few tags all along": lambda: full(lambda n: observe(n, 50)),
+    "a hundred tags a look": lambda: observe(2000, 600, 100),
+    "a hundred tags a look that fit": lambda: observe(2000, 600, 100, step_m=0.041, agree=True),
+    "twenty tags a look": lambda: full(lambda n: observe(n, 600, 20)),
+    "tags a look, far apart": lambda: observe(2000, 600, 100, step_m=2.0),
+    "few tags, far apart": lambda: full(lambda n: observe(n, 50, step_m=10.0)),
+    "few tags that fit": lambda: full(lambda n: observe(n, 50, step_m=0.041, agree=True)),
     "a reset each look": lambda: resets(25, 400, size_bytes=1_010_000),
     "resets": lambda: resets(25, 10, 80, size_bytes=1_010_000),
     "resets, much seen": lambda: resets(25, 10, 530, size_bytes=1_010_000),
@@ -369,7 +369,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "twelve stretches past 400 tags": lambda: resets(12, 400),
     "stretches past 100 tags": lambda: resets(13, 100, size_bytes=1_010_000),
     "one tag, much read in one picture": lambda: readings_in_one_picture(150_000),
-    "keyframes": lambda: full(driven),
+    "keyframes": lambda: full(drive),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),
     "one tag in twenty places": lambda: twins(100, 20),
