@@ -4,7 +4,7 @@ from .offline.importing import BagOptions, ImportOptions, import_bag, import_fol
 from .offline.localization import Localization, OnlineLocalizer, OnlinePose, TagReading, localize
 from .offline.mapping import build_map
 from .offline.maps import Component, MapResult, RunResult, TagResult, read_map, write_map
-from .offline.measurements import Run, chains_of, load_run, read_robot_file
+from .offline.measurements import Run, load_run, read_robot_file, segments_of
 from .onboard.log import find_logs
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "TagReading",
     "TagResult",
     "build_map",
-    "chains_of",
     "find_logs",
     "import_bag",
     "import_folder",
@@ -30,5 +29,6 @@ __all__ = [
     "localize",
     "read_map",
     "read_robot_file",
+    "segments_of",
     "write_map",
 ]

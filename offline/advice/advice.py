@@ -101,15 +101,15 @@ def _result(graph: Graph, solution: Solution, best: Judged, component: int) -> A
     length_m: float | None = None
     if isinstance(wanted, Pass):
         ends = [wanted.from_tag, wanted.to_tag]
-        length_m = float(graph.chains[wanted.chain].odometry.distance_m[wanted.first : wanted.last].sum())
+        length_m = float(graph.segments[wanted.segment].odometry.distance_m[wanted.first : wanted.last].sum())
         way = np.unique(np.linspace(wanted.first, wanted.last, _MOST_POINTS).round().astype(int))
-        way_m = graph.poses_of(solution.state, wanted.chain)[way, :2]
+        way_m = graph.poses_of(solution.state, wanted.segment)[way, :2]
     else:
         ends, way_m = [int(np.argmin(np.hypot(*(tags - wanted.position_m).T)))], wanted.position_m[None]
     return AdviceResult(
         kind=best.kind,
         component=component,
-        run=graph.chains[wanted.chain].name,
+        run=graph.segments[wanted.segment].name,
         tags=tuple(_name(graph.tags[i]) for i in ends),
         way_m=way_m,
         length_m=length_m,

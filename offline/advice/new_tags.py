@@ -47,7 +47,7 @@ class View(NamedTuple):
 class Place(NamedTuple):
     """Where a tag could hang, and the poses that would read it: some for each passing by."""
 
-    chain: int
+    segment: int
     keyframe: int  # beside which it lies
     position_m: FloatArray  # (2,)
     viewers: IntArray  # (k,) poses
@@ -61,16 +61,16 @@ class Drives(NamedTuple):
     state: State
     ways: list[FloatArray]
     sensors: FloatArray  # (P, 3) where what reads the tags is at each pose, in map
-    example: IntArray  # (P,) a reading of the same chain; -1 where it has none
+    example: IntArray  # (P,) a reading of the same segment; -1 where it has none
 
 
 def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> Drives:
     """Of a solved component."""
-    mounts = [chain.T_base_camera if chain.readings.in_camera.any() else np.zeros(3) for chain in graph.chains]
-    lengths = [len(chain.stamps_ns) for chain in graph.chains]
+    mounts = [segment.T_base_camera if segment.readings.in_camera.any() else np.zeros(3) for segment in graph.segments]
+    lengths = [len(segment.stamps_ns) for segment in graph.segments]
     sensors = se2.compose(state.poses, np.repeat(np.array(mounts), lengths, axis=0))
     example = np.searchsorted(graph.problem.readings.pose, graph.first_pose)
-    example = np.where([len(chain.readings) > 0 for chain in graph.chains], example, -1)
+    example = np.where([len(segment.readings) > 0 for segment in graph.segments], example, -1)
     return Drives(graph, state, ways, sensors, np.repeat(example, lengths))
 
 
@@ -100,8 +100,8 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
     """
     spacing_m = max(_LEAST_SPACING_M, 2.0 * sum(float(way[-1]) for way in drives.ways) / _MOST_PLACES)
     beside = {
-        (chain, int(keyframe))
-        for chain, way in enumerate(drives.ways)
+        (segment, int(keyframe))
+        for segment, way in enumerate(drives.ways)
         for keyframe in np.searchsorted(way, np.arange(0.0, float(way[-1]), spacing_m))
     }
     start_m = np.arange(0.0, view.far_m, _LEAST_SPACING_M)
@@ -113,23 +113,23 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
 
 
 def _places_with_two_views(drives: Drives, view: View, where: set[tuple[int, int]]) -> Iterator[Place]:
-    """Of places beside some chains and keyframes those that more than one pose views."""
-    for chain, keyframe in sorted(where):
+    """Of places beside some segments and keyframes those that more than one pose views."""
+    for segment, keyframe in sorted(where):
         for side in (1.0, -1.0):
-            place = place_beside(drives, view, chain, keyframe, side)
+            place = place_beside(drives, view, segment, keyframe, side)
             if len(place.viewers) > 1:
                 yield place
 
 
-def place_beside(drives: Drives, view: View, chain: int, keyframe: int, side: float) -> Place:
+def place_beside(drives: Drives, view: View, segment: int, keyframe: int, side: float) -> Place:
     """The place ahead of a keyframe, to its left (+1) or right (-1).
 
-    Nobody views it where the keyframe's chain has no readings: how its robot would read it, nothing tells.
+    Nobody views it where the keyframe's segment has no readings: how its robot would read it, nothing tells.
     """
-    pose = int(drives.graph.first_pose[chain]) + keyframe
+    pose = int(drives.graph.first_pose[segment]) + keyframe
     sensor = drives.sensors[pose]
     if drives.example[pose] < 0:
-        return Place(chain, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
+        return Place(segment, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
     angle = side * view.typical_rad
     position_m = se2.apply(sensor, view.typical_m * np.array([np.cos(angle), np.sin(angle)]))
     step = -(-len(drives.sensors) // _MOST_VIEWERS)
@@ -139,7 +139,7 @@ def place_beside(drives: Drives, view: View, chain: int, keyframe: int, side: fl
     sightings = _sightings(drives, seen, least=view.n_a_sighting / step)
     beside = np.array([pose], dtype=np.int64)
     viewers = [part[(_WITHIN_SIGHTING * (len(part) - 1)).round().astype(int)] for part in sightings]
-    return Place(chain, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
+    return Place(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
 
 
 def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: View) -> BoolArray:
@@ -209,15 +209,15 @@ def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> Read
 
 
 def _sightings(drives: Drives, poses: IntArray, least: float) -> list[IntArray]:
-    """Rising poses, parted where a chain ends or drives on before it comes back; not more than a few, from all over.
+    """Rising poses, parted where a segment ends or drives on before it comes back; not more than a few, from all over.
 
     A glimpse is not counted on: a passing by has the tag in view from as many poses as read a tag on average.
     """
     if not len(poses):
         return []
     along_m = np.concatenate(drives.ways)[poses]
-    chain = np.searchsorted(drives.graph.first_pose, poses, side="right")
-    parts = np.split(poses, np.flatnonzero((np.diff(chain) != 0) | (np.diff(along_m) > SIGHTING_GAP_M)) + 1)
+    segment = np.searchsorted(drives.graph.first_pose, poses, side="right")
+    parts = np.split(poses, np.flatnonzero((np.diff(segment) != 0) | (np.diff(along_m) > SIGHTING_GAP_M)) + 1)
     parts = [part for part in parts if len(part) >= least]
     if len(parts) <= _MOST_SIGHTINGS:
         return parts

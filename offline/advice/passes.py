@@ -30,16 +30,16 @@ SIGHTING_GAP_M: Final = 2.5
 class Sighting(NamedTuple):
     """A run passes a tag."""
 
-    chain: int
+    segment: int
     tag: int
-    first: int  # keyframe of the chain
+    first: int  # keyframe of the segment
     last: int
 
 
 class Pass(NamedTuple):
-    """Keyframes first to last of a chain, from the tag read first to the one read last."""
+    """Keyframes first to last of a segment, from the tag read first to the one read last."""
 
-    chain: int
+    segment: int
     first: int
     last: int
     from_tag: int
@@ -47,22 +47,22 @@ class Pass(NamedTuple):
 
 
 def ways_m(graph: Graph) -> list[FloatArray]:
-    """Of each chain, (K,) how far it had driven at its keyframes."""
-    return [chain.along_m for chain in graph.chains]
+    """Of each segment, (K,) how far it had driven at its keyframes."""
+    return [segment.along_m for segment in graph.segments]
 
 
 def sightings_of(graph: Graph, ways: list[FloatArray]) -> list[Sighting]:
-    """All of them, chain by chain in the order in which they begin."""
+    """All of them, segment by segment in the order in which they begin."""
     found: list[Sighting] = []
     number = {tag: i for i, tag in enumerate(graph.tags)}
-    for c, chain in enumerate(graph.chains):
-        order = np.lexsort((chain.readings.keyframe, chain.readings.tag))
-        keyframe, tag = chain.readings.keyframe[order], chain.readings.tag[order]
+    for c, segment in enumerate(graph.segments):
+        order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
+        keyframe, tag = segment.readings.keyframe[order], segment.readings.tag[order]
         if not len(order):
             continue
         begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > SIGHTING_GAP_M)) + 1
         own = [
-            Sighting(c, number[chain.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
+            Sighting(c, number[segment.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
             for part in np.split(np.arange(len(order)), begins)
         ]
         found += sorted(own, key=lambda each: (each.first, each.last, each.tag))
@@ -85,7 +85,7 @@ def passes_of(ways: list[FloatArray], sightings: list[Sighting], most: int = MOS
     length_m = most_length_m(ways)
     found: list[Pass] = []
     for c, way in enumerate(ways):
-        own = [each for each in sightings if each.chain == c]
+        own = [each for each in sightings if each.segment == c]
         ends_m = way[[each.last for each in own]]
         for i, begin in enumerate(own):
             reached = i + 1 + np.flatnonzero(ends_m[i + 1 : i + 1 + _MOST_SIGHTINGS] <= way[begin.first] + length_m)
@@ -112,13 +112,13 @@ def _tags_along(wanted: Pass, sightings: list[Sighting]) -> set[int]:
     return {
         each.tag
         for each in sightings
-        if each.chain == wanted.chain and each.first <= wanted.last and each.last >= wanted.first
+        if each.segment == wanted.segment and each.first <= wanted.last and each.last >= wanted.first
     }
 
 
 def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> Gain:
     """What one more pass would tell of the map's tags and calibration."""
-    problem, offset = graph.problem, int(graph.first_pose[wanted.chain])
+    problem, offset = graph.problem, int(graph.first_pose[wanted.segment])
     first, last = offset + wanted.first, offset + wanted.last
     odometry, readings = problem.odometry, problem.readings
     driven = slice(*np.searchsorted(odometry.first, [first, last]))

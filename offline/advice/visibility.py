@@ -28,7 +28,7 @@ def visibility_probabilities(drives: Drives, view: View, place: Place, known: Kn
         known: the joint covariance of these poses, and others.
     """
     columns = drives.graph.problem.columns.poses
-    beside = int(drives.graph.first_pose[place.chain]) + place.keyframe
+    beside = int(drives.graph.first_pose[place.segment]) + place.keyframe
     face = drives.sensors[beside, :2] - place.position_m
     shares = []
     for viewer in place.viewers.tolist():

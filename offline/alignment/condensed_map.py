@@ -4,7 +4,7 @@ The joint covariance of a solve is about small errors. A long drive errs by degr
 phi moves on an arc: two tags 2 m apart, whose distance is known to a millimetre, come out 2 m phi^2 / 2 nearer when
 their errors are taken in map axes (11 mm at 6 degrees). So each tag is kept in the frame of a pose that read it, these
 anchor poses relative to each other along a tree of the stiffest relations, and errors enter there, T o exp(delta), as
-they do along a chain. To first order that is the same covariance; but a bend is no longer a contradiction.
+they do along a segment. To first order that is the same covariance; but a bend is no longer a contradiction.
 
 Andersson and Nygards, "C-SAM: Multi-robot SLAM using square root information smoothing" (2008), and Cunningham et al.,
 "DDF-SAM" (2010), condense local maps too, in map axes.
@@ -28,7 +28,7 @@ class CondensedMap:
     """Some tags of a local map.
 
     Attributes:
-        name: of the chain.
+        name: of the segment.
         tags: sorted.
         T_start_anchor: (T, 3) a pose from which each tag was read.
         tag_m: (T, 2) each tag in its anchor's frame.
@@ -136,7 +136,7 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
     T_start_anchor = state.poses[pose]
     tag_m = se2.apply(se2.inverse(T_start_anchor), state.tags[which])
     return CondensedMap(
-        name=local_map.chain.name,
+        name=local_map.segment.name,
         tags=tuple(tags),
         T_start_anchor=T_start_anchor,
         tag_m=tag_m,

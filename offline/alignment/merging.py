@@ -1,4 +1,4 @@
-"""Many local maps -> components, each with one frame: which chains the shared tags join, and where each starts.
+"""Many local maps -> components, each with one frame: which segments the shared tags join, and where each starts.
 
 Nothing here depends on the order of the maps but the frame: pairs are aligned in the order of names, and what is equal
 is settled by them.
@@ -44,7 +44,7 @@ class PairAlignment:
 
 @dataclass(frozen=True)
 class Group:
-    """Chains that alignments join.
+    """Segments that alignments join.
 
     Attributes:
         members: indices of local maps in the order given; the first one's start is the frame.
@@ -121,8 +121,8 @@ def _align_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
-    effort = AlignmentEffort.of_logs(sum({m.chain.run.name: m.chain.run.log_bytes for m in maps}.values()))
-    by_name = sorted(range(len(maps)), key=lambda i: maps[i].chain.name)
+    effort = AlignmentEffort.of_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
+    by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
         map_a, map_b = condensed[a], condensed[b]
@@ -141,7 +141,7 @@ def _align_pairs(
 
 def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[CondensedMap | None]) -> list[Link]:
     """One where the pair is joined: by its tags, or else by what was measured."""
-    names = maps[pair.a].chain.name, maps[pair.b].chain.name
+    names = maps[pair.a].segment.name, maps[pair.b].segment.name
     alignment, placement = pair.alignment, pair.placement
     if alignment is not None and alignment.is_sure:
         return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.evidence_nats, names)]
@@ -168,7 +168,7 @@ def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
         neighbours[link.b].append(link)
     groups = []
     placed: dict[int, FloatArray] = {}
-    for first in sorted(range(len(maps)), key=lambda i: maps[i].chain.name):
+    for first in sorted(range(len(maps)), key=lambda i: maps[i].segment.name):
         if first in placed:
             continue
         placed[first] = np.zeros(3)

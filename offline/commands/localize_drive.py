@@ -159,7 +159,7 @@ def _tag_json(tag: TagKey) -> dict[str, Any]:
 
 
 def exit_code(found: Localization) -> int:
-    """Done, or done but for stretches whose place is not told or for what is lost of the log."""
+    """Done, or done but for segments whose place is not told or for what is lost of the log."""
     return EXIT_WITH_LOSSES if found.not_located or found.losses else EXIT_DONE
 
 

@@ -64,10 +64,10 @@ class Refined:
             found.append(pose if is_hung else None)
         return found
 
-    def mount_of(self, state: State, chain: int) -> Mount | None:
-        """Where one chain's camera sits, as corrected; None for a log without a camera."""
-        mount = self.corners.graph.mount_of(state, chain)
-        height = self.corners.height_of(chain)
+    def mount_of(self, state: State, segment: int) -> Mount | None:
+        """Where one segment's camera sits, as corrected; None for a log without a camera."""
+        mount = self.corners.graph.mount_of(state, segment)
+        height = self.corners.height_of(segment)
         if mount is None or height is None:
             return mount
         return mount.model_copy(update={"z_m": mount.z_m + float(state.calibration[height])})
@@ -85,7 +85,7 @@ def refine(
 
     Returns:
         What came of it, or None, and sentences that say why the map stays as it was, or which tags
-        and stretches of drives are not as they were taken to be.
+        and segments of drives are not as they were taken to be.
     """
     if not solution.converged:
         return None, []  # the map says so already
@@ -125,7 +125,7 @@ def _too_large(graph: Graph, problem: CornerProblem) -> str:
 
 def _log_bytes(graph: Graph) -> int:
     """Of all logs of a graph."""
-    return sum(run.log_bytes for run in {chain.run.name: chain.run for chain in graph.chains}.values())
+    return sum(run.log_bytes for run in {segment.run.name: segment.run for segment in graph.segments}.values())
 
 
 def _reason_for_level_floor(graph: Graph, found: CornerSolution) -> list[str]:

@@ -1,4 +1,4 @@
-"""In which order an estimate on corners is eliminated: each chain by nested dissection, then what chains share."""
+"""In which order an estimate on corners is eliminated: each segment by nested dissection, then what segments share."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -38,7 +38,7 @@ def corner_order(
     starts, distances = measured.starts, measured.distances
     ends = np.concatenate([starts.pose, distances.pose_a, distances.pose_b])
     ends = ends[ends >= 0]
-    pose_node, parent = _chains(len(columns.poses), odometry, np.concatenate([pose, ends]), ends)
+    pose_node, parent = _segments(len(columns.poses), odometry, np.concatenate([pose, ends]), ends)
     root = len(parent) - 1
     seen = np.unique(tag * (root + 1) + pose_node[pose])
     nodes_of: list[list[int]] = [[] for _ in columns.tags]
@@ -58,10 +58,10 @@ def corner_order(
     return build_fronts(columns.n, node_of, parent, kinds)
 
 
-def _chains(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
-    """(P,) node of each pose and (N,) parent of each node; starts of chains are at the root, and the `ends`.
+def _segments(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
+    """(P,) node of each pose and (N,) parent of each node; starts of segments are at the root, and the `ends`.
 
-    First come nodes of poses in a row that saw nothing, then each chain's others by nested dissection.
+    First come nodes of poses in a row that saw nothing, then each segment's others by nested dissection.
     """
     begins = np.ones(n_poses, dtype=np.bool_)
     begins[odometry.first + 1] = False
@@ -74,11 +74,11 @@ def _chains(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: Int
     n_blind = len(first_blind)
     pose_node = np.cumsum(is_blind & (since % (_BLIND + 1) == 1)) - 1
     parent = [-1] * n_blind
-    chain, tops = np.cumsum(begins) - 1, []
+    segment, tops = np.cumsum(begins) - 1, []
     others = np.flatnonzero(~is_blind & ~begins)
-    for own in np.split(others, np.flatnonzero(np.diff(chain[others])) + 1):
+    for own in np.split(others, np.flatnonzero(np.diff(segment[others])) + 1):
         if len(own):
-            tops.append(_chain(own, pose_node, parent))
+            tops.append(_segment(own, pose_node, parent))
     root = len(parent)
     for top in tops:
         parent[top] = root
@@ -95,8 +95,8 @@ def _chains(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: Int
     return pose_node, nodes
 
 
-def _chain(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
-    """Adds the nodes of poses (n,) along a chain, of which each is joined to the next; their topmost node."""
+def _segment(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
+    """Adds the nodes of poses (n,) along a segment, of which each is joined to the next; their topmost node."""
     nodes, separators = [], []
     for begin in range(0, len(own), _LEAF + 1):
         pose_node[own[begin : begin + _LEAF]] = len(parent)
@@ -116,6 +116,6 @@ def _chain(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
             left += separators[i + len(inside) : i + len(inside) + 1]
             above.append(branch)
         nodes, separators = above, left
-    for separator in separators:  # a chain may end in one
+    for separator in separators:  # a segment may end in one
         pose_node[separator] = nodes[0]
     return nodes[0]

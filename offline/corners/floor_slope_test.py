@@ -1,10 +1,10 @@
-"""Stretches of a drive that are not level with the rest, a ramp or another floor: found and said, not modelled.
+"""Segments of a drive that are not level with the rest, a ramp or another floor: found and said, not modelled.
 
 All drives are taken to be on one floor, off level anew in each picture by the floor's sigmas. Let all pictures of a
-stretch stand off by the same roll, pitch and height m besides. At the solution the slope of the cost by m is
+segment stand off by the same roll, pitch and height m besides. At the solution the slope of the cost by m is
 g = B^T V^-1 r, with V the corners' covariance, how single pictures stand included, and what all else leaves of the
 information about m is L = B^T V^-1 B - C H^-1 C^T, with C = B^T V^-1 J: a score test, exact to first order, and without
-another solve (Rao, "Large sample tests of statistical hypotheses", 1948). A stretch whose tags nobody sees from
+another solve (Rao, "Large sample tests of statistical hypotheses", 1948). A segment whose tags nobody sees from
 elsewhere has L = 0: they took the slope for their own.
 """
 
@@ -20,15 +20,15 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.problem import LOOKS
 from groundsbot.offline.corners.solver import CornerSolution
-from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, Chain
+from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, Segment
 from groundsbot.offline.sam import Graph
 
 # Of way, or of turning; a ramp is longer, and a bump is none.
 _STRETCH_M: Final = 2.0
 _STRETCH_RAD: Final = 1.0
-# One false word in a hundred maps (Bonferroni over all stretches).
+# One false word in a hundred maps (Bonferroni over all segments).
 _FALSE_ALARM: Final = 0.01
-# Squared sigmas: of level stretches, whose poses and tags are estimated, less than a tenth look so much off.
+# Squared sigmas: of level segments, whose poses and tags are estimated, less than a tenth look so much off.
 _MAY_BE: Final = float(chi2.isf(0.1, 3))
 # rad, rad and m: what is known no better than this is not known.
 _COARSE: Final = np.array([0.1, 0.1, 0.5])
@@ -53,7 +53,7 @@ class _Pictures(NamedTuple):
 
 
 class _OffLevel(NamedTuple):
-    """How far a stretch is off in roll, pitch and height, with sigmas; in squared sigmas, and their freedom."""
+    """How far a segment is off in roll, pitch and height, with sigmas; in squared sigmas, and their freedom."""
 
     off: FloatArray
     sigma: FloatArray
@@ -62,7 +62,7 @@ class _OffLevel(NamedTuple):
 
 
 def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
-    """A sentence for each stretch of a chain that stands otherwise than the rest, beyond the floor's own sigmas.
+    """A sentence for each segment of a segment that stands otherwise than the rest, beyond the floor's own sigmas.
 
     The worst is taken first and the others judged given it: what a ramp bends looks off level too.
     """
@@ -70,7 +70,9 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
         return []
     pictures = _pictures(solution)
     firsts = graph.first_pose.tolist()
-    cut = [each for chain, first in zip(graph.chains, firsts, strict=True) for each in _cut(chain, first, pictures)]
+    cut = [
+        each for segment, first in zip(graph.segments, firsts, strict=True) for each in _cut(segment, first, pictures)
+    ]
     asked = _show(pictures, cut)
     couplings = [_coupling(pictures, each, solution.problem.columns.n) for each in asked]
     taken = solution.factor.whiten(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
@@ -114,9 +116,9 @@ def _pictures(solution: CornerSolution) -> _Pictures:
     return _Pictures(pose, slope, spread @ found.own, picture, spread[picture] @ found.coupled, columns, range_m)
 
 
-def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[slice]:
-    """Pictures of a chain, cut by the way driven and by what was turned."""
-    steps = np.maximum(chain.odometry.distance_m / _STRETCH_M, np.abs(chain.odometry.motion[:, 2]) / _STRETCH_RAD)
+def _cut(segment: Segment, first: int, pictures: _Pictures) -> list[slice]:
+    """Pictures of a segment, cut by the way driven and by what was turned."""
+    steps = np.maximum(segment.odometry.distance_m / _STRETCH_M, np.abs(segment.odometry.motion[:, 2]) / _STRETCH_RAD)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     begin, end = np.searchsorted(pictures.pose, [first, first + len(along)]).tolist()
     cell = along[pictures.pose[begin:end] - first].astype(np.int64)
@@ -125,15 +127,15 @@ def _cut(chain: Chain, first: int, pictures: _Pictures) -> list[slice]:
 
 
 def _show(pictures: _Pictures, cut: Sequence[slice]) -> list[slice]:
-    """Stretches that might be off: as good as certain poses and tags are not, they can only look less so."""
-    first = [each.start for each in cut]  # each picture is of one stretch
+    """Segments that might be off: as good as certain poses and tags are not, they can only look less so."""
+    first = [each.start for each in cut]  # each picture is of one segment
     slope, information = np.add.reduceat(pictures.slope, first), np.add.reduceat(pictures.information, first)
     square = np.einsum("ci,cij,cj->c", slope, np.linalg.pinv(information, hermitian=True), slope)
     return [cut[c] for c in np.flatnonzero(square > _MAY_BE).tolist()]
 
 
 def _coupling(pictures: _Pictures, which: slice, n: int) -> FloatArray:
-    """C (3, n) of a stretch."""
+    """C (3, n) of a segment."""
     looks = np.flatnonzero((pictures.look_picture >= which.start) & (pictures.look_picture < which.stop))
     coupled = np.zeros((3, n + 1))  # the last takes what is held
     for k in range(3):
@@ -142,7 +144,7 @@ def _coupling(pictures: _Pictures, which: slice, n: int) -> FloatArray:
 
 
 def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel | None:
-    """None where nothing is known of how the stretch lies to the rest."""
+    """None where nothing is known of how the segment lies to the rest."""
     unit = np.diag(_COARSE)
     values, ways = np.linalg.eigh(unit @ (0.5 * (left + left.T)) @ unit)
     known = values > 1.0
@@ -157,28 +159,28 @@ def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel
     return _OffLevel(ways @ off, sigma, float(off @ np.linalg.solve(covariance, off)), int(known.sum()))
 
 
-def _counts(stretch: _OffLevel, solution: CornerSolution, n: int) -> bool:
+def _counts(part: _OffLevel, solution: CornerSolution, n: int) -> bool:
     """Whether chance does not explain it, and it is more than the floor is uneven by from picture to picture."""
-    beyond = bool((np.abs(stretch.off) > solution.problem.wobble_sigma).any())
-    return beyond and stretch.square > _by_chance(n, stretch.freedom)
+    beyond = bool((np.abs(part.off) > solution.problem.wobble_sigma).any())
+    return beyond and part.square > _by_chance(n, part.freedom)
 
 
 @lru_cache(maxsize=64)
 def _by_chance(n: int, freedom: int) -> float:
-    """Squared sigmas that none of n level stretches reaches, but for a false alarm."""
+    """Squared sigmas that none of n level segments reaches, but for a false alarm."""
     return float(chi2.isf(_FALSE_ALARM / n, freedom))
 
 
-def _sentence(graph: Graph, which: slice, stretch: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:
+def _sentence(graph: Graph, which: slice, part: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:
     poses = pictures.pose[which]
     index = int(np.searchsorted(graph.first_pose, poses[0], side="right")) - 1
-    chain, first = graph.chains[index], int(graph.first_pose[index])
-    begin_s, end_s = (chain.stamps_ns[poses[[0, -1]] - first] - chain.stamps_ns[0]) * 1e-9
+    segment, first = graph.segments[index], int(graph.first_pose[index])
+    begin_s, end_s = (segment.stamps_ns[poses[[0, -1]] - first] - segment.stamps_ns[0]) * 1e-9
     x_m, y_m = solution.state.poses[poses, :2].mean(axis=0)
-    (roll, pitch, height_m), (d_roll, d_pitch, d_height_m) = stretch.off, stretch.sigma
+    (roll, pitch, height_m), (d_roll, d_pitch, d_height_m) = part.off, part.sigma
     return (
-        f"{chain.name} is not level with the rest from {begin_s:.0f} to {end_s:.0f} s, about ({x_m:.1f}, {y_m:.1f}) m: "
-        f"pitch {degrees(pitch):+.1f} deg (sigma {degrees(d_pitch):.1f}), roll {degrees(roll):+.1f} deg "
+        f"{segment.name} is not level with the rest from {begin_s:.0f} to {end_s:.0f} s, about ({x_m:.1f}, {y_m:.1f}) "
+        f"m: pitch {degrees(pitch):+.1f} deg (sigma {degrees(d_pitch):.1f}), roll {degrees(roll):+.1f} deg "
         f"({degrees(d_roll):.1f}), height {height_m:+.2f} m ({d_height_m:.2f}): a ramp or another floor? The map takes "
         "all for one level floor, and is bent there; leave that part of the drive out"
     )

@@ -17,7 +17,7 @@ from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
-from groundsbot.offline.measurements import Chain
+from groundsbot.offline.measurements import Segment
 from groundsbot.offline.sam import CalibrationPrior, Graph, Parameter, ReadingFactors, State
 
 _CORNER_NOISE: Final = "sigma_corner_px"
@@ -29,7 +29,7 @@ class CornerGraph:
     """A problem on corners and what its variables mean.
 
     Attributes:
-        graph: of the floor: its chains, poses, tags, and the first of the parameters, are the same.
+        graph: of the floor: its segments, poses, tags, and the first of the parameters, are the same.
         parameters: in order; those of the graph, then what only corners depend on.
     """
 
@@ -42,9 +42,9 @@ class CornerGraph:
         """(T,) which tags have a height and an orientation."""
         return np.asarray(self.problem.columns.heights >= 0)
 
-    def height_of(self, chain: int) -> int | None:
-        """Index of the height of one chain's camera among the parameters; None where no corners were kept."""
-        height = _height_parameter(self.graph.chains[chain])
+    def height_of(self, segment: int) -> int | None:
+        """Index of the height of one segment's camera among the parameters; None where no corners were kept."""
+        height = _height_parameter(self.graph.segments[segment])
         return self.parameters.index(height) if height in self.parameters else None
 
 
@@ -59,9 +59,11 @@ def corner_graph(
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
         upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
     """
-    chains, masks = graph.chains, [chain.readings.from_corners for chain in graph.chains]
-    seeing = [chain for chain, mask in zip(chains, masks, strict=True) if mask.any()]
-    of_corners = sorted({each for chain in seeing for each in (_height_parameter(chain), _focal_parameter(chain))})
+    segments, masks = graph.segments, [segment.readings.from_corners for segment in graph.segments]
+    seeing = [segment for segment, mask in zip(segments, masks, strict=True) if mask.any()]
+    of_corners = sorted(
+        {each for segment in seeing for each in (_height_parameter(segment), _focal_parameter(segment))}
+    )
     parameters = (*graph.parameters, *of_corners)
     looks, cameras = _looks(graph, parameters, masks)
     floor = graph.problem
@@ -98,22 +100,22 @@ def corner_graph(
 def _looks(
     graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
 ) -> tuple[Looks, tuple[CameraModel, ...]]:
-    """Those readings of each chain that have corners, and the cameras."""
+    """Those readings of each segment that have corners, and the cameras."""
     floor = _readings_where(graph.problem.readings, np.concatenate(masks))
     cameras: list[CameraModel] = []
     shown: list[_Shown] = []
-    of_chain: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
-    for chain, mask in zip(graph.chains, masks, strict=True):
-        camera = chain.run.camera
+    of_segment: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
+    for segment, mask in zip(graph.segments, masks, strict=True):
+        camera = segment.run.camera
         if camera is None or not mask.any():
             continue
         if camera not in cameras:
             cameras.append(camera)
-        own = [parameters.index(each) for each in (_height_parameter(chain), _focal_parameter(chain))]
-        of_chain.append((own[0], own[1], cameras.index(camera)))
-        shown.append(_corner_arrays(chain, mask, camera.height_px))
+        own = [parameters.index(each) for each in (_height_parameter(segment), _focal_parameter(segment))]
+        of_segment.append((own[0], own[1], cameras.index(camera)))
+        shown.append(_corner_arrays(segment, mask, camera.height_px))
     found = _Shown(*(np.concatenate(each) for each in zip(*shown, strict=True)))
-    heights, focal, camera_of = np.repeat(of_chain, [len(each.sigma_px) for each in shown], axis=0).T
+    heights, focal, camera_of = np.repeat(of_segment, [len(each.sigma_px) for each in shown], axis=0).T
     index: dict[str, IntArray] = {
         **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
         **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
@@ -150,14 +152,14 @@ class _Shown(NamedTuple):
     mount: FloatArray
 
 
-def _corner_arrays(chain: Chain, mask: BoolArray, height_px: int) -> _Shown:
-    """Of those readings of one chain that have corners."""
-    robot, readings = chain.run.robot, chain.readings
+def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _Shown:
+    """Of those readings of one segment that have corners."""
+    robot, readings = segment.run.robot, segment.readings
     corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
     unit = parts.of((_CORNER_NOISE,))[0]
     variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
-    sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in chain.tags])
-    moved, twist = _base_motion(chain, readings.keyframe[mask], corners_px, height_px)
+    sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in segment.tags])
+    moved, twist = _base_motion(segment, readings.keyframe[mask], corners_px, height_px)
     return _Shown(
         corners_px,
         np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
@@ -174,35 +176,38 @@ def _trace(matrices: FloatArray) -> FloatArray:
 
 
 def _base_motion(
-    chain: Chain, keyframe: IntArray, corners_px: FloatArray, height_px: int
+    segment: Segment, keyframe: IntArray, corners_px: FloatArray, height_px: int
 ) -> tuple[FloatArray, FloatArray]:
     """How base moved by the wheels (M, 4, 3) from a keyframe to when each corner's row was read, and its twist (M, 3).
 
     A stamp is that of the middle row.
     """
-    robot = chain.run.robot
-    stamps_ns = chain.stamps_ns[keyframe]
-    track = next(each for each in chain.run.stretches if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1])
-    speed, turning = track.twist_at(stamps_ns, robot.wheels.track_m).T
+    robot = segment.run.robot
+    stamps_ns = segment.stamps_ns[keyframe]
+    wheel_segment = next(
+        each for each in segment.run.wheel_segments if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1]
+    )
+    speed, turning = wheel_segment.twist_at(stamps_ns, robot.wheels.track_m).T
     twist = np.stack([speed, np.zeros_like(speed), turning], axis=-1)
     if robot.readout_s == 0.0:  # all rows at once
         return np.zeros((*corners_px.shape[:-1], 3)), twist
     share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
     rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
     left_m, right_m = (
-        at_row - at_stamp[:, None] for at_row, at_stamp in zip(track.at(rows_ns), track.at(stamps_ns), strict=True)
+        at_row - at_stamp[:, None]
+        for at_row, at_stamp in zip(wheel_segment.at(rows_ns), wheel_segment.at(stamps_ns), strict=True)
     )
     return wheels.advance(left_m, right_m, robot.wheels.track_m), twist
 
 
-def _height_parameter(chain: Chain) -> Parameter:
-    mount = chain.run.robot.mount
-    return Parameter(chain.run.robot_id, _HEIGHT, (mount.z_m,), mount.z_m_sigma)
+def _height_parameter(segment: Segment) -> Parameter:
+    mount = segment.run.robot.mount
+    return Parameter(segment.run.robot_id, _HEIGHT, (mount.z_m,), mount.z_m_sigma)
 
 
-def _focal_parameter(chain: Chain) -> Parameter:
+def _focal_parameter(segment: Segment) -> Parameter:
     """Held where robot.yaml gives it no sigma."""
-    run = chain.run
+    run = segment.run
     nominal = () if run.camera is None else (run.camera.fx_px, run.camera.fy_px)
     return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)
 

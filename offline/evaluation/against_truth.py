@@ -103,7 +103,7 @@ def align_points(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
 def _start_places(
     component: Component, truth: Truth, T_world_map: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Where each run starts, found and true (2,); later stretches apart, whose start is no start of a drive."""
+    """Where each run starts, found and true (2,); later segments apart, whose start is no start of a drive."""
     places = {}
     for run in component.runs:
         T_world_start = _true_start(run, truth) if run.run == run.name else None

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 from groundsbot.offline.errors import OfflineError
 
 # Any number of drives may be mapped together, as long as they were driven: recorded ones take 200 kB a minute and more,
-# and who has a hundred has some that broke off. Pairs of stretches are laid over each other.
-_FREE_STRETCHES: Final = 25
-_BYTES_A_STRETCH: Final = 64 << 10
+# and who has a hundred has some that broke off. Pairs of segments are laid over each other.
+_FREE_SEGMENTS: Final = 25
+_BYTES_A_SEGMENT: Final = 64 << 10
 
 
 class Inputs(NamedTuple):
@@ -28,24 +28,24 @@ class Inputs(NamedTuple):
         return Inputs(max(1, len(logs)), sum(map(size_bytes, logs)))
 
     @property
-    def most_stretches(self) -> int:
-        """How many stretches all of them may have."""
-        return _FREE_STRETCHES + self.n_bytes // _BYTES_A_STRETCH
+    def most_segments(self) -> int:
+        """How many segments all of them may have."""
+        return _FREE_SEGMENTS + self.n_bytes // _BYTES_A_SEGMENT
 
-    def check_stretches(self, n_stretches: int, log: Path) -> None:
-        """Refuses more stretches of drives than logs of this size are worth.
+    def check_segments(self, n_segments: int, log: Path) -> None:
+        """Refuses more segments of drives than logs of this size are worth.
 
         Args:
-            n_stretches: of the logs up to this one, at least.
+            n_segments: of the logs up to this one, at least.
             log: named in the error.
 
         Raises:
             OfflineError: naming how many there are, the limit and the way out.
         """
-        if self.n_logs > 1 and n_stretches > self.most_stretches:
+        if self.n_logs > 1 and n_segments > self.most_segments:
             raise OfflineError(
-                f"{log}: with it there are {n_stretches} drives or stretches of such in {self.n_logs} logs, limit "
-                f"{self.most_stretches} for {self.n_bytes} bytes in all; map some of them and add the others by "
+                f"{log}: with it there are {n_segments} drives or segments of such in {self.n_logs} logs, limit "
+                f"{self.most_segments} for {self.n_bytes} bytes in all; map some of them and add the others by "
                 "--extend, or leave some out"
             )
 

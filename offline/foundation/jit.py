@@ -28,7 +28,8 @@ _F = TypeVar("_F", bound=Callable[..., object])
 
 
 # Sums are contracted into fused multiply-adds but never reordered, so that a result does not depend on the machine's
-# vector width. Nobody calls these functions from C. They hold no lock of Python's, so that chains may share out cores.
+# vector width. Nobody calls these functions from C. They hold no lock of Python's, so that segments may share out
+# cores.
 _OPTIONS: Final = {"error_model": "numpy", "fastmath": {"contract"}, "no_cfunc_wrapper": True, "nogil": True}
 _njit: Final[Any] = numba.njit  # its types leave some options out
 

@@ -38,7 +38,7 @@ def solve_global_map(
     """Solves the members of a group together, from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
     with stages.stage("building the graph"):
-        graph = build_graph([member.chain for member in members])
+        graph = build_graph([member.segment for member in members])
         graph = with_measurements(graph, measurements) if measurements else graph
         if len(members) == 1 and not len(graph.problem.measured):
             return graph, members[0].solution
@@ -53,7 +53,7 @@ def solve_global_map(
 
 
 def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
-    """Typed results with covariances, in the frame of the first chain's start; refined on corners where they are."""
+    """Typed results with covariances, in the frame of the first segment's start; refined on corners where they are."""
     last = refined.solution if refined else solution
     state, columns = last.state, last.problem.columns
     starts = graph.first_pose
@@ -64,14 +64,14 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     n_starts = 3 * len(starts)
     runs = tuple(
         _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mount_of(state, i))
-        for i in range(len(graph.chains))
+        for i in range(len(graph.segments))
     )
     tag_covariances = [
         joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2]
         for i in range(len(graph.tags))
     ]
     return Component(
-        frame_run=graph.chains[0].name,
+        frame_run=graph.segments[0].name,
         runs=runs,
         tags=_tag_results(graph, state, tag_covariances, refined.tag_poses if refined else [None] * len(graph.tags)),
         joint_covariance=joint,
@@ -144,19 +144,19 @@ def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArra
 
 
 def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mount: Mount | None) -> RunResult:
-    chain = graph.chains[index]
+    segment = graph.segments[index]
     poses = graph.poses_of(state, index)
     return RunResult(
-        name=chain.name,
-        run=chain.run.name,
-        log=chain.run.log,
-        robot_id=chain.run.robot_id,
-        run_id=chain.run.run_id,
+        name=segment.name,
+        run=segment.run.name,
+        log=segment.run.log,
+        robot_id=segment.run.robot_id,
+        run_id=segment.run.run_id,
         T_map_start=poses[0],
         covariance=covariance,
-        stamps_ns=chain.stamps_ns,
+        stamps_ns=segment.stamps_ns,
         T_map_base=poses,
-        distance_m=float(chain.along_m[-1]),
+        distance_m=float(segment.along_m[-1]),
         T_base_camera=None if mount is None else _components(mount),
     )
 
@@ -172,7 +172,7 @@ def _tag_results(
 ) -> tuple[TagResult, ...]:
     results = []
     for i, (tag, n) in enumerate(zip(graph.tags, graph.n_readings().tolist(), strict=True)):
-        seen_by = [chain for chain in graph.chains if tag in chain.tags]
+        seen_by = [segment for segment in graph.segments if tag in segment.tags]
         robot = seen_by[0].run.robot
         has_size = any(batch.family == tag.family for batch in robot.tags)
         results.append(
@@ -184,7 +184,7 @@ def _tag_results(
                 position_m=state.tags[i],
                 covariance=covariances[i],
                 n_observations=n,
-                runs=tuple(chain.name for chain in seen_by),
+                runs=tuple(segment.name for segment in seen_by),
                 pose=poses[i],
             )
         )

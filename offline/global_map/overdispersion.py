@@ -29,12 +29,12 @@ def misfit_of(
     """What contradicts the model most; None where chance explains all of it.
 
     Args:
-        maps: of the graph's chains in order, solved under the noise that the graph has.
+        maps: of the graph's segments in order, solved under the noise that the graph has.
         graph: of the component.
         solution: of it, on places of tags.
         together: whether all windows of several drives are one map; None where a drive alone does not fit.
     """
-    alone = [_alone(each, graph, solution, chain) for chain, each in enumerate(maps)]
+    alone = [_alone(each, graph, solution, segment) for segment, each in enumerate(maps)]
     found = (_of_joins(maps, graph, solution, alone), _of_windows(maps, graph, solution, alone, together))
     misfits = [each for each in found if each is not None and each.variance_factor > 1.0]
     return max(misfits, key=lambda each: each.variance_factor, default=None)
@@ -54,7 +54,7 @@ def _of_joins(maps: Sequence[LocalMap], graph: Graph, solution: Solution, alone:
     rise = 2.0 * (solution.cost - sum(each.cost for each in alone)) - measured.sum_of_squares(solution.state)
     if rise <= n * float(stats.f.isf(_FALSE_ALARM, n, noise_freedom(maps))):
         return None
-    return Misfit("joins", graph.chains[_worst(graph, solution, alone)].name, rise, n)
+    return Misfit("joins", graph.segments[_worst(graph, solution, alone)].name, rise, n)
 
 
 def _of_windows(
@@ -69,10 +69,10 @@ def _of_windows(
     if not all(each.fits for each in runs):
         cost = [_cost(each) for each in runs]
         worst = int(np.argmax([square / max(1, each.expected) for square, each in zip(cost, runs, strict=True)]))
-        return Misfit("windows", graph.chains[worst].name, sum(cost), noise_freedom(maps))
+        return Misfit("windows", graph.segments[worst].name, sum(cost), noise_freedom(maps))
     if together is None or together.fits:
         return None
-    name = graph.chains[_worst(graph, solution, alone)].name
+    name = graph.segments[_worst(graph, solution, alone)].name
     return Misfit("windows", name, _cost(together), max(1, together.expected))
 
 
@@ -81,13 +81,13 @@ def _cost(goodness: Goodness) -> float:
     return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
 
 
-def _alone(local_map: LocalMap, graph: Graph, solution: Solution, chain: int) -> Solution:
-    """Of one chain of the graph: its local map's, unless its tags were told apart otherwise since."""
-    now = graph.chains[chain]
-    if _same_places(local_map.chain.readings.tag, now.readings.tag):
+def _alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) -> Solution:
+    """Of one segment of the graph: its local map's, unless its tags were told apart otherwise since."""
+    now = graph.segments[segment]
+    if _same_places(local_map.segment.readings.tag, now.readings.tag):
         return local_map.solution
     own = build_graph([now])
-    poses, tags = graph.poses_of(solution.state, chain), graph.tags_of(solution.state)
+    poses, tags = graph.poses_of(solution.state, segment), graph.tags_of(solution.state)
     back = se2.inverse(poses[0])
     start = own.start(
         se2.compose(back, poses),
@@ -106,13 +106,13 @@ def _same_places(tag: IntArray, other: IntArray) -> bool:
 
 
 def _worst(graph: Graph, solution: Solution, alone: Sequence[Solution]) -> int:
-    """The chain whose motions and readings cost most beyond what they cost alone."""
+    """The segment whose motions and readings cost most beyond what they cost alone."""
     together = np.zeros(len(alone))
     for first, losses in zip(
         (graph.problem.odometry.first, graph.problem.readings.pose), _losses(solution), strict=True
     ):
-        chain = np.searchsorted(graph.first_pose, first, side="right") - 1
-        together += np.bincount(chain, losses, len(alone))
+        segment = np.searchsorted(graph.first_pose, first, side="right") - 1
+        together += np.bincount(segment, losses, len(alone))
     return int(np.argmax(together - [sum(losses.sum() for losses in _losses(each)) for each in alone]))
 
 

@@ -67,10 +67,10 @@ def scatter_warnings(graph: Graph, scatter: TagScatter) -> list[str]:
 
 
 def _passes(graph: Graph) -> tuple[IntArray, IntArray]:
-    """(M,) the pass of each reading, through all chains; (P,) the tag of each pass."""
+    """(M,) the pass of each reading, through all segments; (P,) the tag of each pass."""
     n_passes, of_pass = 0, []
-    for chain in graph.chains:
-        own = passes_of(chain)
+    for segment in graph.segments:
+        own = passes_of(segment)
         of_pass.append(n_passes + own)
         n_passes += int(own.max(initial=-1)) + 1
     found = np.concatenate(of_pass)

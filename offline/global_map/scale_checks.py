@@ -26,8 +26,8 @@ _HELD: Final = 1e-12  # the sigma of what is held: far below any that somebody g
 def checks_of(graph: Graph, solution: Solution, component: int) -> list[CheckResult]:
     """Each robot's wheels against each batch of tags that it read, where readings compare them."""
     found: dict[tuple[str, str, str | None], CheckResult] = {}
-    for i, chain in enumerate(graph.chains):
-        robot_id = chain.run.robot_id
+    for i, segment in enumerate(graph.segments):
+        robot_id = segment.run.robot_id
         wheel_scale, _, track_scale = graph.wheel_parameters(i).tolist()
         pairs: list[tuple[str, str | None, list[int]]] = [
             ("scale", graph.parameters[batch].owner, [batch, wheel_scale]) for batch in graph.tag_scales(i).tolist()

@@ -32,7 +32,7 @@ class SolvedComponent(NamedTuple):
 
     Attributes:
         members: of the local maps.
-        graph: its chains are the members' in order.
+        graph: its segments are the members' in order.
         solution: of the graph, on places of tags.
         suspects: tags that do not belong.
         refined: on corners; None where it is not.

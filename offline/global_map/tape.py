@@ -121,8 +121,8 @@ def _first_instances(graph: Graph) -> dict[str | TagKey, int]:
 
 
 def _names(graph: Graph) -> list[str]:
-    """Of the chains: where a run has several, the first has the run's own."""
-    return [chain.name for chain in graph.chains]
+    """Of the segments: where a run has several, the first has the run's own."""
+    return [segment.name for segment in graph.segments]
 
 
 def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:

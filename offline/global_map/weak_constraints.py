@@ -22,12 +22,12 @@ def weak_parts(graph: Graph, solution: Solution) -> list[str]:
 
 
 def _unobservable_warnings(graph: Graph, solution: Solution) -> list[str]:
-    """Of chains that can still move without any measurement noticing."""
-    seen_by = Counter(tag for chain in graph.chains for tag in chain.tags)
+    """Of segments that can still move without any measurement noticing."""
+    seen_by = Counter(tag for segment in graph.segments for tag in segment.tags)
     sentences = []
-    for index in solution.unobservable.chains:
-        chain = graph.chains[index]
-        shared = [tag for tag in chain.tags if seen_by[tag] > 1]
+    for index in solution.unobservable.segments:
+        segment = graph.segments[index]
+        shared = [tag for tag in segment.tags if seen_by[tag] > 1]
         if not shared:
             reason = "shares no tag with the others"
         elif len(shared) == 1:
@@ -35,7 +35,7 @@ def _unobservable_warnings(graph: Graph, solution: Solution) -> list[str]:
         else:
             reason = f"hangs on the others by {_list_tags(shared)} alone, which leaves it free to move"
         sentences.append(
-            f"{chain.name} {reason}; its place in this map means nothing, nor do those of tags it alone saw"
+            f"{segment.name} {reason}; its place in this map means nothing, nor do those of tags it alone saw"
         )
     return sentences
 
@@ -48,8 +48,8 @@ def _single_observation_warnings(graph: Graph) -> list[str]:
         return []
     first, second = readings.value[once].T
     range_m = np.where(readings.polar[once], first, np.hypot(first, second))
-    chain = np.searchsorted(graph.first_pose, readings.pose[once], side="right") - 1
-    names = [graph.chains[c].name for c in chain]
+    segment = np.searchsorted(graph.first_pose, readings.pose[once], side="right") - 1
+    names = [graph.segments[c].name for c in segment]
     tags = [graph.tags[t].tag_id for t in readings.tag[once]]
     if len(once) == 1:
         return [f"tag {tags[0]} was seen once, from {range_m[0]:.1f} m, by {names[0]}; nothing checks its place"]
@@ -64,7 +64,7 @@ def _rounding_warnings(graph: Graph, solution: Solution) -> list[str]:
     if error <= MAX_RELATIVE_ERROR:
         return []
     reason = "sigmas of very different size, or a long drive past too few tags"
-    return [f"{graph.chains[0].name}: rounding spoils the covariances of its map ({reason}); do not trust them"]
+    return [f"{graph.segments[0].name}: rounding spoils the covariances of its map ({reason}); do not trust them"]
 
 
 def _list_tags(tags: list[TagKey]) -> str:

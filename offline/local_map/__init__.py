@@ -1,6 +1,6 @@
 """One drive alone: its local map, and whether the drive fits together in itself.
 
-In: a chain. Out: `LocalMap` (poses and tags in the frame of the drive's start, with their joint covariance) and its
+In: a segment. Out: `LocalMap` (poses and tags in the frame of the drive's start, with their joint covariance) and its
 test of goodness of fit. In the paper: the local map of each robot.
 """
 

@@ -18,28 +18,28 @@ from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.local_map.goodness_of_fit import Goodness
 from groundsbot.offline.local_map.local_map import LocalMap
-from groundsbot.offline.maps import KeptChain, MapResult
+from groundsbot.offline.maps import KeptSegment, MapResult
 from groundsbot.offline.measurements import (
     SAME_SIZE_M,
-    Chain,
-    ChainOdometry,
     CovarianceParts,
     Detections,
     Positions,
     Readings,
     Run,
+    Segment,
+    SegmentOdometry,
     TagKey,
     TapeOptions,
 )
 from groundsbot.offline.sam import State, build_graph, solve
 
 
-def archive_map(local_map: LocalMap) -> KeptChain:
+def archive_map(local_map: LocalMap) -> KeptSegment:
     """What a later run needs of a local map."""
-    chain, state = local_map.chain, local_map.solution.state
-    run, odometry, readings = chain.run, chain.odometry, chain.readings
-    return KeptChain(
-        name=chain.name,
+    segment, state = local_map.segment, local_map.solution.state
+    run, odometry, readings = segment.run, segment.odometry, segment.readings
+    return KeptSegment(
+        name=segment.name,
         run=run.name,
         log=str(run.log),
         robot_id=run.robot_id,
@@ -48,16 +48,16 @@ def archive_map(local_map: LocalMap) -> KeptChain:
         camera_json="" if run.camera is None else json.dumps(asdict(run.camera)),
         log_bytes=run.log_bytes,
         lost=run.lost,
-        warnings=chain.warnings,
+        warnings=segment.warnings,
         run_warnings=run.warnings,
-        stamps_ns=chain.stamps_ns,
+        stamps_ns=segment.stamps_ns,
         motion=odometry.motion,
         motion_covariance=odometry.covariance,
         motion_by_wheels=odometry.jacobian,
         distance_m=odometry.distance_m,
-        tag_families=tuple(tag.family for tag in chain.tags),
-        tag_ids=np.array([tag.tag_id for tag in chain.tags], dtype=np.int64),
-        tag_instances=tuple(tag.instance for tag in chain.tags),
+        tag_families=tuple(tag.family for tag in segment.tags),
+        tag_ids=np.array([tag.tag_id for tag in segment.tags], dtype=np.int64),
+        tag_instances=tuple(tag.instance for tag in segment.tags),
         reading_keyframe=readings.keyframe,
         reading_tag=readings.tag,
         reading=readings.value,
@@ -73,14 +73,14 @@ def archive_map(local_map: LocalMap) -> KeptChain:
     )
 
 
-def local_map_of(kept: KeptChain) -> LocalMap:
+def local_map_of(kept: KeptSegment) -> LocalMap:
     """The local map again, under the noise that it was kept with."""
-    chain = _chain(kept)
-    graph = build_graph([chain])
+    segment = _segment(kept)
+    graph = build_graph([segment])
     solution = solve(graph.problem, State(kept.poses, kept.tags_m, kept.calibration))
     chi_square, expected, bound, odometry_factor, reading_factor = kept.goodness.tolist()
     return LocalMap(
-        chain, graph, solution, Goodness(chi_square, round(expected), bound, odometry_factor, reading_factor)
+        segment, graph, solution, Goodness(chi_square, round(expected), bound, odometry_factor, reading_factor)
     )
 
 
@@ -98,14 +98,14 @@ def segment_from_arrays(
     in_camera: BoolArray,
     *,
     distance_m: FloatArray | None = None,
-) -> Chain:
-    """A chain of motions and readings whose noise is settled, named as its run.
+) -> Segment:
+    """A segment of motions and readings whose noise is settled, named as its run.
 
     Args:
         run: whose they are.
         stamps_ns: (K,) of the keyframes.
-        motions: (K-1, 3), (K-1, 3, 3) and (K-1, 3, 3): motion, covariance and jacobian of `ChainOdometry`.
-        tags: as of `Chain`.
+        motions: (K-1, 3), (K-1, 3, 3) and (K-1, 3, 3): motion, covariance and jacobian of `SegmentOdometry`.
+        tags: as of `Segment`.
         keyframe: as of `Readings`, and likewise the others.
         tag: index into the tags.
         value: of each reading.
@@ -117,7 +117,7 @@ def segment_from_arrays(
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
-    odometry = ChainOdometry(motion, spread, _fixed_parts(spread), jacobian, driven_m)
+    odometry = SegmentOdometry(motion, spread, _fixed_parts(spread), jacobian, driven_m)
     n = len(value)
     readings = Readings(
         keyframe,
@@ -132,7 +132,7 @@ def segment_from_arrays(
         corner_bias_px=np.zeros((n, 2)),
         corner_sigmas=np.ones(n),
     )
-    return Chain(run.name, run, stamps_ns, odometry, tags, readings)
+    return Segment(run.name, run, stamps_ns, odometry, tags, readings)
 
 
 def _fixed_parts(covariance: FloatArray) -> CovarianceParts:
@@ -150,7 +150,7 @@ def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
         log=Path(),
         robot=robot,
         camera=None,
-        stretches=(),
+        wheel_segments=(),
         picture_stamps_ns=none,
         tags=tuple(sorted({tag.whole for tag in tags})),
         detections=Detections(none, none, np.zeros((0, 4, 2))),
@@ -161,7 +161,7 @@ def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
     )
 
 
-def _chain(kept: KeptChain) -> Chain:
+def _segment(kept: KeptSegment) -> Segment:
     names = zip(kept.tag_families, kept.tag_ids.tolist(), kept.tag_instances, strict=True)
     tags = tuple(TagKey(*name) for name in names)
     camera = json.loads(kept.camera_json) if kept.camera_json else None
@@ -175,7 +175,7 @@ def _chain(kept: KeptChain) -> Chain:
         log_bytes=kept.log_bytes,
         lost=kept.lost,
     )
-    chain = segment_from_arrays(
+    segment = segment_from_arrays(
         run,
         kept.stamps_ns,
         (kept.motion, kept.motion_covariance, kept.motion_by_wheels),
@@ -189,7 +189,7 @@ def _chain(kept: KeptChain) -> Chain:
         kept.reading_in_camera,
         distance_m=kept.distance_m,
     )
-    return replace(chain, name=kept.name, warnings=kept.warnings)
+    return replace(segment, name=kept.name, warnings=kept.warnings)
 
 
 def check_extendable(known: MapResult) -> None:
@@ -205,8 +205,8 @@ def check_extendable(known: MapResult) -> None:
         )
 
 
-def tags_of(kept: KeptChain) -> list[TagKey]:
-    """The ids of the tags that a chain read, whichever instance."""
+def tags_of(kept: KeptSegment) -> list[TagKey]:
+    """The ids of the tags that a segment read, whichever instance."""
     return [TagKey(family, tag_id) for family, tag_id in zip(kept.tag_families, kept.tag_ids.tolist(), strict=True)]
 
 

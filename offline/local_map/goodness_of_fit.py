@@ -1,6 +1,6 @@
 """Does a solve fit together? A check that knows no truth, for solves that may have ended in a wrong place.
 
-The chains are cut into windows of a few metres, each with its own start and its own place for each tag. In whichever
+The segments are cut into windows of a few metres, each with its own start and its own place for each tag. In whichever
 valley the whole ended, a window is solved right, and what it leaves over shows how large the noise of wheels and
 readings is. The whole is the same problem under conditions: windows join, and a tag has one place. What the conditions
 cost, in squared sigmas of the noise so fitted, is chi-square with as many degrees of freedom as there are conditions
@@ -284,7 +284,7 @@ def _part(odometry: OdometryFactors, which: BoolArray | slice) -> OdometryFactor
 
 
 def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
-    """(P,) rising numbers, a new one at each chain's start."""
+    """(P,) rising numbers, a new one at each segment's start."""
     n_poses = len(problem.columns.poses)
     driven_m, follows = np.zeros(n_poses), np.zeros(n_poses, dtype=np.bool_)
     after = problem.odometry.first + 1

@@ -1,4 +1,4 @@
-"""One chain solved alone, in the frame of its start.
+"""One segment solved alone, in the frame of its start.
 
 A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
 from there does not fit together, the drive is built up again under the noise that its windows show, with other draws of
@@ -20,7 +20,7 @@ from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fit_
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
-    Chain,
+    Segment,
     TagKey,
     coarse_keyframes,
     coarsen,
@@ -31,7 +31,7 @@ from groundsbot.offline.measurements import (
 )
 from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, State, build_graph, parameters_of_wheels, solve
 
-# A chain is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
+# A segment is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
 # farther than its heading is known to this sigma, under the noise and the wheels' calibration as the pieces before tell
 # it. They grow with the distance, so that the time does not grow with its square.
 _PIECE_M: Final = 10.0
@@ -63,14 +63,14 @@ _NEXT_SHARE: Final = 1.4
 
 @dataclass(frozen=True)
 class LocalMap:
-    """A chain in the frame of its start, and whether its readings fit together there."""
+    """A segment in the frame of its start, and whether its readings fit together there."""
 
-    chain: Chain
+    segment: Segment
     graph: Graph
     solution: Solution
     goodness: Goodness
     is_noisy: bool = False  # its windows show far more noise than was told: that comes first, what does not fit after
-    whole: Chain | None = None  # with readings that nothing confirms, where these were left out of a noisy one
+    whole: Segment | None = None  # with readings that nothing confirms, where these were left out of a noisy one
     n_misread: int = 0  # readings that were left out of it since they are of another tag, or of none
     is_doubtful: bool = False  # it does not fit even under the noise that was fitted to it: no tag of it is named
 
@@ -86,7 +86,7 @@ class LocalMap:
 
     @property
     def calibration(self) -> dict[Parameter, float]:
-        """What the chain says of the calibration."""
+        """What the segment says of the calibration."""
         return self.graph.calibration_of(self.solution.state)
 
     def without_factors(self) -> "LocalMap":
@@ -95,7 +95,7 @@ class LocalMap:
 
 
 class _BuiltUp(NamedTuple):
-    """What is known of a chain as far as it has been built up."""
+    """What is known of a segment as far as it has been built up."""
 
     poses: FloatArray
     wheel_calibration: FloatArray
@@ -103,41 +103,41 @@ class _BuiltUp(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open: bool = False) -> LocalMap:
-    """Solves the whole chain from where building up leads.
+def solve_local_map(segment: Segment, effort: Effort | None = None, *, noise_is_open: bool = False) -> LocalMap:
+    """Solves the whole segment from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
     first that fits counts, else the one of least cost, whose `goodness` then says that it does not fit.
 
     Args:
-        chain: what was measured.
-        effort: what the stretch is worth; the whole log's where None.
-        noise_is_open: the noise that the chain is under is a first guess, to be fitted later. Where its windows show
+        segment: what was measured.
+        effort: what the segment is worth; the whole log's where None.
+        noise_is_open: the noise that the segment is under is a first guess, to be fitted later. Where its windows show
             far more, it is taken for unknown, as it always is for robots that nobody measured.
 
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
     """
-    effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
-    effort.check(build_graph([chain]).problem, chain.run.log, chain.name)
-    shown, check = _noise_of_windows(chain, effort, noise_is_open=noise_is_open)
-    chain, whole = shown.apply_to(chain)
+    effort = effort or Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    effort.check(build_graph([segment]).problem, segment.run.log, segment.name)
+    shown, check = _noise_of_windows(segment, effort, noise_is_open=noise_is_open)
+    segment, whole = shown.apply_to(segment)
     far_larger = shown.is_far_larger
-    graph = build_graph([chain])
-    keyframes = coarse_keyframes(chain)
-    coarse = coarsen(chain, keyframes)
+    graph = build_graph([segment])
+    keyframes = coarse_keyframes(segment)
+    coarse = coarsen(segment, keyframes)
     known = _build_up(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, effort)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
     for n_others in range(1 + _OTHER_STARTS):
-        poses = refine_poses(chain, keyframes, known.poses, known.wheel_calibration)
+        poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
-            best = LocalMap(chain, graph, solution, check.judge(solution), is_noisy=far_larger, whole=whole)
+            best = LocalMap(segment, graph, solution, check.judge(solution), is_noisy=far_larger, whole=whole)
             n_in_vain = 0
             if best.goodness.fits:
                 break
@@ -146,7 +146,7 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open
             break
         known = _build_up(_redrawn(_inflate_noise(coarse, check.noise_factors), rng), effort)
     if best is None:
-        raise ValueError(f"{chain.name}: no start was tried")
+        raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
     return _with_edges_at_solved_ranges(best, effort) if far_larger else best
 
@@ -154,24 +154,24 @@ def solve_local_map(chain: Chain, effort: Effort | None = None, *, noise_is_open
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: Effort) -> LocalMap:
     """The map of noisy ranges solved again, with what depends on ranges taken at those of the map."""
 
-    def changed(chain: Chain) -> Chain:
-        graph = build_graph([chain])
+    def changed(segment: Segment) -> Segment:
+        graph = build_graph([segment])
         state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-        return replace(chain, readings=chain.readings.with_edges_at(graph.problem.readings.ranges_m(state)))
+        return replace(segment, readings=segment.readings.with_edges_at(graph.problem.readings.ranges_m(state)))
 
-    chain = changed(local_map.chain)
-    if not chain.readings.from_corners.any():
+    segment = changed(local_map.segment)
+    if not segment.readings.from_corners.any():
         return local_map
-    graph = build_graph([chain])
+    graph = build_graph([segment])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
     graph.problem.arrowhead.without_scratch()
     whole = local_map.whole
-    return replace(local_map, chain=chain, graph=graph, solution=solution, whole=whole and changed(whole))
+    return replace(local_map, segment=segment, graph=graph, solution=solution, whole=whole and changed(whole))
 
 
 class ShownNoise(NamedTuple):
-    """What the windows of a chain show of its noise.
+    """What the windows of a segment show of its noise.
 
     Attributes:
         is_far_larger: far larger than was told, so that it is taken for unknown.
@@ -183,77 +183,77 @@ class ShownNoise(NamedTuple):
     factors: tuple[float, float]
     added: tuple[str, ...]
 
-    def apply_to(self, chain: Chain) -> tuple[Chain, Chain | None]:
-        """The chain to solve and, where its noise is unknown, the one with readings that nothing confirms."""
+    def apply_to(self, segment: Segment) -> tuple[Segment, Segment | None]:
+        """The segment to solve and, where its noise is unknown, the one with readings that nothing confirms."""
         if not self.is_far_larger:
-            return chain, None
-        whole = chain.with_position_noise(self.added)
+            return segment, None
+        whole = segment.with_position_noise(self.added)
         return without_unconfirmed_tracks(whole), whole
 
 
-def noise_of_windows(chain: Chain) -> ShownNoise:
-    """What the windows show, where the noise that the chain is under is a first guess."""
-    effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
-    return _noise_of_windows(chain, effort, noise_is_open=True)[0]
+def noise_of_windows(segment: Segment) -> ShownNoise:
+    """What the windows show, where the noise that the segment is under is a first guess."""
+    effort = Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    return _noise_of_windows(segment, effort, noise_is_open=True)[0]
 
 
-def first_solution(chain: Chain, shown: ShownNoise) -> tuple[Graph, Solution]:
-    """The chain solved once from where building up leads, whether it fits together or not."""
-    effort = Effort.of_log(chain.run.log_bytes, chain.run.inputs)
-    chain, _ = shown.apply_to(chain)
+def first_solution(segment: Segment, shown: ShownNoise) -> tuple[Graph, Solution]:
+    """The segment solved once from where building up leads, whether it fits together or not."""
+    effort = Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far off the priors costs less than the right one
         wheels, readings = (
             shown.factors
         )  # within a window errors that last do not show: readings are no better than told
-        chain = _inflate_noise(chain, (max(1.0, wheels), max(1.0, readings)))
-    graph, keyframes = build_graph([chain]), coarse_keyframes(chain)
-    known = _build_up(coarsen(chain, keyframes), effort)
-    poses = refine_poses(chain, keyframes, known.poses, known.wheel_calibration)
+        segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, readings)))
+    graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
+    known = _build_up(coarsen(segment, keyframes), effort)
+    poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
     start = graph.start(poses, known.tags, known.calibration)
     return graph, solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
 
 
 def with_goodness_of_fit(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
     """The map with its test of goodness of fit made again, under the noise that was fitted to whole drives."""
-    chain = local_map.chain
-    effort = effort or Effort.of_log(chain.run.log_bytes, chain.run.inputs)
+    segment = local_map.segment
+    effort = effort or Effort.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, effort, least_factor=1.0)
     found = replace(local_map, goodness=check.judge(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
 
 
-def _noise_of_windows(chain: Chain, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
-    """What the windows show, and the check of solutions of the chain that `ShownNoise.applied_to` returns."""
-    is_left_open = chain.run.robot.is_left_open
+def _noise_of_windows(segment: Segment, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
+    """What the windows show, and the check of solutions of the segment that `ShownNoise.applied_to` returns."""
+    is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
-    likely = without_unconfirmed_tracks(chain) if is_left_open else chain
+    likely = without_unconfirmed_tracks(segment) if is_left_open else segment
     check = _Check(build_graph([likely]), effort)
     factors = check.noise_factors if is_left_open else check.usual_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
-    is_beyond_pixels = factors[1] * chain.readings.corner_sigma_px > _MOST_CORNER_PX
+    is_beyond_pixels = factors[1] * segment.readings.corner_sigma_px > _MOST_CORNER_PX
     shown = ShownNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
-    applied, whole = shown.apply_to(chain)
-    if likely is not chain if whole is None else whole.readings is not chain.readings:
+    applied, whole = shown.apply_to(segment)
+    if likely is not segment if whole is None else whole.readings is not segment.readings:
         check = _Check(build_graph([applied]), effort)
         shown = shown._replace(factors=check.noise_factors)
     return shown, check
 
 
 class _Check:
-    """Whether solutions of a chain fit together; without most of the poses that read no tag and have little to say."""
+    """Tests the goodness of fit of solutions of a segment, without most of the poses from which no tag was observed."""
 
     def __init__(self, graph: Graph, effort: Effort, least_factor: float = 0.0) -> None:
-        (chain,) = graph.chains
+        (segment,) = graph.segments
         whole = graph
-        self._keyframes = telling_keyframes(chain)
+        self._keyframes = telling_keyframes(segment)
         share = _LEAST_SHARE
         while len(self._keyframes) > _MOST_CHECKED:
-            self._keyframes = coarse_keyframes(chain, share)
+            self._keyframes = coarse_keyframes(segment, share)
             share *= _NEXT_SHARE
-        if len(self._keyframes) < len(chain.stamps_ns):
-            chain = coarsen(chain, self._keyframes)
-            graph = build_graph([chain])
+        if len(self._keyframes) < len(segment.stamps_ns):
+            segment = coarsen(segment, self._keyframes)
+            graph = build_graph([segment])
         # Tags whose few readings all fall out are not in the windows, nor is what only these depend on.
         self._tags = np.array([whole.tags.index(tag) for tag in graph.tags], dtype=np.int64)
         self._calibration = np.array([whole.parameters.index(each) for each in graph.parameters], dtype=np.int64)
@@ -261,7 +261,7 @@ class _Check:
             graph.problem,
             effort=effort,
             share=_WINDOWS_SHARE,
-            least_shared=least_shared(chain.readings),
+            least_shared=least_shared(segment.readings),
             least_factor=least_factor,
         )
 
@@ -284,31 +284,31 @@ class _Check:
         )
 
 
-def _inflate_noise(chain: Chain, factors: tuple[float, float]) -> Chain:
-    """The chain under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
+def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
+    """The segment under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
     of_wheels, of_readings = factors
     return replace(
-        chain,
-        odometry=replace(chain.odometry, covariance=of_wheels**2 * chain.odometry.covariance),
-        readings=chain.readings.spread(np.full((len(chain.readings), 2), of_readings)),
+        segment,
+        odometry=replace(segment.odometry, covariance=of_wheels**2 * segment.odometry.covariance),
+        readings=segment.readings.spread(np.full((len(segment.readings), 2), of_readings)),
     )
 
 
-def _redrawn(chain: Chain, rng: np.random.Generator) -> Chain:
-    """The chain with one more draw of the wheels' noise: as likely a drive, whose valleys lie elsewhere."""
-    odometry = chain.odometry
+def _redrawn(segment: Segment, rng: np.random.Generator) -> Segment:
+    """The segment with one more draw of the wheels' noise: as likely a drive, whose valleys lie elsewhere."""
+    odometry = segment.odometry
     error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
-    return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
+    return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _build_up(chain: Chain, effort: Effort) -> _BuiltUp:
-    """Solves the chain piece by piece, each from the solution of the last; dead reckoning where effort ends."""
+def _build_up(segment: Segment, effort: Effort) -> _BuiltUp:
+    """Solves the segment piece by piece, each from the solution of the last; dead reckoning where effort ends."""
     known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
-    pieces, n_keyframes = _Pieces(chain), 1
+    pieces, n_keyframes = _Pieces(segment), 1
     while True:
         n_keyframes = pieces.next_end(n_keyframes)
-        part = chain.prefix(n_keyframes)
+        part = segment.prefix(n_keyframes)
         graph = build_graph([part])
         poses = _extend(part, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
@@ -318,10 +318,10 @@ def _build_up(chain: Chain, effort: Effort) -> _BuiltUp:
         state = solution.state
         wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
         known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state))
-        if n_keyframes == len(chain.stamps_ns) or effort.left < enough:
+        if n_keyframes == len(segment.stamps_ns) or effort.left < enough:
             break
         pieces.wheel_covariance = solution.covariance(graph.problem.columns.calibration[graph.wheel_parameters(0)])
-    return known._replace(poses=_extend(chain, known.poses, known.wheel_calibration))
+    return known._replace(poses=_extend(segment, known.poses, known.wheel_calibration))
 
 
 class _Pieces:
@@ -331,13 +331,13 @@ class _Pieces:
         wheel_covariance: (3, 3) of WHEEL_PARAMETERS, as far as they are known; at first as robot.yaml says.
     """
 
-    def __init__(self, chain: Chain) -> None:
-        self._along_m = chain.along_m
-        odometry = chain.odometry
+    def __init__(self, segment: Segment) -> None:
+        self._along_m = segment.along_m
+        odometry = segment.odometry
         # Of the heading at each keyframe: its derivative by the wheels' parameters, and the variance of its noise.
         self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
         self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
-        self.wheel_covariance = np.diag([each.sigma**2 for each in parameters_of_wheels(chain.run.robot)])
+        self.wheel_covariance = np.diag([each.sigma**2 for each in parameters_of_wheels(segment.run.robot)])
 
     def next_end(self, n_keyframes: int) -> int:
         """Where the piece after so many keyframes ends."""
@@ -351,8 +351,8 @@ class _Pieces:
         return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
 
 
-def _extend(part: Chain, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
-    """Poses of a longer chain: those known, then dead reckoning from the last one."""
+def _extend(part: Segment, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+    """Poses of a longer segment: those known, then dead reckoning from the last one."""
     n_known = len(poses)
     rest = part.odometry.motion[n_known - 1 :]
     if not len(rest):

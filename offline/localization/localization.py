@@ -1,6 +1,6 @@
 """A new run in a finished map, which stays as it is: where it started, its trajectory, and which tags were moved since.
 
-Each stretch alone, as for a map; its place from the tags that it shares with the map; then all stretches in one solve
+Each segment alone, as for a map; its place from the tags that it shares with the map; then all segments in one solve
 in which the map's tags and calibration are known as the map knows them (`solve_in_map`).
 """
 
@@ -21,7 +21,7 @@ from groundsbot.offline.localization.placement import Located, locate
 from groundsbot.offline.localization.result import Candidate, Localization, LocatedRun, MovedTag, NotLocated
 from groundsbot.offline.localization.solve_in_map import HeldRun, solve_in_map
 from groundsbot.offline.maps import MapResult
-from groundsbot.offline.measurements import Run, chains_of
+from groundsbot.offline.measurements import Run, segments_of
 from groundsbot.offline.noise import with_noise_of_map
 from groundsbot.offline.outliers import local_maps_of, remove_outliers_under_own_noise, split_duplicates
 
@@ -55,10 +55,10 @@ def localize(
     """
     stages = stages or Stages()
     check_sizes_in_map(run, known)
-    chains = [split_duplicates(chain) for chain in chains_of(run, noise or known.noise)]
-    if not any(chain.tags for chain in chains):
+    segments = [split_duplicates(segment) for segment in segments_of(run, noise or known.noise)]
+    if not any(segment.tags for segment in segments):
         raise OfflineError(f"{run.log}: {run.name} saw no tag, so nothing tells where in {folder} it drove")
-    maps, noisy, broken = local_maps_of(chains, stages)
+    maps, noisy, broken = local_maps_of(segments, stages)
     maps = with_noise_of_map(maps, noise or known.noise, known.noise_fit if noise is None else None)
     maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages)
     found = localize_maps(maps, known, folder, component=component, stages=stages)
@@ -66,7 +66,7 @@ def localize(
         *run.warnings,
         *broken,
         *slipped,
-        *(warning for each in maps for warning in each.chain.warnings),
+        *(warning for each in maps for warning in each.segment.warnings),
         *found.warnings,
     ]
     losses = (f"{run.name}: located without what is lost of {run.log}: {run.lost}",) if run.lost else ()
@@ -81,18 +81,18 @@ def localize_maps(
     component: int | None = None,
     stages: Stages | None = None,
 ) -> Localization:
-    """As `localize`, from the local maps of a run's stretches."""
+    """As `localize`, from the local maps of a run's segments."""
     stages = stages or Stages()
     parts = _parts(known, folder, component)
     with stages.stage("looking for the start"):
-        found = [_Stretch(each, _locate(each, parts)) for each in maps]
+        found = [_SegmentPlaces(each, _locate(each, parts)) for each in maps]
     _check_shared(found, folder, parts)
     home = _home(found)
-    here = [stretch.best for stretch in found if stretch.is_in(home)]
-    not_located = tuple(stretch.why(home) for stretch in found if not stretch.is_in(home))
+    here = [each.best for each in found if each.is_in(home)]
+    not_located = tuple(each.why(home) for each in found if not each.is_in(home))
     if not here and not any(each.candidates for each in not_located):
-        raise OfflineError(f"{maps[0].chain.run.log}: {not_located[0].reason}")
-    warnings = [sentence for each in maps for sentence in each.goodness.warnings(each.chain.name)]
+        raise OfflineError(f"{maps[0].segment.run.log}: {not_located[0].reason}")
+    warnings = [sentence for each in maps for sentence in each.goodness.warnings(each.segment.name)]
     located = Localization(folder, parts[home].frame_run, home, (), not_located, warnings=tuple(warnings))
     if not here:
         return located
@@ -111,8 +111,8 @@ def localize_maps(
 
 
 @dataclass(frozen=True)
-class _Stretch:
-    """One stretch against the components of a map, best first; those that it shares tags with."""
+class _SegmentPlaces:
+    """One segment against the components of a map, best first; those that it shares tags with."""
 
     local_map: LocalMap
     located: tuple[Located, ...]
@@ -138,7 +138,7 @@ class _Stretch:
 
     def why(self, home: int) -> NotLocated:
         """Why its place is not told."""
-        name = self.local_map.chain.name
+        name = self.local_map.segment.name
         if not self.located:
             return NotLocated(name, f"{name} shares no tag with the map; drive it past two tags of the map")
         best = self.best
@@ -180,11 +180,11 @@ def _evidence(located: Located) -> float:
     return float("-inf") if located.alignment is None else located.alignment.evidence_nats
 
 
-def _check_shared(found: Sequence[_Stretch], folder: Path, parts: dict[int, KnownMap]) -> None:
-    if any(stretch.located for stretch in found):
+def _check_shared(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, KnownMap]) -> None:
+    if any(each.located for each in found):
         return
-    run = found[0].local_map.chain.run
-    seen = sorted({tag.whole for stretch in found for tag in stretch.local_map.graph.tags})
+    run = found[0].local_map.segment.run
+    seen = sorted({tag.whole for each in found for tag in each.local_map.graph.tags})
     families = sorted({tag.family for part in parts.values() for tag in part.tags})
     named = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in seen[:8])
     raise OfflineError(
@@ -194,10 +194,10 @@ def _check_shared(found: Sequence[_Stretch], folder: Path, parts: dict[int, Know
     )
 
 
-def _home(found: Sequence[_Stretch]) -> int:
-    """The component of the stretch that is surest."""
-    placed = [stretch for stretch in found if stretch.located]
-    best = max(placed, key=lambda stretch: (stretch.is_sure, _evidence(stretch.best), -stretch.best.component))
+def _home(found: Sequence[_SegmentPlaces]) -> int:
+    """The component of the segment that is surest."""
+    placed = [each for each in found if each.located]
+    best = max(placed, key=lambda each: (each.is_sure, _evidence(each.best), -each.best.component))
     return best.best.component
 
 
@@ -217,18 +217,18 @@ def _runs(held: HeldRun) -> tuple[LocatedRun, ...]:
     state = held.solution.state
     covariance = _in_map_axes(held.solution.pose_covariances(np.arange(len(state.poses))), state.poses)
     runs = []
-    for i, chain in enumerate(held.graph.chains):
+    for i, segment in enumerate(held.graph.segments):
         first = int(held.graph.first_pose[i])
-        own = slice(first, first + len(chain.stamps_ns))
+        own = slice(first, first + len(segment.stamps_ns))
         runs.append(
             LocatedRun(
-                name=chain.name,
-                run=chain.run.name,
-                stamps_ns=chain.stamps_ns,
+                name=segment.name,
+                run=segment.run.name,
+                stamps_ns=segment.stamps_ns,
                 T_map_base=state.poses[own],
                 covariance=covariance[own],
                 tags=tuple(sorted(held.held[i])),
-                distance_m=float(chain.along_m[-1]),
+                distance_m=float(segment.along_m[-1]),
             )
         )
     return tuple(runs)
@@ -249,7 +249,7 @@ def _moved_tags(here: Sequence[Located], held: HeldRun) -> tuple[MovedTag, ...]:
     found = [
         MovedTag(
             tag=each.known,
-            run=place.local_map.chain.name,
+            run=place.local_map.segment.name,
             position_m=each.position_m,
             shift_m=float(np.linalg.norm(each.off_m)),
             sigmas=each.squares**0.5,

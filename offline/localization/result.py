@@ -12,7 +12,7 @@ from groundsbot.offline.measurements import TagKey
 
 @dataclass(frozen=True)
 class LocatedRun:
-    """One stretch of unbroken odometry in the map.
+    """One segment of unbroken odometry in the map.
 
     Attributes:
         name: as in `RunResult`; run: that it belongs to.
@@ -34,7 +34,7 @@ class LocatedRun:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place where a stretch may have started."""
+    """A place where a segment may have started."""
 
     component: int
     T_map_start: FloatArray  # (3,)
@@ -43,7 +43,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class NotLocated:
-    """A stretch whose place in the map is not known.
+    """A segment whose place in the map is not known.
 
     Attributes:
         reason: a sentence.
@@ -60,7 +60,7 @@ class MovedTag:
     """A tag that no longer hangs where the map has it; its place there is not used."""
 
     tag: TagKey
-    run: str  # the stretch that saw it elsewhere
+    run: str  # the segment that saw it elsewhere
     position_m: FloatArray  # (2,) where it hangs now
     shift_m: float  # from where the map and the run put it
     sigmas: float
@@ -81,7 +81,7 @@ class Localization:
     Attributes:
         map: the map's folder.
         frame_run: whose start is the frame; component: its index.
-        runs: the stretches that were located.
+        runs: the segments that were located.
         not_located: those that were not.
         moved: tags that hang elsewhere now.
         new: tags that the map does not have.
@@ -100,5 +100,5 @@ class Localization:
 
     @property
     def is_located(self) -> bool:
-        """Whether any stretch is."""
+        """Whether any segment is."""
         return bool(self.runs)

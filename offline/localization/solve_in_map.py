@@ -1,4 +1,4 @@
-"""The stretches of a run solved together in a finished map: its tags and calibration are known beforehand, jointly.
+"""The segments of a run solved together in a finished map: its tags and calibration are known beforehand, jointly.
 
 The map's tags are variables with the map's joint covariance as their prior, so the trajectory carries its uncertainty;
 what the run makes of them is not kept. A tag that was moved since is given a place of its own. It is looked for as in
@@ -63,7 +63,7 @@ def solve_in_map(
     maybe: Sequence[dict[TagKey, TagKey]],
     known: KnownMap,
 ) -> HeldRun:
-    """Solves stretches in a map, and frees the tags of it that were moved.
+    """Solves segments in a map, and frees the tags of it that were moved.
 
     Args:
         members: their local maps.
@@ -94,7 +94,7 @@ def solve_in_map(
 
 
 class _Split:
-    """Which of the map's tags hold which stretch, and which are loose."""
+    """Which of the map's tags hold which segment, and which are loose."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class _Split:
         off = {key: judge.tag_offset(tag) for key, tag in _entries(self.held)}
         worst = max(off, key=lambda key: off[key].squares, default=None)
         if worst is not None and off[worst].squares > self.bound and len(off) > 2:
-            # In all stretches that saw it: where each has it is told apart from the map's place.
+            # In all segments that saw it: where each has it is told apart from the map's place.
             for i, own in [key for key, each in off.items() if each.known == off[worst].known]:
                 self.loose[i][own] = self.held[i].pop(own)
                 self._settled.add((i, own))
@@ -144,7 +144,7 @@ def _solve(
     known: KnownMap,
 ) -> tuple[Graph, Solution]:
     called = [rename_tags(each, split.name_of(i)) for i, each in enumerate(members)]
-    graph = unheld(build_graph([each.chain for each in called]))
+    graph = unheld(build_graph([each.segment for each in called]))
     of_map = {tag: tag for each in split.held for tag in each.values()}
     graph = known.constrain(graph, of_map)
     poses = np.concatenate([se2.compose(T, each.T_start_base) for T, each in zip(T_map_start, members, strict=True)])
@@ -160,7 +160,7 @@ def _solve(
 
 def _own_name(member: LocalMap, tag: TagKey) -> TagKey:
     """Of a tag whose place in the map does not count."""
-    return tag._replace(instance=f"{_MOVED}{member.chain.name} {tag.instance}")
+    return tag._replace(instance=f"{_MOVED}{member.segment.name} {tag.instance}")
 
 
 def _entries(groups: Sequence[dict[TagKey, TagKey]]) -> list[tuple[tuple[int, TagKey], TagKey]]:

@@ -95,7 +95,7 @@ def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Good
 
 def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness | None) -> list[str]:
     """Drives that do not fit together in themselves, and a component that does not though its drives do."""
-    found = [w for each in maps for w in each.goodness.warnings(each.chain.name)]
+    found = [w for each in maps for w in each.goodness.warnings(each.segment.name)]
     return found if together is None else found + together.warnings(f"component {component}")
 
 

@@ -18,7 +18,7 @@ from groundsbot.onboard.log import Allowance
 
 
 def check_distinct(runs: Sequence[Run]) -> None:
-    """Refuses a drive that is given twice, and runs and stretches that would have one name."""
+    """Refuses a drive that is given twice, and runs and segments that would have one name."""
     if not runs:
         raise OfflineError("no log given; name at least one log file or run folder")
     seen: dict[str, Run] = {}
@@ -36,11 +36,11 @@ def check_distinct(runs: Sequence[Run]) -> None:
             )
         seen[run.name] = run
     for run in runs:
-        stretch = re.fullmatch(r"(.+)_stretch\d+", run.name)
-        if stretch and stretch[1] in seen:
+        later = re.fullmatch(r"(.+)_stretch\d+", run.name)
+        if later and later[1] in seen:
             raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a stretch of {stretch[1]}, which "
-                f"{seen[stretch[1]].log} is; map them apart"
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a segment of {later[1]}, which "
+                f"{seen[later[1]].log} is; map them apart"
             )
 
 
@@ -78,14 +78,14 @@ def read_runs(
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.
     """
-    runs, inputs, allowance, n_stretches = list[Run](), Inputs.of(logs), Allowance(), 0
+    runs, inputs, allowance, n_segments = list[Run](), Inputs.of(logs), Allowance(), 0
     if logs:
-        inputs.check_stretches(len(logs), logs[-1])
+        inputs.check_segments(len(logs), logs[-1])
     with (stages or Stages()).stage("reading logs", len(logs)) as done:
         for log in logs:
             runs.append(load_run(log, robot_files, inputs, allowance))
-            n_stretches += len(runs[-1].stretches)
-            inputs.check_stretches(n_stretches, log)
+            n_segments += len(runs[-1].wheel_segments)
+            inputs.check_segments(n_segments, log)
             done()
     check_robots(runs, robot_files or {})
     return runs

@@ -55,7 +55,7 @@ def reason_apart(
     """Why a component is one of its own, told of the pair that is nearest to joining it, and what would help."""
     crossing = [pair for pair in merged.pairs if (pair.a in group.members) != (pair.b in group.members)]
     if crossing:
-        names = {maps[m].chain.name for m in group.members}
+        names = {maps[m].segment.name for m in group.members}
         nearest = max(crossing, key=_nearness)
         why = _reason_not_joined(maps, nearest, names)
         if len(nearest.shared) > 1:
@@ -64,7 +64,7 @@ def reason_apart(
             return f"{why}, and --model corners may do with the one"
         tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
         return tried[0] if tried else why
-    name = maps[group.members[0]].chain.name
+    name = maps[group.members[0]].segment.name
     if not any(maps[m].graph.tags for m in group.members):
         return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"
     return f"{name} shares no tag with the others; drive it past two tags that another run saw"
@@ -74,7 +74,7 @@ def _not_searched(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
     left = [pair for pair in merged.pairs if not pair.is_searched]
     if not left:
         return []
-    a, b = (maps[m].chain.name for m in (left[0].a, left[0].b))
+    a, b = (maps[m].segment.name for m in (left[0].a, left[0].b))
     told = f"{len(left)} of {len(merged.pairs)} pairs of drives that share tags were not laid over each other"
     return [f"{told}, {a} and {b} among them: {_TOO_LONG}"]
 
@@ -86,7 +86,7 @@ def _nearness(pair: PairAlignment) -> tuple[float, int]:
 
 def _reason_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
     """Why a pair is not joined; the first name is one of `told_of`."""
-    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
     if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
         a, b = b, a
     if not pair.is_searched:
@@ -97,7 +97,7 @@ def _reason_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: s
 def _elsewhere(
     maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment, named: Collection[tuple[str, int]]
 ) -> list[str]:
-    a, b = maps[pair.a].chain.name, maps[pair.b].chain.name
+    a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
     return [
         f"tag {tag.tag_id} lies {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
         "moved between the runs, or carried about?"
@@ -111,9 +111,9 @@ def _elsewhere(
 def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
     warnings = []
     for each in merged.contradictions:
-        ring = ", ".join(maps[m].chain.name for m in each.ring)
+        ring = ", ".join(maps[m].segment.name for m in each.ring)
         gap_m, turn_deg = float((each.gap[:2] ** 2).sum() ** 0.5), abs(degrees(each.gap[2]))
-        a, b = (maps[m].chain.name for m in (each.link.a, each.link.b))
+        a, b = (maps[m].segment.name for m in (each.link.a, each.link.b))
         warnings.append(
             f"the alignments of {ring} contradict each other (their ring gapes by {gap_m:.2f} m and {turn_deg:.1f} "
             f"deg, {each.sigmas:.0f} sigma); that of {a} with {b} was left out"
@@ -123,8 +123,8 @@ def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
 
 def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment) -> AlignmentResult:
     return AlignmentResult(
-        from_run=maps[pair.a].chain.name,
-        to_run=maps[pair.b].chain.name,
+        from_run=maps[pair.a].segment.name,
+        to_run=maps[pair.b].segment.name,
         T_from_to=alignment.T_a_b,
         n_shared=len(pair.shared),
         n_inliers=alignment.n_inliers,

@@ -1,4 +1,4 @@
-"""Logs in, map out: runs -> chains -> local maps -> alignments -> components -> one global solve each."""
+"""Logs in, map out: runs -> segments -> local maps -> alignments -> components -> one global solve each."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,12 +25,12 @@ from groundsbot.offline.mapping.warnings import map_warnings
 from groundsbot.offline.mapping.workings import Workings
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import (
-    Chain,
     Measurements,
     Run,
+    Segment,
     TapeOptions,
-    chains_of,
     parse_measurements,
+    segments_of,
 )
 from groundsbot.offline.noise import fit_and_weigh, with_noise_of_map
 from groundsbot.offline.outliers import (
@@ -95,14 +95,14 @@ def build_map(
     workings = workings or Workings()
     workings.runs += runs
     given = runs
-    (runs, choices, put_in, searches), chains = _calibrate_runs(
+    (runs, choices, put_in, searches), segments = _calibrate_runs(
         runs, noise or prior_noise, stages, calibrate, corners=corners
     )
     workings.searches |= searches
-    measurements = _measurements(tape, runs, chains, extending)
+    measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
     times = TIMES_MAPPED if calibrate.is_on else 1
-    maps, noisy, broken = local_maps_of(chains, stages, times, noise_is_open=noise is None)
+    maps, noisy, broken = local_maps_of(segments, stages, times, noise_is_open=noise is None)
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
@@ -121,7 +121,7 @@ def build_map(
         workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
     found.measured += unused_measurements(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
-    runs = [*{each.chain.run.name: each.chain.run for each in known}.values(), *runs]
+    runs = [*{each.segment.run.name: each.segment.run for each in known}.values(), *runs]
     calibration = about_the_files(found.calibration, put_in)
     return MapResult(
         components=tuple(found.components),
@@ -146,8 +146,8 @@ def build_map(
 
 def _calibrate_runs(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
-) -> tuple[Freed, list[Chain]]:
-    """The runs as their robots are to be taken, and their stretches."""
+) -> tuple[Freed, list[Segment]]:
+    """The runs as their robots are to be taken, and their segments."""
     with stages.stage("start values of robots"):
         runs, started, searches = start_left_open(runs, noise)
     found = Freed(runs, started, put_right(started), searches)
@@ -157,23 +157,23 @@ def _calibrate_runs(
         found = Freed(
             freed.runs, (*started, *freed.choices), found.put_in | freed.put_in, found.searches | freed.searches
         )
-    return found, _chains(found.runs, noise, stages)
+    return found, _segments(found.runs, noise, stages)
 
 
-def _chains(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Chain]:
-    """All stretches of the runs, two tags with one id apart."""
-    chains: list[Chain] = []
+def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Segment]:
+    """All segments of the runs, two tags with one id apart."""
+    segments: list[Segment] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
-            chains += [split_duplicates(chain) for chain in chains_of(run, noise)]
+            segments += [split_duplicates(segment) for segment in segments_of(run, noise)]
             done()
-    return chains
+    return segments
 
 
 def _measurements(
-    tape: TapeOptions, runs: Sequence[Run], chains: Sequence[Chain], extending: MapResult | None
+    tape: TapeOptions, runs: Sequence[Run], segments: Sequence[Segment], extending: MapResult | None
 ) -> Measurements:
-    names, tags = [run.name for run in runs], {tag for chain in chains for tag in chain.tags}
+    names, tags = [run.name for run in runs], {tag for segment in segments for tag in segment.tags}
     if extending is not None:
         names = [*dict.fromkeys(each.run for each in extending.kept), *names]
         tags |= {tag for each in extending.kept for tag in tags_of(each)}
@@ -208,7 +208,7 @@ def _align_and_solve(
 ) -> _Together:
     """Aligns local maps and solves each group that hangs together; on corners a single tag may join two of them."""
     with stages.stage("aligning local maps"):
-        merged = merge(maps, measurements.placements([each.chain.name for each in maps]))
+        merged = merge(maps, measurements.placements([each.segment.name for each in maps]))
         maps = with_outliers_apart(maps, merged)
     solve = partial(solve_group, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
     components = [solve(maps, members, measurements, stages) for members in merged.groups]

@@ -10,7 +10,7 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.mapping.findings import Found
 from groundsbot.offline.mapping.merge_report import merge_warnings
 from groundsbot.offline.maps import MAX_SIGMAS, CalibrationResult, CheckResult
-from groundsbot.offline.measurements import Chain, Run
+from groundsbot.offline.measurements import Run, Segment
 
 
 def map_warnings(
@@ -22,12 +22,16 @@ def map_warnings(
     not_joined: Sequence[TagJoin] | None,
 ) -> tuple[str, ...]:
     """All that a person must be told, in the order in which it came up, each sentence once."""
-    chains = [each.chain for each in maps]
-    warnings = [w for run in runs for w in run.warnings] + [*broken] + [w for chain in chains for w in chain.warnings]
+    segments = [each.segment for each in maps]
+    warnings = (
+        [w for run in runs for w in run.warnings] + [*broken] + [w for segment in segments for w in segment.warnings]
+    )
     warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
     warnings += calibration_warnings(found.calibration, found.checks)
     named = {(each.family, each.tag_id) for each in found.suspects} | found.left_out | _in_one_place(found)
-    return tuple(dict.fromkeys(warnings + _chain_warnings(chains) + merge_warnings(maps, merged, named, not_joined)))
+    return tuple(
+        dict.fromkeys(warnings + _segment_warnings(segments) + merge_warnings(maps, merged, named, not_joined))
+    )
 
 
 def _in_one_place(found: Found) -> set[tuple[str, int]]:
@@ -53,15 +57,15 @@ def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Seque
     ]
 
 
-def _chain_warnings(chains: Sequence[Chain]) -> list[str]:
+def _segment_warnings(segments: Sequence[Segment]) -> list[str]:
     warnings = []
-    for chain in chains:
-        if chain.along_m[-1] < 0.05:
-            warnings.append(f"{chain.name} never moves (its wheels turned less than 5 cm)")
-        if not chain.tags and len(chains) == 1:
-            warnings.append(f"{chain.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
-        if len(chain.tags) == 1:
+    for segment in segments:
+        if segment.along_m[-1] < 0.05:
+            warnings.append(f"{segment.name} never moves (its wheels turned less than 5 cm)")
+        if not segment.tags and len(segments) == 1:
+            warnings.append(f"{segment.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
+        if len(segment.tags) == 1:
             warnings.append(
-                f"{chain.name} saw a single tag, {chain.tags[0].tag_id}; two would make sure how it lies to other runs"
+                f"{segment.name} saw a single tag, {segment.tags[0].tag_id}; two would fix its place among other runs"
             )
     return warnings

@@ -16,7 +16,7 @@ class Solved(NamedTuple):
 
     Attributes:
         group: indices into `Workings.maps`, and where the alignments put their starts.
-        graph: its chains are the group's members in order, its tags those of the component in order.
+        graph: its segments are the group's members in order, its tags those of the component in order.
         solution: of that graph.
         poses: (P, 3) of its keyframes as the map has them: refined on corners where that was possible.
     """
@@ -26,10 +26,10 @@ class Solved(NamedTuple):
     solution: Solution
     poses: FloatArray
 
-    def poses_of(self, chain: int) -> FloatArray:
-        """(K, 3) of one chain."""
-        first = int(self.graph.first_pose[chain])
-        return self.poses[first : first + len(self.graph.chains[chain].stamps_ns)]
+    def poses_of(self, segment: int) -> FloatArray:
+        """(K, 3) of one segment."""
+        first = int(self.graph.first_pose[segment])
+        return self.poses[first : first + len(self.graph.segments[segment].stamps_ns)]
 
 
 @dataclass

@@ -1,4 +1,4 @@
-from .archive import KeptCalibration, KeptChain, nominal_row
+from .archive import KeptCalibration, KeptSegment, nominal_row
 from .files import JSON_FILE, read_map, write_map
 from .fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
 from .json_document import advice_as_json, map_as_json
@@ -46,7 +46,7 @@ __all__ = [
     "FloorSigmas",
     "GraphEdges",
     "KeptCalibration",
-    "KeptChain",
+    "KeptSegment",
     "MapModel",
     "MapResult",
     "MeasurementResult",

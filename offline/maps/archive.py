@@ -37,15 +37,15 @@ class KeptCalibration:
 
 
 @dataclass(frozen=True)
-class KeptChain:
-    """The measurements of one chain as they entered the joint solve, and where its own solve ended.
+class KeptSegment:
+    """The measurements of one segment as they entered the joint solve, and where its own solve ended.
 
     Attributes:
         name, run, log, robot_id, run_id: as in `RunResult`.
         robot_json: the robot.yaml that was used; camera_json: the camera, empty without one.
         log_bytes: of the log.
         lost: what of the log could not be read.
-        warnings: of the chain; run_warnings: of its run.
+        warnings: of the segment; run_warnings: of its run.
         stamps_ns: (K,) of the keyframes.
         motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels:
             (K-1, 3, 3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
@@ -54,7 +54,7 @@ class KeptChain:
             (M, 2, 2); reading_by_camera: (M, 2, 5) derivative by `readings.CAMERA_PARAMETERS`.
         reading_polar, reading_in_camera: (M,) its form, and whether about the camera or about base.
         picture_stamps_ns: (F,) of all pictures.
-        poses: (K, 3) in the frame of the chain's start; tags_m: (T, 2) there; calibration: of its graph.
+        poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.
         goodness: (5,) the fields of `Goodness`.
     """
 
@@ -91,7 +91,7 @@ class KeptChain:
     goodness: FloatArray
 
 
-def arrays_of(kept: KeptCalibration | KeptChain, key: str) -> dict[str, Any]:
+def arrays_of(kept: KeptCalibration | KeptSegment, key: str) -> dict[str, Any]:
     """Arrays by name, each after the key; texts as unicode arrays."""
     arrays: dict[str, Any] = {}
     for each in fields(kept):
@@ -106,14 +106,14 @@ def calibration_from(arrays: Any, key: str) -> KeptCalibration | None:  # noqa: 
     return KeptCalibration(**_values(KeptCalibration, arrays, key)) if f"{key}owners" in arrays else None
 
 
-def chain_from(arrays: Any, key: str) -> KeptChain | None:  # noqa: ANN401 - numpy's file of arrays
+def segment_from(arrays: Any, key: str) -> KeptSegment | None:  # noqa: ANN401 - numpy's file of arrays
     """What `arrays_of` wrote; None where there is none, or one of a program that knew fewer numbers of a camera."""
     if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
         return None
-    return KeptChain(**_values(KeptChain, arrays, key))
+    return KeptSegment(**_values(KeptSegment, arrays, key))
 
 
-def _values(kind: type[KeptCalibration | KeptChain], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
+def _values(kind: type[KeptCalibration | KeptSegment], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
     """Of a dataclass: texts and counts as Python's own, all else as arrays."""
     values: dict[str, Any] = {}
     for each in fields(kind):

@@ -17,7 +17,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
-from groundsbot.offline.maps.archive import KeptChain, arrays_of, calibration_from, chain_from
+from groundsbot.offline.maps.archive import KeptSegment, arrays_of, calibration_from, segment_from
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.maps.json_document import (
     FORMAT_VERSION,
@@ -192,10 +192,10 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     )
 
 
-def _archived_segments(arrays: Mapping[str, Any]) -> tuple[KeptChain, ...]:
+def _archived_segments(arrays: Mapping[str, Any]) -> tuple[KeptSegment, ...]:
     """All that there are; none in a map of an older program."""
-    found: list[KeptChain] = []
-    while (kept := chain_from(arrays, f"run{len(found)}_")) is not None:
+    found: list[KeptSegment] = []
+    while (kept := segment_from(arrays, f"run{len(found)}_")) is not None:
         found.append(kept)
     return tuple(found)
 

@@ -34,8 +34,8 @@ class CalibrationChoice:
         value: the correction by the drives alone, with its sigma.
         prior_sigma: what robot.yaml says of it.
         off_sigmas: how far drives and robot.yaml differ.
-        held_out_gain: log likelihood of each stretch by what the other stretches tell, over that by robot.yaml; summed.
-            None where no two stretches tell anything of it.
+        held_out_gain: log likelihood of each segment by what the other segments tell, over that by robot.yaml; summed.
+            None where no two segments tell anything of it.
         reason: why it stays as robot.yaml has it; empty where it is freed.
         is_asked: it was asked for by its name.
     """

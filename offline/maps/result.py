@@ -1,6 +1,6 @@
 """What mapping hands out: typed, in the map frame, in SI units.
 
-A run with unbroken odometry is one chain; where the odometry broke, a run has several chains (stretches), named
+A run with unbroken odometry is one segment; where the odometry broke, a run has several segments (segments), named
 `<run>` and `<run>_stretch2`, ... Each is placed on its own, like another run.
 """
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.archive import KeptCalibration, KeptChain
+from groundsbot.offline.maps.archive import KeptCalibration, KeptSegment
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, SuspectTag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
@@ -25,10 +25,10 @@ from groundsbot.offline.maps.parameter_results import (
 
 @dataclass(frozen=True)
 class RunResult:
-    """One chain of keyframes in its component's map frame."""
+    """One segment of keyframes in its component's map frame."""
 
-    name: str  # unique: robot id and run id, and the stretch where there are several
-    run: str  # the run it belongs to: equal to name unless it is a later stretch
+    name: str  # unique: robot id and run id, and the segment where there are several
+    run: str  # the run it belongs to: equal to name unless it is a later segment
     log: Path
     robot_id: str
     run_id: str
@@ -223,7 +223,7 @@ class MapResult:
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
     choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none where it was off
     robot_numbers: tuple[RobotNumber, ...] = ()  # what the drives say of each number of robots' files
-    kept: tuple[KeptChain, ...] = ()  # each run's measurements, to solve them again together with another run's
+    kept: tuple[KeptSegment, ...] = ()  # each run's measurements, to solve them again together with another run's
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

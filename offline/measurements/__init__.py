@@ -1,6 +1,6 @@
 """The front end: one run log to keyframes, odometry factors and tag measurements, each with its covariance.
 
-In: a run log. Out: `Run` and `Chain` (one unbroken segment of a drive), with everything that the estimate takes from
+In: a run log. Out: `Run` and `Segment` (one unbroken segment of a drive), with everything that the estimate takes from
 them. In the paper: the motion model (`motion_model/`) and the sensor model (`sensor_model/`).
 """
 

@@ -1,11 +1,11 @@
-from .chain import Chain, chains_of
-from .coarse_chain import coarse_keyframes, coarsen, refine_poses, telling_keyframes
+from .coarse_segment import coarse_keyframes, coarsen, refine_poses, telling_keyframes
 from .covariance_components import CovarianceParts
-from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, ChainOdometry
+from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
-from .motion_model.stretches import wheel_distances
+from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
+from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared, least_shared_by_corners
 from .sensor_model.readings import Readings
 from .sensor_model.sensor_model import (
@@ -34,8 +34,6 @@ __all__ = [
     "STAMP_NOISE",
     "UNIT_CORNERS",
     "UNMODELLED_SIGMA_M",
-    "Chain",
-    "ChainOdometry",
     "CovarianceParts",
     "Detections",
     "MeasuredDistance",
@@ -47,10 +45,11 @@ __all__ = [
     "RobotFile",
     "Run",
     "RunEvent",
+    "Segment",
+    "SegmentOdometry",
     "TagKey",
     "TapeOptions",
     "cells_of",
-    "chains_of",
     "coarse_keyframes",
     "coarsen",
     "growth",
@@ -63,6 +62,7 @@ __all__ = [
     "read_positions",
     "read_robot_file",
     "refine_poses",
+    "segments_of",
     "telling_keyframes",
     "wheel_distances",
     "without_unconfirmed_tracks",

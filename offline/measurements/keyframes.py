@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
@@ -17,13 +17,13 @@ _STANDING_TICKS: Final = 1.5
 _STANDING_M: Final = 1e-7  # rounding
 
 
-def candidate_stamps(run: Run, track: WheelTrack) -> IntArray:
+def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
     """Times at which a pose is wanted: pictures, or whatever an imported log was stamped with."""
     stamps_ns = run.picture_stamps_ns
     if not len(stamps_ns):
-        stamps_ns = np.union1d(track.stamps_ns, run.positions.stamps_ns)
-    inside = (stamps_ns >= track.stamps_ns[0]) & (stamps_ns <= track.stamps_ns[-1])
-    return np.asarray(np.union1d(track.stamps_ns[:1], stamps_ns[inside]), dtype=np.int64)
+        stamps_ns = np.union1d(wheel_segment.stamps_ns, run.positions.stamps_ns)
+    inside = (stamps_ns >= wheel_segment.stamps_ns[0]) & (stamps_ns <= wheel_segment.stamps_ns[-1])
+    return np.asarray(np.union1d(wheel_segment.stamps_ns[:1], stamps_ns[inside]), dtype=np.int64)
 
 
 def tags_at_candidates(run: Run, stamps_ns: IntArray) -> list[set[int]]:
@@ -39,13 +39,13 @@ def tags_at_candidates(run: Run, stamps_ns: IntArray) -> list[set[int]]:
 
 
 def choose_keyframes(
-    track: WheelTrack, stamps_ns: IntArray, tags_at: list[set[int]], track_m: float
+    wheel_segment: WheelSegment, stamps_ns: IntArray, tags_at: list[set[int]], track_m: float
 ) -> tuple[IntArray, IntArray]:
     """Thins by motion: (K,) stamps, and for each candidate its keyframe or -1 (passed over)."""
-    left_m, right_m = track.at(stamps_ns)
+    left_m, right_m = wheel_segment.at(stamps_ns)
     distance_m, turn_rad = 0.5 * (left_m + right_m), (right_m - left_m) / track_m
     keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
-    standing_m = _STANDING_TICKS * track.quantum_m + _STANDING_M
+    standing_m = _STANDING_TICKS * wheel_segment.quantum_m + _STANDING_M
     chosen: list[int] = []
     for i, (distance, turn) in enumerate(zip(distance_m.tolist(), turn_rad.tolist(), strict=True)):
         moved_m = abs(distance - distance_m[chosen[-1]]) if chosen else np.inf

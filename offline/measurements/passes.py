@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, IntArray
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 
 # Longer out of sight, by the way driven or by the clock, and it is another pass.
 GAP_M: Final = 2.0
@@ -18,21 +18,21 @@ MOST_MISREAD: Final = 0.05
 _CELL_M: Final = 2.5
 
 
-def passes_of(chain: Chain, cut: BoolArray | None = None) -> IntArray:
+def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
     """(M,) the pass of each reading, from 0 without gaps, in order of tag and time.
 
     Args:
-        chain: whose M readings.
+        segment: whose M readings.
         cut: (M,) readings with which another pass begins though the tag was not out of sight.
     """
-    readings = chain.readings
+    readings = segment.readings
     order = np.lexsort((readings.keyframe, readings.tag))
     tag, keyframe = readings.tag[order], readings.keyframe[order]
     begins = np.ones(len(order), dtype=np.bool_)
     begins[1:] = (
         (np.diff(tag) != 0)
-        | (np.diff(chain.along_m[keyframe]) > GAP_M)
-        | (np.diff(chain.stamps_ns[keyframe]) > _GAP_S * 1e9)
+        | (np.diff(segment.along_m[keyframe]) > GAP_M)
+        | (np.diff(segment.stamps_ns[keyframe]) > _GAP_S * 1e9)
     )
     if cut is not None:
         begins[1:] |= cut[order][1:]
@@ -41,24 +41,24 @@ def passes_of(chain: Chain, cut: BoolArray | None = None) -> IntArray:
     return number
 
 
-def without_unconfirmed_tracks(chain: Chain) -> Chain:
-    """The chain without passes of one or two readings of tags that have passes of more.
+def without_unconfirmed_tracks(segment: Segment) -> Segment:
+    """The segment without passes of one or two readings of tags that have passes of more.
 
     A detector that takes one tag for another does so in a picture or two; tags that pass by are read in several. Where
     more of the readings are alone than codes are misread, the sensor reads seldom, and all stay.
     """
-    readings, pass_of = chain.readings, passes_of(chain)
+    readings, pass_of = segment.readings, passes_of(segment)
     if not len(readings):
-        return chain
+        return segment
     n_in_pass = np.bincount(pass_of)[pass_of]
-    most = np.zeros(len(chain.tags), dtype=np.int64)
+    most = np.zeros(len(segment.tags), dtype=np.int64)
     np.maximum.at(most, readings.tag, n_in_pass)
     is_alone = (n_in_pass <= FEW_READINGS) & (most[readings.tag] > FEW_READINGS)
-    return chain if is_alone.mean() > MOST_MISREAD else chain.with_readings(~is_alone)
+    return segment if is_alone.mean() > MOST_MISREAD else segment.with_readings(~is_alone)
 
 
-def cells_of(chain: Chain) -> IntArray:
+def cells_of(segment: Segment) -> IntArray:
     """(M,) of each reading: a number for each tag in each 2.5 m of the way, from 0 without gaps."""
-    part = (chain.along_m[chain.readings.keyframe] / _CELL_M).astype(np.int64)
-    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    part = (segment.along_m[segment.readings.keyframe] / _CELL_M).astype(np.int64)
+    _, cell = np.unique(part * len(segment.tags) + segment.readings.tag, return_inverse=True)
     return np.asarray(cell, dtype=np.int64)

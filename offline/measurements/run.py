@@ -12,8 +12,8 @@ from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
-from groundsbot.offline.measurements.motion_model.stretches import WheelRow, stretches_of
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
+from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
 from groundsbot.offline.measurements.tag_messages import RunReadings
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
@@ -48,7 +48,7 @@ class Run:
 
     Attributes:
         name: robot id and run id, unique among the runs of a map.
-        stretches: wheel readings with unbroken odometry, in order.
+        segments: wheel readings with unbroken odometry, in order.
         picture_stamps_ns: (F,) every picture, also those that show no tag.
         tags: what was seen, sorted.
         camera: None in an imported log.
@@ -66,7 +66,7 @@ class Run:
     log: Path
     robot: Robot
     camera: CameraModel | None
-    stretches: tuple[WheelTrack, ...]
+    wheel_segments: tuple[WheelSegment, ...]
     picture_stamps_ns: IntArray
     tags: tuple[TagKey, ...]
     detections: Detections
@@ -181,7 +181,7 @@ def load_run(
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
-    stretches, warnings = stretches_of(collected.wheels, collected.odometry, robot, log, log_bytes)
+    wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     collected.readings.check_tags(log)
     read = collected.readings.collect(log_bytes, inputs.n_logs)
@@ -195,7 +195,7 @@ def load_run(
         log=log,
         robot=robot,
         camera=camera,
-        stretches=tuple(stretches),
+        wheel_segments=tuple(wheel_segments),
         picture_stamps_ns=read.pictures_ns,
         tags=read.tags,
         detections=replace(

@@ -10,7 +10,7 @@ from scipy.special import ndtri
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import STAMP_NOISE, Chain, CovarianceParts, coarse_keyframes, coarsen
+from groundsbot.offline.measurements import STAMP_NOISE, CovarianceParts, Segment, coarse_keyframes, coarsen
 from groundsbot.offline.noise.likelihood import Components, Part
 from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
@@ -75,7 +75,7 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoisePara
         noise: what stays where the drives say nothing.
         start: where to begin; there where None.
     """
-    maps = sorted(maps, key=lambda each: each.chain.name)  # sums are rounded alike whatever the order of the logs
+    maps = sorted(maps, key=lambda each: each.segment.name)  # sums are rounded alike whatever the order of the logs
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
@@ -107,7 +107,7 @@ def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
     """Parameters that some measurement depends on."""
     found = set()
     for each in maps:
-        for parts in (each.chain.odometry.parts, each.chain.readings.parts):
+        for parts in (each.segment.odometry.parts, each.segment.readings.parts):
             found |= {name for name, unit in zip(parts.names, parts.unit, strict=True) if unit.any()}
     return tuple(name for name in NoiseParameters.model_fields if name in found)
 
@@ -121,54 +121,54 @@ def _fit(
 ) -> FittedVariances:
     default = NoiseParameters()
     return fit_variances(
-        [_part(each, chain, noise, names) for each, chain in zip(maps, _thin(maps), strict=True)],
+        [_part(each, segment, noise, names) for each, segment in zip(maps, _thin(maps), strict=True)],
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
         start=np.array([getattr(start, name) for name in names]),
     )
 
 
-def _thin(maps: Sequence[LocalMap]) -> list[Chain]:
+def _thin(maps: Sequence[LocalMap]) -> list[Segment]:
     """All of each run, at so few keyframes that all together have no more than is looked at."""
-    chains = [each.chain for each in maps]
-    n_all = sum(len(chain.stamps_ns) for chain in chains)
+    segments = [each.segment for each in maps]
+    n_all = sum(len(segment.stamps_ns) for segment in segments)
     if n_all <= _MAX_KEYFRAMES:
-        return chains
+        return segments
     share = _LEAST_SHARE
-    keyframes = [coarse_keyframes(chain, share) for chain in chains]
+    keyframes = [coarse_keyframes(segment, share) for segment in segments]
     while sum(map(len, keyframes)) > _MAX_KEYFRAMES:
         share *= _NEXT_SHARE
-        keyframes = [coarse_keyframes(chain, share) for chain in chains]
-    return [coarsen(*each) for each in zip(chains, keyframes, strict=True)]
+        keyframes = [coarse_keyframes(segment, share) for segment in segments]
+    return [coarsen(*each) for each in zip(segments, keyframes, strict=True)]
 
 
-def _part(local_map: LocalMap, chain: Chain, noise: NoiseParameters, names: tuple[str, ...]) -> Part:
-    """Of a map, the chain that is all of its own or some keyframes of it."""
+def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: tuple[str, ...]) -> Part:
+    """Of a map, the segment that is all of its own or some keyframes of it."""
     state = local_map.solution.state
     graph, start = local_map.graph, state
-    if chain is not local_map.chain:
-        graph = build_graph([chain])
-        at = np.searchsorted(local_map.chain.stamps_ns, chain.stamps_ns)
+    if segment is not local_map.segment:
+        graph = build_graph([segment])
+        at = np.searchsorted(local_map.segment.stamps_ns, segment.stamps_ns)
         start = graph.start(state.poses[at], local_map.tags_m, local_map.calibration)
-    odometry, readings = chain.odometry.parts, chain.readings.parts
+    odometry, readings = segment.odometry.parts, segment.readings.parts
     components = Components(
         odometry.of(names),
         _rest(odometry, noise, names),
         readings.of(names),
         _rest(readings, noise, names),
-        lasting_errors(chain),
-        lasting_root(chain),
-        *_of_stamps(chain, names),
+        lasting_errors(segment),
+        lasting_root(segment),
+        *_of_stamps(segment, names),
     )
     return Part(graph.problem, start, components)
 
 
-def _of_stamps(chain: Chain, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
+def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
     """Which variance is that of stamps, readings' change in a second, and the picture of each; or nothing of it."""
-    if STAMP_NOISE not in names or not len(chain.readings):
+    if STAMP_NOISE not in names or not len(segment.readings):
         return None, None, None
-    _, picture = np.unique(chain.readings.keyframe, return_inverse=True)
-    by_time = chain.readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+    _, picture = np.unique(segment.readings.keyframe, return_inverse=True)
+    by_time = segment.readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
     return names.index(STAMP_NOISE), by_time, np.asarray(picture, dtype=np.int64)
 
 

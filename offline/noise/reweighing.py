@@ -67,8 +67,8 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMa
         FittedNoise(
             tuple(parameters),
             **dict(zip(_SHARED, shared.reshape(-1).tolist(), strict=True)),
-            runs=tuple(each.chain.name for each in sound),
-            contradicting=tuple(each.chain.name for each in maps if not (each.goodness.fits or each.is_noisy)),
+            runs=tuple(each.segment.name for each in sound),
+            contradicting=tuple(each.segment.name for each in maps if not (each.goodness.fits or each.is_noisy)),
         ),
     )
 
@@ -94,16 +94,16 @@ def _is_sound(local_map: LocalMap) -> bool:
     Of one whose noise is unknown it is all that is known of that; whether it fits is asked afterwards.
     """
     fits = local_map.is_noisy or (local_map.goodness.fits and local_map.solution.converged)
-    return len(local_map.chain.tags) > 0 and fits
+    return len(local_map.segment.tags) > 0 and fits
 
 
 def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
     """The map solved under other noise and with readings that share errors."""
-    if noise == prior and not shared.any() and not local_map.chain.readings.corner_bias_px.any():
+    if noise == prior and not shared.any() and not local_map.segment.readings.corner_bias_px.any():
         return local_map
-    chain = with_shared_errors(local_map.chain.with_noise(noise), shared, noise.sigma_corner_px)
-    weights = whitening(chain.odometry.covariance), whitening(chain.readings.covariance)
-    graph = replace(local_map.graph, problem=local_map.graph.problem.reweigh(*weights), chains=(chain,))
+    segment = with_shared_errors(local_map.segment.with_noise(noise), shared, noise.sigma_corner_px)
+    weights = whitening(segment.odometry.covariance), whitening(segment.readings.covariance)
+    graph = replace(local_map.graph, problem=local_map.graph.problem.reweigh(*weights), segments=(segment,))
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
@@ -112,7 +112,7 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
     whole = local_map.whole
     if whole is not None:
         whole = with_shared_errors(whole.with_noise(noise), shared, noise.sigma_corner_px)
-    return replace(local_map, chain=chain, graph=graph, solution=solution, goodness=goodness, whole=whole)
+    return replace(local_map, segment=segment, graph=graph, solution=solution, goodness=goodness, whole=whole)
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:

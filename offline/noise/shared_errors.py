@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.measurements import Chain, cells_of, least_shared, least_shared_by_corners, passes_of
+from groundsbot.offline.measurements import Segment, cells_of, least_shared, least_shared_by_corners, passes_of
 from groundsbot.offline.noise.lasting_errors import LastingErrors
 
 # What readings of a tag err by is forgotten, but for a share of 1/e, after so much of the way, or so much turned. On
@@ -23,67 +23,67 @@ _LASTING_M: Final = 0.25
 _LASTING_RAD: Final = 1.0
 
 
-def lasting_errors(chain: Chain) -> tuple[LastingErrors, LastingErrors]:
+def lasting_errors(segment: Segment) -> tuple[LastingErrors, LastingErrors]:
     """Errors of readings of a tag in one pass that last some way, and that last for all of it."""
-    pass_of = passes_of(chain)
-    order = np.lexsort((chain.readings.keyframe, pass_of))
+    pass_of = passes_of(segment)
+    order = np.lexsort((segment.readings.keyframe, pass_of))
     goes_on = np.zeros(len(order))
     goes_on[1:] = np.diff(pass_of[order]) == 0
-    at = chain.readings.keyframe[order]
+    at = segment.readings.keyframe[order]
     apart = np.zeros(len(order))
-    apart[1:] = np.abs(np.diff(_view_changes(chain)[at]))
+    apart[1:] = np.abs(np.diff(_view_changes(segment)[at]))
     return LastingErrors(order, goes_on * np.exp(-apart)), LastingErrors(order, goes_on)
 
 
-def _view_changes(chain: Chain) -> FloatArray:
+def _view_changes(segment: Segment) -> FloatArray:
     """(K,) how often the view has changed by so much that errors are others, at the keyframes."""
-    turned_rad = np.append(0.0, np.cumsum(np.abs(chain.odometry.motion[:, 2])))
-    return np.asarray(chain.along_m / _LASTING_M + turned_rad / _LASTING_RAD)
+    turned_rad = np.append(0.0, np.cumsum(np.abs(segment.odometry.motion[:, 2])))
+    return np.asarray(segment.along_m / _LASTING_M + turned_rad / _LASTING_RAD)
 
 
-def lasting_root(chain: Chain) -> FloatArray:
+def lasting_root(segment: Segment) -> FloatArray:
     """(M, 2, 2) whose columns a shared error of one adds to a reading: in range and bearing, as the default noise is.
 
     Of readings whose log gives their covariance that is a multiple of their own.
     """
-    return np.asarray(np.linalg.cholesky(chain.readings.parts.under(NoiseParameters())))
+    return np.asarray(np.linalg.cholesky(segment.readings.parts.under(NoiseParameters())))
 
 
-def in_cell(chain: Chain) -> IntArray:
+def in_cell(segment: Segment) -> IntArray:
     """(M,) how many readings are in the cell of each."""
-    return _n_in_group(cells_of(chain))
+    return _n_in_group(cells_of(segment))
 
 
-def spread_of_corners(chain: Chain, n_in_cell: IntArray, sigma_corner_px: float) -> FloatArray:
+def spread_of_corners(segment: Segment, n_in_cell: IntArray, sigma_corner_px: float) -> FloatArray:
     """(M,) how many times their sigma corners count with, for what refined corners are known to share.
 
     Args:
-        chain: with one reading at least.
+        segment: with one reading at least.
         n_in_cell: (M,) as of `in_cell`.
         sigma_corner_px: of the corners' noise.
     """
-    return np.asarray(np.sqrt(1.0 + n_in_cell * least_shared_by_corners(chain.readings, sigma_corner_px)))
+    return np.asarray(np.sqrt(1.0 + n_in_cell * least_shared_by_corners(segment.readings, sigma_corner_px)))
 
 
-def with_shared_errors(chain: Chain, shared: FloatArray, sigma_corner_px: float) -> Chain:
-    """The chain with readings that count for less by what they share.
+def with_shared_errors(segment: Segment, shared: FloatArray, sigma_corner_px: float) -> Segment:
+    """The segment with readings that count for less by what they share.
 
     Args:
-        chain: under its noise, with its readings as independent.
+        segment: under its noise, with its readings as independent.
         shared: (2, 2) variances by kind and component, as multiples of the squares of `lasting_root`.
         sigma_corner_px: of the corners' noise.
     """
-    readings = chain.readings
+    readings = segment.readings
     if not len(readings) or not (shared.any() or readings.corner_bias_px.any()):
-        return chain
-    back = np.linalg.inv(np.linalg.cholesky(readings.covariance)) @ lasting_root(chain)
+        return segment
+    back = np.linalg.inv(np.linalg.cholesky(readings.covariance)) @ lasting_root(segment)
     times = np.zeros((len(readings), 2))
-    for errors, both in zip(lasting_errors(chain), shared, strict=True):
+    for errors, both in zip(lasting_errors(segment), shared, strict=True):
         times += errors.alike()[:, None] * np.einsum("mij,j->mi", back**2, both)
-    n_in_cell = in_cell(chain)
+    n_in_cell = in_cell(segment)
     sigmas = np.sqrt(1.0 + np.maximum(times, n_in_cell[:, None] * least_shared(readings)))
-    of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), spread_of_corners(chain, n_in_cell, sigma_corner_px))
-    return replace(chain, readings=readings.spread(sigmas, of_corners))
+    of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), spread_of_corners(segment, n_in_cell, sigma_corner_px))
+    return replace(segment, readings=readings.spread(sigmas, of_corners))
 
 
 def _n_in_group(group: IntArray) -> IntArray:

@@ -14,37 +14,39 @@ from scipy.optimize import linear_sum_assignment
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
-from groundsbot.offline.measurements import GAP_M, Chain, Readings
+from groundsbot.offline.measurements import GAP_M, Readings, Segment
 
 # Beside its covariance, how far a reading is off from what the last one made expect.
 _SLACK_M: Final = 0.01
 
 
-def split_duplicates(chain: Chain) -> Chain:
-    """The chain with as many instances of an id as were seen at once, under names that no other chain has."""
-    readings, tags = chain.readings, chain.tags
-    if len(chain.run.positions.tag) or not len(readings):  # imported: several readings of a keyframe may be of one tag
-        return chain
+def split_duplicates(segment: Segment) -> Segment:
+    """The segment with as many instances of an id as were seen at once, under names that no other segment has."""
+    readings, tags = segment.readings, segment.tags
+    if len(segment.run.positions.tag) or not len(
+        readings
+    ):  # imported: several readings of a keyframe may be of one tag
+        return segment
     pairs, count = np.unique(readings.keyframe * len(tags) + readings.tag, return_counts=True)
     several = np.unique(pairs[count > 1] % len(tags))
     if not len(several):
-        return chain
+        return segment
     keys = [tags[i] for i in readings.tag]
     for tag in several.tolist():
         own = np.flatnonzero(readings.tag == tag)
-        for reading, number in zip(own.tolist(), _follow(chain, own), strict=True):
-            keys[reading] = tags[tag]._replace(instance=f"{chain.name} {number}")
+        for reading, number in zip(own.tolist(), _follow(segment, own), strict=True):
+            keys[reading] = tags[tag]._replace(instance=f"{segment.name} {number}")
     apart = tuple(sorted(set(keys)))
     index = {tag: i for i, tag in enumerate(apart)}
     tag_of = np.array([index[key] for key in keys], dtype=np.int64)
-    return replace(chain, tags=apart, readings=replace(readings, tag=tag_of))
+    return replace(segment, tags=apart, readings=replace(readings, tag=tag_of))
 
 
-def _follow(chain: Chain, own: IntArray) -> list[int]:
+def _follow(segment: Segment, own: IntArray) -> list[int]:
     """Numbers of the tags that readings `own` of one id are of, in order of time; the wheels tell where they hang."""
-    readings = chain.readings
-    poses = se2.compose(chain_motions(chain.odometry.motion, np.zeros(3)), chain.T_base_camera)
-    along_m = chain.along_m
+    readings = segment.readings
+    poses = se2.compose(chain_motions(segment.odometry.motion, np.zeros(3)), segment.T_base_camera)
+    along_m = segment.along_m
     keyframe = readings.keyframe[own]
     range_m, bearing = readings.value[own].T
     in_camera = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)

@@ -54,10 +54,10 @@ class Evidence:
 
 
 def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
-    """(C, 2) how many times larger than told the noise of each chain's wheels and readings is, 1 at least.
+    """(C, 2) how many times larger than told the noise of each segment's wheels and readings is, 1 at least.
 
-    By what the windows of each chain leave over, which no tag that was moved between them raises; where windows do not
-    join within that, something that is in no covariance bends the chain, and the covariances say too little.
+    By what the windows of each segment leave over, which no tag that was moved between them raises; where windows do
+    not join within that, something that is in no covariance bends the segment, and the covariances say too little.
     """
     rows = []
     for each in goodness:
@@ -68,7 +68,7 @@ def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Heard:
-    """A problem under its chains' own noise, and what its readings say at a state.
+    """A problem under its segments' own noise, and what its readings say at a state.
 
     Attributes:
         residual: (M, 2) of the readings, whitened.
@@ -85,9 +85,9 @@ def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> He
     """Linearises the readings of a graph.
 
     Args:
-        graph: of some chains.
+        graph: of some segments.
         state: near an optimum.
-        scales: (C, 2) of each chain's noise, see `noise_scales`.
+        scales: (C, 2) of each segment's noise, see `noise_scales`.
     """
     problem = _scale_noise(graph, scales)
     readings = problem.readings.linearise(state, problem.columns)
@@ -104,7 +104,7 @@ def marginalise(
     """Linearises all factors at a state and eliminates all but the sightings' places.
 
     Args:
-        at: the chains that the sightings are of, near an optimum.
+        at: the segments that the sightings are of, near an optimum.
         sightings: S of them.
         unmodelled_sigma_m: of each coordinate of a sighting, beyond what the covariances say.
         weighed: whether readings count by how well they fit the others of their sighting, or all alike.
@@ -215,11 +215,11 @@ def _inverse(matrices: FloatArray) -> FloatArray:
 
 
 def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
-    """The problem under the chains' own noise."""
+    """The problem under the segments' own noise."""
     problem = graph.problem
-    chain_of_pose = np.repeat(np.arange(len(graph.chains)), [len(chain.stamps_ns) for chain in graph.chains])
-    by_wheels = scales[chain_of_pose[problem.odometry.first], 0]
-    by_reading = scales[chain_of_pose[problem.readings.pose], 1]
+    segment_of_pose = np.repeat(np.arange(len(graph.segments)), [len(segment.stamps_ns) for segment in graph.segments])
+    by_wheels = scales[segment_of_pose[problem.odometry.first], 0]
+    by_reading = scales[segment_of_pose[problem.readings.pose], 1]
     odometry, readings = problem.odometry, problem.readings
     return replace(
         problem,

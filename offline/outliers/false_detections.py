@@ -42,8 +42,8 @@ def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
     """Counts near views, in runs that tell when pictures were taken that showed nothing."""
     n = len(sightings)
     views = Views(np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64))
-    tells = np.array([len(chain.run.picture_stamps_ns) > 0 for chain in graph.chains], dtype=np.bool_)
-    counted = np.flatnonzero(tells[sightings.chain])
+    tells = np.array([len(segment.run.picture_stamps_ns) > 0 for segment in graph.segments], dtype=np.bool_)
+    counted = np.flatnonzero(tells[sightings.segment])
     for begin in range(0, len(counted), _AT_ONCE):
         some = counted[begin : begin + _AT_ONCE]
         views.read[some], views.near[some] = _count_views(graph, state, sightings, some)
@@ -63,9 +63,9 @@ def _count_views(graph: Graph, state: State, sightings: Sightings, which: IntArr
     place = np.add.reduceat(readings.places_in_map(state)[own], begins) / n_readings[:, None]
     again = np.append(False, (np.diff(pose) == 0) & (np.diff(of) == 0))
     # Poses before and after the sighting, in the same run.
-    chain = sightings.chain[which]
-    ends = graph.first_pose[chain] + np.array([len(each.stamps_ns) for each in graph.chains])[chain]
-    first = np.maximum(graph.first_pose[chain], pose[begins] - _WINDOW)
+    segment = sightings.segment[which]
+    ends = graph.first_pose[segment] + np.array([len(each.stamps_ns) for each in graph.segments])[segment]
+    first = np.maximum(graph.first_pose[segment], pose[begins] - _WINDOW)
     n_around = np.minimum(ends, pose[begins + n_readings - 1] + _WINDOW + 1) - first
     around, of_around = _ranges(first, n_around)
     mount = readings.mount[own[begins]]

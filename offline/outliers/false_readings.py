@@ -25,19 +25,19 @@ _LEAST_FAR_M: Final = 0.5  # a drive that stands for long scatters by next to no
 
 
 def false_readings(local_map: LocalMap) -> BoolArray:
-    """(M,) readings of the map's chain that are of another tag, or of none.
+    """(M,) readings of the map's segment that are of another tag, or of none.
 
     Args:
         local_map: solved under noise that its readings fit.
     """
-    if not len(local_map.chain.readings):
+    if not len(local_map.segment.readings):
         return np.zeros(0, dtype=np.bool_)
     return _far_within_pass(local_map) | _far_passes(local_map)
 
 
 def _far_within_pass(local_map: LocalMap) -> BoolArray:
     """(M,) readings that put their tag far from where the others of their pass do, as these scatter in this drive."""
-    pass_of = passes_of(local_map.chain)
+    pass_of = passes_of(local_map.segment)
     places = local_map.graph.problem.readings.places_in_map(local_map.solution.state)
     middle = np.column_stack([_medians(places[:, axis], pass_of) for axis in (0, 1)])
     off_m = np.linalg.norm(places - middle[pass_of], axis=1)
@@ -50,7 +50,7 @@ def _far_within_pass(local_map: LocalMap) -> BoolArray:
 
 def _far_passes(local_map: LocalMap) -> BoolArray:
     """(M,) readings of passes of one or two that lie elsewhere than passes of more place their tag."""
-    readings, pass_of = local_map.chain.readings, passes_of(local_map.chain)
+    readings, pass_of = local_map.segment.readings, passes_of(local_map.segment)
     n_in_pass = np.bincount(pass_of)
     squares = (local_map.graph.problem.readings.residual(local_map.solution.state) ** 2).sum(axis=1)
     is_few = n_in_pass <= FEW_READINGS
@@ -58,7 +58,7 @@ def _far_passes(local_map: LocalMap) -> BoolArray:
     np.minimum.at(least, pass_of, squares)
     tag_of = np.zeros(len(n_in_pass), dtype=np.int64)
     tag_of[pass_of] = readings.tag
-    is_placed = np.zeros(len(local_map.chain.tags), dtype=np.bool_)
+    is_placed = np.zeros(len(local_map.segment.tags), dtype=np.bool_)
     is_placed[tag_of[~is_few]] = True
     is_false = is_few & is_placed[tag_of] & (least > chi2.isf(FALSE_ALARM / max(int(is_few.sum()), 1), 2))
     # So many are the noise's, not misread.
@@ -75,27 +75,27 @@ def _medians(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 def without_false_detections(local_map: LocalMap) -> LocalMap:
-    """The map solved without them, but with all others; the chain's warnings say how many there were."""
+    """The map solved without them, but with all others; the segment's warnings say how many there were."""
     local_map = _with_all_readings(local_map)
     wrong = false_readings(local_map)
-    n, n_all, name = int(wrong.sum()), len(wrong), local_map.chain.name
+    n, n_all, name = int(wrong.sum()), len(wrong), local_map.segment.name
     told = f"{name}: {n} of {n_all} readings lie far from their tags, single ones: taken for misread, left out"
-    chain = local_map.chain.with_readings(~wrong)
+    segment = local_map.segment.with_readings(~wrong)
     if n:
-        chain = replace(chain, warnings=(*chain.warnings, told))
-    graph = build_graph([chain])
+        segment = replace(segment, warnings=(*segment.warnings, told))
+    graph = build_graph([segment])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start)
     graph.problem.arrowhead.without_scratch()
-    return replace(local_map, chain=chain, graph=graph, solution=solution, n_misread=n)
+    return replace(local_map, segment=segment, graph=graph, solution=solution, n_misread=n)
 
 
 def _with_all_readings(local_map: LocalMap) -> LocalMap:
     """The map, not solved again, with the readings that were left out of it because nothing confirmed them."""
-    chain = local_map.whole
-    if chain is None:
+    segment = local_map.whole
+    if segment is None:
         return local_map
-    graph = build_graph([chain])
+    graph = build_graph([segment])
     state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = replace(local_map.solution, state=state, problem=graph.problem)
-    return replace(local_map, chain=chain, graph=graph, solution=solution, whole=None)
+    return replace(local_map, segment=segment, graph=graph, solution=solution, whole=None)

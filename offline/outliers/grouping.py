@@ -28,7 +28,7 @@ _LEVELS: Final = LEVELS - 1  # below the top
 
 def few_of_each_tag(graph: Graph, sightings: Sightings) -> Sightings:
     """The same readings in fewer sightings where a tag has very many; the same sightings where none has."""
-    tag = places_told_apart(graph.chains, sightings)
+    tag = places_told_apart(graph.segments, sightings)
     most = _most_of_each(np.bincount(tag), _FREE + len(graph.problem.columns.poses) // _KEYFRAMES_A_SIGHTING)
     if np.bincount(tag, minlength=1).max() <= most:
         return sightings
@@ -38,7 +38,7 @@ def few_of_each_tag(graph: Graph, sightings: Sightings) -> Sightings:
     group = np.arange(len(sightings))
     is_many, level = np.bincount(tag)[tag] > most, 0
     while is_many.any() and level <= _LEVELS + int(tree.n_poses).bit_length():
-        wanted = np.column_stack([tag, sightings.chain, _piece_of(tree, level)[pose]])
+        wanted = np.column_stack([tag, sightings.segment, _piece_of(tree, level)[pose]])
         found = np.unique(wanted, axis=0, return_inverse=True)[1].reshape(-1)
         group[is_many] = (level + 1) * len(sightings) + found[is_many]  # no number of a level before
         is_many &= _n_groups(tag, group)[tag] > most
@@ -69,21 +69,21 @@ def _n_groups(tag: IntArray, group: IntArray) -> IntArray:
 
 
 def _together(sightings: Sightings, group: IntArray) -> Sightings:
-    """With those (S,) of one group, all of one tag in one chain, in one; in the order of `Sightings`."""
+    """With those (S,) of one group, all of one tag in one segment, in one; in the order of `Sightings`."""
     _, one, number = np.unique(group, return_index=True, return_inverse=True)
     first_ns, last_ns = sightings.first_ns[one], sightings.last_ns[one]
     np.minimum.at(first_ns, number, sightings.first_ns)
     np.maximum.at(last_ns, number, sightings.last_ns)
     n_readings = np.zeros(len(one), dtype=np.int64)
     np.add.at(n_readings, number, sightings.n_readings)
-    order = np.lexsort((first_ns, sightings.chain[one], sightings.id[one]))
+    order = np.lexsort((first_ns, sightings.segment[one], sightings.id[one]))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     return replace(
         sightings,
         of_reading=rank[number][sightings.of_reading],
         id=sightings.id[one][order],
-        chain=sightings.chain[one][order],
+        segment=sightings.segment[one][order],
         first_ns=first_ns[order],
         last_ns=last_ns[order],
         n_readings=n_readings[order],

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
-from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam import Effort, Parameter, build_graph, solve
 
 # Of all drives whose wheels are right, so many are taken for broken.
@@ -20,7 +20,7 @@ _MOST_PIECES: Final = 60
 
 
 class Grown(NamedTuple):
-    """A part of a chain, solved."""
+    """A part of a segment, solved."""
 
     first: int
     end: int
@@ -32,15 +32,15 @@ class Grown(NamedTuple):
     freedom: int
 
 
-def grow_parts(chain: Chain, effort: Effort, *, backwards: bool) -> list[Grown]:
-    """Longer and longer parts of the chain, from one end on, as long as there is effort for them."""
-    n = len(chain.stamps_ns)
+def grow_parts(segment: Segment, effort: Effort, *, backwards: bool) -> list[Grown]:
+    """Longer and longer parts of the segment, from one end on, as long as there is effort for them."""
+    n = len(segment.stamps_ns)
     parts: list[Grown] = []
-    for end in _coarse_ends(chain):
+    for end in _coarse_ends(segment):
         if effort.is_spent():
             break
         piece = (n - end, n) if backwards else (0, end)
-        parts.append(_solve_part(chain, *piece, parts[-1] if parts else None, effort))
+        parts.append(_solve_part(segment, *piece, parts[-1] if parts else None, effort))
     return parts
 
 
@@ -55,25 +55,25 @@ def noise_factor(grown: Sequence[Sequence[Grown]]) -> float:
     return max(1.0, float(np.median(added))) if added else 1.0
 
 
-def limit_of(chain: Chain, parts: Sequence[Grown], factor: float, effort: Effort) -> Grown | None:
-    """The longest part whose readings fit together, as far as there is effort; None where all of the chain does."""
+def limit_of(segment: Segment, parts: Sequence[Grown], factor: float, effort: Effort) -> Grown | None:
+    """The longest part whose readings fit together, as far as there is effort; None where all of the segment does."""
     for before, after in pairwise(parts):
         if _strains(before, after, factor, len(parts)):
-            return _refine_end(chain, before, after, factor, effort)
+            return _refine_end(segment, before, after, factor, effort)
     return None
 
 
-def _refine_end(chain: Chain, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
+def _refine_end(segment: Segment, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
     """Between a part that fits and a longer one that does not, keyframe by keyframe."""
     longest = known
-    reading = np.unique(chain.readings.keyframe)
+    reading = np.unique(segment.readings.keyframe)
     ahead = reading[(reading >= known.end) & (reading < beyond.end)] + 1
     back = reading[(reading < known.first) & (reading >= beyond.first)][::-1]
     parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
     for part in parts:
         if effort.is_spent():
             break
-        grown = _solve_part(chain, *part, longest, effort)
+        grown = _solve_part(segment, *part, longest, effort)
         if _strains(known, grown, factor, len(parts)):
             break
         longest = grown
@@ -86,12 +86,12 @@ def _strains(before: Grown, after: Grown, factor: float, n_tests: int) -> bool:
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solve_part(chain: Chain, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
-    """A part of a chain, from what is known of another that has an end in common with it."""
-    part = chain.part(first, end)
+def _solve_part(segment: Segment, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
+    """A part of a segment, from what is known of another that has an end in common with it."""
+    part = segment.part(first, end)
     graph = build_graph([part])
     wheels = np.zeros(3) if known is None else known.wheels
-    poses = _poses(chain, first, end, known, wheels)
+    poses = _poses(segment, first, end, known, wheels)
     start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
     solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.tries(graph.problem, 1.0))
     effort.spend(solution, is_built=True)
@@ -101,9 +101,9 @@ def _solve_part(chain: Chain, first: int, end: int, known: Grown | None, effort:
     return Grown(first, end, state.poses, wheels, tags, graph.calibration_of(state), solution.cost, freedom)
 
 
-def _poses(chain: Chain, first: int, end: int, known: Grown | None, wheels: FloatArray) -> FloatArray:
+def _poses(segment: Segment, first: int, end: int, known: Grown | None, wheels: FloatArray) -> FloatArray:
     """Of a part: those known, and dead reckoning on from them either way."""
-    odometry = chain.odometry.part(first, end - 1)
+    odometry = segment.odometry.part(first, end - 1)
     motion = se2.compose(odometry.motion, se2.exp(odometry.jacobian @ wheels))
     if known is None:
         return chain_motions(motion, np.zeros(3))
@@ -114,9 +114,9 @@ def _poses(chain: Chain, first: int, end: int, known: Grown | None, wheels: Floa
     return np.concatenate([before, kept, after])
 
 
-def _coarse_ends(chain: Chain) -> list[int]:
+def _coarse_ends(segment: Segment) -> list[int]:
     """Numbers of keyframes, some metres apart; the last is all of them."""
-    along_m = chain.along_m
+    along_m = segment.along_m
     step_m = max(_PIECE_M, along_m[-1] / _MOST_PIECES)
     marks = np.searchsorted(along_m, np.arange(step_m, along_m[-1], step_m)) + 1
     ends: list[int] = np.unique([*marks[(marks > 1) & (marks < len(along_m))], len(along_m)]).tolist()

@@ -41,12 +41,12 @@ class Stand:
 
     Attributes:
         label: of the place among those of the evidence.
-        chains: indices of those that saw it there.
+        segments: indices of those that saw it there.
         n_readings: there; n_sightings: there.
     """
 
     label: int
-    chains: tuple[int, ...]
+    segments: tuple[int, ...]
     n_readings: int
     n_sightings: int
 
@@ -57,9 +57,9 @@ class Case:
 
     Attributes:
         stands: in order of time; where the order of runs is unknown, in that of their first stamps.
-        seen: for each chain that saw it, in that order, the places in order of time, as indices of stands, none twice
+        seen: for each segment that saw it, in that order, the places in order of time, as indices of stands, none twice
             in a row.
-        is_ordered: whether no two of these chains were driven at the same time.
+        is_ordered: whether no two of these segments were driven at the same time.
         at_once: whether one of them saw it in two places at the same time.
     """
 
@@ -106,8 +106,8 @@ def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case
             continue
         stands = tuple(_stand(sightings, each, own[label[own] == each]) for each in labels)
         seen = {
-            c: _without_repeats([labels.index(int(label[s])) for s in own if sightings.chain[s] == c])
-            for c in dict.fromkeys(sightings.chain[own].tolist())
+            c: _without_repeats([labels.index(int(label[s])) for s in own if sightings.segment[s] == c])
+            for c in dict.fromkeys(sightings.segment[own].tolist())
         }
         at_once = _in_two_places_at_once(sightings, own, label[own])
         found.append(Case(tag, stands, seen, sightings.one_after_the_other(own), at_once))
@@ -164,19 +164,19 @@ def swapped_pairs(found: Sequence[Case], evidence: Evidence, places: Places) -> 
 
 
 def wrong_runs(found: Sequence[Case], sightings: Sightings) -> dict[int, list[int]]:
-    """Chains that have most of their shared tags elsewhere than all others have them, and the cases of these."""
+    """Segments that have most of their shared tags elsewhere than all others have them, and the cases of these."""
     shared: dict[int, int] = {}
     for own in sightings.of_ids():
-        seen_by = np.unique(sightings.chain[own]).tolist()
+        seen_by = np.unique(sightings.segment[own]).tolist()
         for c in seen_by if len(seen_by) > 1 else []:
             shared[c] = shared.get(c, 0) + 1
     alone: dict[int, list[int]] = {}
     for i, case in enumerate(found):
         # Two others who agree: of two runs nobody knows which is wrong.
         for stand in case.stands:
-            others = {c for each in case.stands if each is not stand for c in each.chains}
-            if len(stand.chains) == 1 and len(case.stands) == 2 and len(others - set(stand.chains)) > 1:
-                alone.setdefault(stand.chains[0], []).append(i)
+            others = {c for each in case.stands if each is not stand for c in each.segments}
+            if len(stand.segments) == 1 and len(case.stands) == 2 and len(others - set(stand.segments)) > 1:
+                alone.setdefault(stand.segments[0], []).append(i)
     return {
         c: which
         for c, which in alone.items()
@@ -194,7 +194,7 @@ def _in_two_places_at_once(sightings: Sightings, own: IntArray, label: IntArray)
     """Whether sightings (indices) of different places (of each) in one run overlap in time."""
     return any(
         p != q
-        and sightings.chain[s] == sightings.chain[t]
+        and sightings.segment[s] == sightings.segment[t]
         and max(sightings.first_ns[s], sightings.first_ns[t]) <= min(sightings.last_ns[s], sightings.last_ns[t])
         for (s, p), (t, q) in combinations(zip(own.tolist(), label.tolist(), strict=True), 2)
     )
@@ -207,8 +207,8 @@ def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
 
 
 def _stand(sightings: Sightings, label: int, own: IntArray) -> Stand:
-    chains = tuple(dict.fromkeys(sightings.chain[own].tolist()))
-    return Stand(label, chains, int(sightings.n_readings[own].sum()), len(own))
+    segments = tuple(dict.fromkeys(sightings.segment[own].tolist()))
+    return Stand(label, segments, int(sightings.n_readings[own].sum()), len(own))
 
 
 def _without_repeats(way: Sequence[int]) -> tuple[int, ...]:

@@ -89,11 +89,13 @@ def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> 
     left = Counter(tag.whole for tag in graph.tags if tag not in gone)
     alone = {tag.whole for tag in gone if left[tag.whole] == 1}
     name = {tag: tag.whole if tag.whole in alone else tag for tag in graph.tags if tag not in gone}
-    chains = []
-    for chain in graph.chains:
-        kept = chain.with_readings(np.array([chain.tags[t] not in gone for t in chain.readings.tag], dtype=np.bool_))
-        chains.append(replace(kept, tags=tuple(name[tag] for tag in kept.tags)))
-    again = build_graph(chains)
+    segments = []
+    for segment in graph.segments:
+        kept = segment.with_readings(
+            np.array([segment.tags[t] not in gone for t in segment.readings.tag], dtype=np.bool_)
+        )
+        segments.append(replace(kept, tags=tuple(name[tag] for tag in kept.tags)))
+    again = build_graph(segments)
     index = {tag: i for i, tag in enumerate(again.tags)}
     numbers = np.array([index.get(name.get(tag, tag.whole), 0) for tag in graph.tags], dtype=np.int64)
     again = replace(again, problem=replace(again.problem, measured=to_other_tags(graph.problem.measured, numbers)))

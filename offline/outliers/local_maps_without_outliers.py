@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
-from groundsbot.offline.measurements import Chain
+from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_readings import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.outliers.outliers import RunsAlone
@@ -18,8 +18,8 @@ class ExplainedMaps(NamedTuple):
     """Local maps.
 
     Attributes:
-        maps: of chains or of parts of such.
-        noisy: names of chains whose noise is far from what was told, in which nothing was looked for yet.
+        maps: of segments or of parts of such.
+        noisy: names of segments whose noise is far from what was told, in which nothing was looked for yet.
         warnings: sentences about drives that were parted where their wheels lost the way.
     """
 
@@ -29,24 +29,24 @@ class ExplainedMaps(NamedTuple):
 
 
 def local_maps_of(
-    chains: Sequence[Chain], stages: Stages, times: int = 1, *, noise_is_open: bool = False
+    segments: Sequence[Segment], stages: Stages, times: int = 1, *, noise_is_open: bool = False
 ) -> ExplainedMaps:
-    """Each chain solved alone, parted where its wheels lost the way, with tags that do not belong apart.
+    """Each segment solved alone, parted where its wheels lost the way, with tags that do not belong apart.
 
     That is what explains a drive that contradicts itself though its wheels and readings are about as good as told. One
     whose noise is far larger than that is left as it is: its noise comes first (`remove_outliers_under_own_noise`).
 
     Args:
-        chains: stretches of runs.
+        segments: segments of runs.
         stages: told what is being done.
         times: how often the command maps the runs; what they are worth is shared out.
         noise_is_open: as for `solve_local_map`.
     """
     maps: list[LocalMap] = []
-    with stages.stage("local maps", len(chains)) as done:
-        efforts = efforts_of(chains, times)
-        for chain, effort in zip(chains, efforts, strict=True):
-            maps.append(solve_local_map(chain, effort, noise_is_open=noise_is_open))
+    with stages.stage("local maps", len(segments)) as done:
+        efforts = efforts_of(segments, times)
+        for segment, effort in zip(segments, efforts, strict=True):
+            maps.append(solve_local_map(segment, effort, noise_is_open=noise_is_open))
             done()
     alone = RunsAlone()
     with stages.stage("tags that do not belong"):
@@ -55,7 +55,7 @@ def local_maps_of(
         maps, broken = split_at_breaks(maps, efforts)
     with stages.stage("tags that do not belong"):
         maps = [each if each.is_noisy else alone.split(each) for each in maps]
-    noisy = frozenset(each.chain.name for each in maps if each.is_noisy)
+    noisy = frozenset(each.segment.name for each in maps if each.is_noisy)
     return ExplainedMaps([each.without_factors() for each in maps], noisy, broken)
 
 
@@ -75,13 +75,13 @@ def remove_outliers_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[
 
     Args:
         maps: solved under the fitted noise.
-        noisy: names of the chains in question.
+        noisy: names of the segments in question.
         stages: told what is being done.
     """
     found: list[LocalMap] = []
     warnings: list[str] = []
     for each in maps:
-        if each.chain.name not in noisy or not each.chain.tags:
+        if each.segment.name not in noisy or not each.segment.tags:
             found.append(each)
             continue
         with stages.stage("breaks of odometry"):

@@ -22,7 +22,7 @@ from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.alignment import Alignment, align, condense
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements import Chain
+from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.grown_segments import (
     COST_TOLERANCE,
     FALSE_ALARM,
@@ -66,7 +66,7 @@ class Break:
 
 
 class Mended(NamedTuple):
-    """The chains and local maps of all runs after those that broke were split, and sentences that say so."""
+    """The segments and local maps of all runs after those that broke were split, and sentences that say so."""
 
     maps: list[LocalMap]
     warnings: list[str]
@@ -83,7 +83,7 @@ class _Split(NamedTuple):
     """Of a drive.
 
     Attributes:
-        parts: its stretches.
+        parts: its segments.
         breaks: with the keyframe at which the part begins that each is told of.
         is_searched: whether the effort sufficed to look for breaks in all of it.
     """
@@ -101,7 +101,7 @@ class _Start(NamedTuple):
 
 
 def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
-    """Splits each drive where its wheels do not tell how it moved, and solves the stretches on their own.
+    """Splits each drive where its wheels do not tell how it moved, and solves the segments on their own.
 
     Args:
         maps: of the drives.
@@ -111,9 +111,9 @@ def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None =
     for whole, effort in zip(maps, efforts or [_all_of(each) for each in maps], strict=True):
         split = _split(whole, _MOST_BREAKS, effort)
         mended += split.parts
-        warnings += [_sentence(whole.chain, each) for each in split.breaks]
+        warnings += [_sentence(whole.segment, each) for each in split.breaks]
         if not split.is_searched:
-            warnings.append(_not_searched(whole.chain))
+            warnings.append(_not_searched(whole.segment))
     return Mended(_rename_segments(mended) if warnings else mended, warnings)
 
 
@@ -122,21 +122,21 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
 
     Nor is there one where the effort is spent before it is found; the whole log's where None.
     """
-    chain, effort = local_map.chain, effort or _all_of(local_map)
+    segment, effort = local_map.segment, effort or _all_of(local_map)
     if _fits(local_map) or local_map.is_noisy:
         return None
-    grown = [grow_parts(chain, effort, backwards=backwards) for backwards in (False, True)]
+    grown = [grow_parts(segment, effort, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
-    ahead, behind = (limit_of(chain, parts, factor, effort) for parts in grown)
+    ahead, behind = (limit_of(segment, parts, factor, effort) for parts in grown)
     if ahead is None or behind is None:
         return None
-    places = _places(chain, ahead, behind)
+    places = _places(segment, ahead, behind)
     if not places or effort.is_spent():
         return None
     middle = places[len(places) // 2]
     starts = [
         _start(local_map.graph, ahead, behind, place, T_ahead_behind)
-        for T_ahead_behind in _ways_to_align(chain, behind, middle, effort)
+        for T_ahead_behind in _ways_to_align(segment, behind, middle, effort)
         for place in places
     ]
     if not starts:
@@ -146,22 +146,22 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
         return None
     costs = np.array([solution.cost for solution in apart])
     equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
-    best = max(equal.tolist(), key=lambda i: _seconds_between(chain, starts[i].place))
+    best = max(equal.tolist(), key=lambda i: _seconds_between(segment, starts[i].place))
     return _test_break(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
 
 
 def _all_of(local_map: LocalMap) -> Effort:
-    return Effort.of_log(local_map.chain.run.log_bytes, local_map.chain.run.inputs)
+    return Effort.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
 
 
 def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
     found = find_break(whole, effort) if most else None
     if found is None:
         return _Split([whole], [], is_searched=not effort.is_spent() or _fits(whole))
-    chain = whole.chain
+    segment = whole.segment
     split = _Split([], [(0, found)], is_searched=True)
-    ends = (0, found.end), (found.begin, len(chain.stamps_ns))
-    left = [_without_ends(chain.part(*each), *each, chain) for each in ends]
+    ends = (0, found.end), (found.begin, len(segment.stamps_ns))
+    left = [_without_ends(segment.part(*each), *each, segment) for each in ends]
     for (first, _), part in zip(ends, left, strict=True):
         own = effort.take(_SHARE_OF_A_PART if part is left[0] else 1.0)
         inner = _split(solve_local_map(part, own), most - 1, own)
@@ -171,7 +171,7 @@ def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
     return split
 
 
-def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
+def _without_ends(part: Segment, first: int, end: int, whole: Segment) -> Segment:
     """Without what was read where the break is: pictures of one standing pose may show two places."""
     keyframe = part.readings.keyframe
     kept = (keyframe > 0) | (first == 0)
@@ -182,13 +182,13 @@ def _without_ends(part: Chain, first: int, end: int, whole: Chain) -> Chain:
 
 
 def _fits(local_map: LocalMap) -> bool:
-    """Whether the whole fits together, no stretch between two readings strains the wheels beyond chance, nor a tag.
+    """Whether the whole fits together, no segment between two readings strains the wheels beyond chance, nor a tag.
 
     What is between two readings is laid out as the wheels like it best, so that its squares add up to those of the
     motion from one reading to the next: chi-square with 3 degrees of freedom at most.
     """
     problem, state = local_map.graph.problem, local_map.solution.state
-    if len(local_map.chain.tags) < 2 or not len(problem.odometry.first):
+    if len(local_map.segment.tags) < 2 or not len(problem.odometry.first):
         return True
     reads = np.zeros(len(problem.columns.poses), dtype=np.bool_)
     reads[problem.readings.pose] = True
@@ -203,17 +203,17 @@ def _wild_in_a_row(local_map: LocalMap) -> bool:
 
     The wheels are known so well that a solve may rather give up the readings around a slip, whose loss is bounded.
     """
-    chain, readings = local_map.chain, local_map.graph.problem.readings
+    segment, readings = local_map.segment, local_map.graph.problem.readings
     squares = (readings.residual(local_map.solution.state) ** 2).sum(axis=1)
     squares /= max(1.0, local_map.goodness.reading_factor) ** 2
-    part = (chain.along_m[chain.readings.keyframe] / _IN_A_ROW_M).astype(int)
-    _, cell = np.unique(part * len(chain.tags) + chain.readings.tag, return_inverse=True)
+    part = (segment.along_m[segment.readings.keyframe] / _IN_A_ROW_M).astype(int)
+    _, cell = np.unique(part * len(segment.tags) + segment.readings.tag, return_inverse=True)
     n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
     by_chance = np.asarray(binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM))
     return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
 
 
-def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
+def _places(segment: Segment, ahead: Grown, behind: Grown) -> list[_Place]:
     """Where the break may be: what lies between the two parts, or wherever they overlap.
 
     Not where all was read on one side, for nothing tells of a break there. A place with a single keyframe on one side
@@ -221,31 +221,31 @@ def _places(chain: Chain, ahead: Grown, behind: Grown) -> list[_Place]:
     """
     wanted = [_Place(ahead.end, behind.first)]
     if behind.first <= ahead.end:
-        reading = np.unique(chain.readings.keyframe)
+        reading = np.unique(segment.readings.keyframe)
         cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
         cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
         cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
         wanted = [_Place(cut, cut) for cut in cuts.tolist()]
-    places = dict.fromkeys(_between_readings(chain, each) for each in wanted)
-    return [each for each in places if each.end > 0 and each.begin < len(chain.stamps_ns)]
+    places = dict.fromkeys(_between_readings(segment, each) for each in wanted)
+    return [each for each in places if each.end > 0 and each.begin < len(segment.stamps_ns)]
 
 
-def _seconds_between(chain: Chain, place: _Place) -> float:
+def _seconds_between(segment: Segment, place: _Place) -> float:
     """Who carries a robot has it stand meanwhile."""
-    return float(chain.stamps_ns[place.begin] - chain.stamps_ns[place.end - 1]) * 1e-9
+    return float(segment.stamps_ns[place.begin] - segment.stamps_ns[place.end - 1]) * 1e-9
 
 
-def _between_readings(chain: Chain, place: _Place) -> _Place:
+def _between_readings(segment: Segment, place: _Place) -> _Place:
     """As far as nothing was read: nobody knows where in there it happened."""
-    reading = np.unique(chain.readings.keyframe)
+    reading = np.unique(segment.readings.keyframe)
     before, after = reading[reading < place.end], reading[reading >= place.begin]
-    n = len(chain.stamps_ns)
+    n = len(segment.stamps_ns)
     return _Place(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
 
 
-def _ways_to_align(chain: Chain, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
+def _ways_to_align(segment: Segment, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
     """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
-    apart = _solve_apart(chain, place, effort)
+    apart = _solve_apart(segment, place, effort)
     if apart is None:
         return []
     at_begin = behind.poses[place.begin - behind.first]
@@ -266,13 +266,13 @@ def _solve_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> l
     return found
 
 
-def _solve_apart(chain: Chain, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
+def _solve_apart(segment: Segment, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
     """What comes before and what comes after, each on its own; None where one of them cannot be."""
-    n = len(chain.stamps_ns)
+    n = len(segment.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
         return None
     found = []
-    for part in (chain.part(0, place.end), chain.part(place.begin, n)):
+    for part in (segment.part(0, place.end), segment.part(place.begin, n)):
         own = effort.take(_SHARE_OF_A_SOLVE)
         try:
             found.append(solve_local_map(part, own))
@@ -290,7 +290,7 @@ def _align(before: LocalMap, after: LocalMap) -> Alignment | None:
 def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_behind: FloatArray) -> _Start:
     """Starting values for the whole with a break in that place."""
     before, after = ahead.poses[: place.end], behind.poses[place.begin - behind.first :]
-    between = chain_motions(graph.chains[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
+    between = chain_motions(graph.segments[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
     poses = np.concatenate([before, between, se2.compose(T_ahead_behind, after)])
     tags = {tag: se2.apply(T_ahead_behind, at) for tag, at in behind.tags.items()} | ahead.tags
     return _Start(place, graph.start(poses, tags, ahead.calibration))
@@ -300,8 +300,8 @@ def _test_break(
     local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort
 ) -> Break | None:
     """The break, if two tags agree on it and it pays to believe in it."""
-    chain, problem = local_map.chain, local_map.graph.problem
-    parts = _solve_apart(chain, place, effort)
+    segment, problem = local_map.segment, local_map.graph.problem
+    parts = _solve_apart(segment, place, effort)
     alignment = None if parts is None else _align(*parts)
     if parts is None or alignment is None or not alignment.is_sure:
         return None
@@ -312,7 +312,7 @@ def _test_break(
     effort.spend(together)
     joined = min(local_map.solution.cost, together.cost)
     factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
-    reading = np.unique(chain.readings.keyframe)
+    reading = np.unique(segment.readings.keyframe)
     # Between two readings all motions are one: freeing the others as well lets nothing else go.
     n_freed = 3 * (1 + int(((reading >= place.end) & (reading < place.begin)).sum()))
     bound = factor**2 * chi2.isf(FALSE_ALARM / len(reading), n_freed)
@@ -333,43 +333,43 @@ def _without_motions(problem: Problem, end: int, begin: int) -> Problem:
 
 def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
     """(3,) the motion that the wheels do not have."""
-    odometry = graph.chains[0].odometry.part(end - 1, begin)
+    odometry = graph.segments[0].odometry.part(end - 1, begin)
     told = odometry.dead_reckon(graph.wheel_calibration(state, 0))[-1]
     return se2.between(told, se2.between(state.poses[end - 1], state.poses[begin]))
 
 
 def _rename_segments(maps: Sequence[LocalMap]) -> list[LocalMap]:
-    """Stretches named after their run and their place in it."""
+    """Segments named after their run and their place in it."""
     count: dict[str, int] = {}
     numbered = []
     for each in maps:
-        run = each.chain.run.name
+        run = each.segment.run.name
         count[run] = count.get(run, 0) + 1
-        chain = replace(each.chain, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
-        numbered.append(replace(each, chain=chain, graph=replace(each.graph, chains=(chain,))))
+        segment = replace(each.segment, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
+        numbered.append(replace(each, segment=segment, graph=replace(each.graph, segments=(segment,))))
     return numbered
 
 
-def _not_searched(chain: Chain) -> str:
+def _not_searched(segment: Segment) -> str:
     return (
-        f"{chain.name}: its readings do not fit together, and where its wheels may have lost the way was not searched "
-        "to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, map what "
-        "was recorded before and after as runs of their own, or leave out some of the looks"
+        f"{segment.name}: its readings do not fit together, and where its wheels may have lost the way was not "
+        "searched to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, map "
+        "what was recorded before and after as runs of their own, or leave out some of the looks"
     )
 
 
-def _sentence(chain: Chain, told: tuple[int, Break]) -> str:
+def _sentence(segment: Segment, told: tuple[int, Break]) -> str:
     """When, how much, how sure, and what became of it."""
     first, found = told
     keyframes = np.array([found.end - 1, found.begin, *found.reach]) + first
-    begin_s, end_s, earliest_s, latest_s = (chain.stamps_ns[keyframes] - chain.stamps_ns[0]) * 1e-9
+    begin_s, end_s, earliest_s, latest_s = (segment.stamps_ns[keyframes] - segment.stamps_ns[0]) * 1e-9
     or_else = ""
     if (earliest_s, latest_s) != (begin_s, end_s):
         or_else = f"; readings would as well have it anywhere from {earliest_s:.1f} s to {latest_s:.1f} s"
     x_m, y_m, theta_rad = found.jump
     return (
-        f"{chain.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start the robot moved by "
+        f"{segment.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start the robot moved by "
         f"{hypot(x_m, y_m):.2f} m and {round(degrees(theta_rad))} deg that its wheels do not explain (chi-square "
         f"{found.chi_square:.0f}, chance explains {found.bound:.0f}): lifted, pushed, or slipping? The run is split "
-        f"there into stretches, which only tags join{or_else}"
+        f"there into segments, which only tags join{or_else}"
     )

@@ -55,7 +55,7 @@ class Searched:
 
     Attributes:
         graph, solution: with the splits.
-        sightings: of the graph's chains.
+        sightings: of the graph's segments.
         place: (S,) equal where sightings are of one tag.
         evidence: at the solution, and places: of its sightings.
     """
@@ -70,14 +70,14 @@ class Searched:
     @property
     def tags(self) -> list[TagKey]:
         """The tag of each sighting (S,)."""
-        of = zip(self.sightings.chain, self.sightings.tag, strict=True)
-        return [self.graph.chains[c].tags[t] for c, t in of]
+        of = zip(self.sightings.segment, self.sightings.tag, strict=True)
+        return [self.graph.segments[c].tags[t] for c, t in of]
 
     @property
     def picture(self) -> IntArray:
         """(M,) the picture of each reading, as the pose it was taken from; -1 for an imported one, which is of none."""
-        from_pictures = [not len(chain.run.positions.tag) for chain in self.graph.chains]
-        of_reading = np.repeat(from_pictures, [len(chain.readings) for chain in self.graph.chains])
+        from_pictures = [not len(segment.run.positions.tag) for segment in self.graph.segments]
+        of_reading = np.repeat(from_pictures, [len(segment.readings) for segment in self.graph.segments])
         return np.where(of_reading, self.graph.problem.readings.pose, -1)
 
 
@@ -102,9 +102,9 @@ class RunsAlone:
         Where wheels did not tell how the robot moved, most tags seem to have been moved.
         """
         after = self.split(before)
-        sightings = sightings_of([before.chain])
+        sightings = sightings_of([before.segment])
         n_again = int((np.bincount(sightings.id) > 1).sum())
-        n_split = len({tag.whole for tag in after.chain.tags if tag.instance})
+        n_split = len({tag.whole for tag in after.segment.tags if tag.instance})
         return after if after.goodness.fits and 2 * n_split < max(n_again, _FEW_AGAIN) else before
 
 
@@ -127,11 +127,11 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
 
 def join_places(local_map: LocalMap) -> LocalMap:
     """With one place for each id again."""
-    if not any(tag.instance for tag in local_map.chain.tags):
+    if not any(tag.instance for tag in local_map.segment.tags):
         return local_map
-    sightings = sightings_of([local_map.chain])
+    sightings = sightings_of([local_map.segment])
     ids = [sightings.ids[i] for i in sightings.id]
-    return solve_local_map(with_instances([local_map.chain], sightings, ids)[0])
+    return solve_local_map(with_instances([local_map.segment], sightings, ids)[0])
 
 
 def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
@@ -141,7 +141,7 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
     """
     found = _search_alone(local_map, scales, false_alarm)
-    n_places = Counter(key.whole for key in found.chain.tags)
+    n_places = Counter(key.whole for key in found.segment.tags)
     for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
         seen = _collect_tracks(local_map.graph, local_map.solution, scales)
         for place in _joins(seen, tag)[:_MOST_JOINS]:
@@ -170,7 +170,7 @@ def _joins(seen: Searched, tag: TagKey) -> list[IntArray]:
 
 
 def _n_places(local_map: LocalMap, tag: TagKey) -> int:
-    return sum(key.whole == tag for key in local_map.chain.tags)
+    return sum(key.whole == tag for key in local_map.segment.tags)
 
 
 def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
@@ -186,9 +186,9 @@ def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -
 
 
 def _relabel(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
-    """The chain solved anew with these places, whose names no other run has."""
-    tag_of = instances(sightings, place, f"{local_map.chain.name} ")
-    return solve_local_map(with_instances([local_map.chain], sightings, tag_of)[0])
+    """The segment solved anew with these places, whose names no other run has."""
+    tag_of = instances(sightings, place, f"{local_map.segment.name} ")
+    return solve_local_map(with_instances([local_map.segment], sightings, tag_of)[0])
 
 
 def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
@@ -220,7 +220,7 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
     Args:
         graph: of the component.
         solution: of it.
-        maps: of the graph's chains.
+        maps: of the graph's segments.
     """
     if len(graph.problem.measured):
         loose = replace(graph, problem=replace(graph.problem, measured=_loosen_priors(graph.problem.measured)))
@@ -267,15 +267,15 @@ def _join_near_places(seen: Searched) -> IntArray:
 
 def _sightings(graph: Graph, at: Heard) -> Sightings:
     """Cut also where a tag moved in sight."""
-    whole = sightings_of(graph.chains)
+    whole = sightings_of(graph.segments)
     cut = find_contradictions(at, whole)
-    return few_of_each_tag(graph, sightings_of(graph.chains, cut) if cut.any() else whole)
+    return few_of_each_tag(graph, sightings_of(graph.segments, cut) if cut.any() else whole)
 
 
 def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
     at = linearise_observations(graph, solution.state, scales)
     sightings = _sightings(graph, at)
-    place = places_told_apart(graph.chains, sightings)
+    place = places_told_apart(graph.segments, sightings)
     evidence = marginalise(at, sightings)
     return Searched(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
 
@@ -305,9 +305,9 @@ def _same(place: IntArray, other: IntArray) -> bool:
 
 
 def _solve_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
-    """The same chains with these places, from the poses as they are."""
+    """The same segments with these places, from the poses as they are."""
     graph, state = seen.graph, seen.solution.state
-    again = build_graph(with_instances(graph.chains, seen.sightings, instances(seen.sightings, place)))
+    again = build_graph(with_instances(graph.segments, seen.sightings, instances(seen.sightings, place)))
     again = replace(again, problem=replace(again.problem, measured=_rename_ends(graph, again)))
     start = again.start(state.poses, _unchanged_places(graph, again, state.tags), graph.calibration_of(state))
     return again, solve(again.problem, start)
@@ -340,7 +340,9 @@ def rename_tags(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
     """The same map with some of its tags under other names."""
     if not names:
         return local_map
-    chain = local_map.chain
-    renamed = replace(chain, tags=tuple(names.get(tag, tag) for tag in chain.tags))
-    graph = replace(local_map.graph, chains=(renamed,), tags=tuple(names.get(tag, tag) for tag in local_map.graph.tags))
-    return replace(local_map, chain=renamed, graph=graph)
+    segment = local_map.segment
+    renamed = replace(segment, tags=tuple(names.get(tag, tag) for tag in segment.tags))
+    graph = replace(
+        local_map.graph, segments=(renamed,), tags=tuple(names.get(tag, tag) for tag in local_map.graph.tags)
+    )
+    return replace(local_map, segment=renamed, graph=graph)

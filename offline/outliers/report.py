@@ -34,7 +34,7 @@ def suspect_tags(searched: Searched) -> list[SuspectTag]:
 class _Report:
     def __init__(self, searched: Searched) -> None:
         self._searched = searched
-        self._names = [chain.name for chain in searched.graph.chains]
+        self._names = [segment.name for segment in searched.graph.segments]
         self._cases = cases(searched.sightings, searched.evidence, searched.places)
         self._views: Views = views_of(searched.graph, searched.solution.state, searched.sightings)
         self._chances: FloatArray = chances(searched.sightings, searched.place, self._views)
@@ -61,7 +61,7 @@ class _Report:
         kind = case.kind()
         apart_m, sigmas = self._shift(case)
         if kind == MOVED:
-            elsewhere = [c for c in case.seen if c not in case.stands[0].chains]
+            elsewhere = [c for c in case.seen if c not in case.stands[0].segments]
             words = f"by {_metres(apart_m)} ({sigmas:.0f} sigma) between runs: {self._where(case)}"
             return self._suspect(case, kind, elsewhere, words)
         if kind == MOVING:
@@ -110,10 +110,10 @@ class _Report:
         nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
         rest = sum(each.n_readings for each in case.stands) - stand.n_readings
         words = (
-            f"{plural(stand.n_readings, 'reading')} in {self._list_segments(stand.chains)} {_metres(nearest[0])} "
+            f"{plural(stand.n_readings, 'reading')} in {self._list_segments(stand.segments)} {_metres(nearest[0])} "
             f"({nearest[1]:.0f} sigma) from where {plural(rest, 'other')} have it: a false detection"
         )
-        return self._suspect(case, PHANTOM, list(stand.chains), words)
+        return self._suspect(case, PHANTOM, list(stand.segments), words)
 
     def _unsupported_tags(self) -> list[SuspectTag]:
         """Ids read once or a few times from where they should have been read more often."""
@@ -123,7 +123,7 @@ class _Report:
         asked = alone & (self._chances < 1.0)
         found = []
         for s in np.flatnonzero(asked & (self._chances < FALSE_ALARM / max(int(asked.sum()), 1))):
-            tag, run = sightings.ids[sightings.id[s]], self._names[sightings.chain[s]]
+            tag, run = sightings.ids[sightings.id[s]], self._names[sightings.segment[s]]
             n = int(sightings.n_readings[s])
             words = (
                 f"{plural(n, 'reading')} in {run} and none elsewhere, though it was in view as much the same in "
@@ -145,14 +145,14 @@ class _Report:
     def _where(self, case: Case) -> str:
         """Who saw it at which instance."""
         told = [
-            f"in {self._list_segments(stand.chains)} ({plural(stand.n_readings, 'reading')})"
+            f"in {self._list_segments(stand.segments)} ({plural(stand.n_readings, 'reading')})"
             for stand in case.stands[:_MOST_NAMED]
         ]
         more = len(case.stands) - _MOST_NAMED
         return ", then ".join([*told, f"in {more} more places"] if more > 0 else told)
 
-    def _list_segments(self, chains: Sequence[int]) -> str:
-        names = [self._names[c] for c in sorted(chains)]
+    def _list_segments(self, segments: Sequence[int]) -> str:
+        names = [self._names[c] for c in sorted(segments)]
         return " and ".join(names[-2:]) if len(names) < 3 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 

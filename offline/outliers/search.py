@@ -186,19 +186,19 @@ def _in_time(sightings: Sightings, which: IntArray, members: IntArray) -> IntArr
 
 def _splits_of(sightings: Sightings, members: IntArray) -> BoolArray:
     """(n, m) which of the sightings (m,) of one place, in order of time, may have another."""
-    _, chain = np.unique(sightings.chain[members], return_inverse=True)
-    return _splits(tuple(chain.tolist()))
+    _, segment = np.unique(sightings.segment[members], return_inverse=True)
+    return _splits(tuple(segment.tolist()))
 
 
 @lru_cache(maxsize=4096)
-def _splits(chain: tuple[int, ...]) -> BoolArray:
+def _splits(segment: tuple[int, ...]) -> BoolArray:
     """Each split of few sightings; of more: each alone, each run alone, runs before and after, the end of a run."""
-    n = len(chain)
+    n = len(segment)
     if n < 2:
         return np.zeros((0, n), dtype=np.bool_)
     if n <= _FEW:
         return np.array([(False, *mask) for mask in product((False, True), repeat=n - 1) if any(mask)])
-    of = np.array(chain)
+    of = np.array(segment)
     masks = [np.arange(n) == i for i in range(n)]
     masks += [np.arange(n) >= i for i in range(1, n)]
     for each in np.unique(of):

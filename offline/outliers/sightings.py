@@ -14,30 +14,30 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, IntArray
-from groundsbot.offline.measurements import Chain, TagKey, passes_of
+from groundsbot.offline.measurements import Segment, TagKey, passes_of
 
 _INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """S sightings of the tags of some chains, in order of id, chain and time.
+    """S sightings of the tags of some segments, in order of id, segment and time.
 
     Attributes:
         ids: N ids that were read, sorted, no instances told apart.
-        of_reading: (M,) the sighting of each reading, in the order of the chains' readings one after the other.
+        of_reading: (M,) the sighting of each reading, in the order of the segments' readings one after the other.
         passing: (M,) the same, before passings were taken together (`grouping`).
-        id: (S,) index into `ids`; chain: (S,) index of the chain.
+        id: (S,) index into `ids`; segment: (S,) index of the segment.
         first_ns, last_ns: (S,) when it began and ended.
         n_readings: (S,)
-        tag: (S,) index into the chain's own tags.
+        tag: (S,) index into the segment's own tags.
     """
 
     ids: tuple[TagKey, ...]
     of_reading: IntArray
     passing: IntArray
     id: IntArray
-    chain: IntArray
+    segment: IntArray
     first_ns: IntArray
     last_ns: IntArray
     n_readings: IntArray
@@ -49,10 +49,10 @@ class Sightings:
 
     @cached_property
     def in_time(self) -> IntArray:
-        """(S,) their order by id, then by the beginning of the chain, then by time."""
-        begin_ns = np.full(int(self.chain.max(initial=-1)) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(begin_ns, self.chain, self.first_ns)
-        return np.lexsort((self.first_ns, self.chain, begin_ns[self.chain], self.id))
+        """(S,) their order by id, then by the beginning of the segment, then by time."""
+        begin_ns = np.full(int(self.segment.max(initial=-1)) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(begin_ns, self.segment, self.first_ns)
+        return np.lexsort((self.first_ns, self.segment, begin_ns[self.segment], self.id))
 
     @cached_property
     def rank(self) -> IntArray:
@@ -68,8 +68,8 @@ class Sightings:
 
     def one_after_the_other(self, members: IntArray) -> bool:
         """Whether the runs that these sightings are of were driven at different times, by what all of them sighted."""
-        chains = np.unique(self.chain[members])
-        spans = [(self.first_ns[self.chain == c].min(), self.last_ns[self.chain == c].max()) for c in chains]
+        segments = np.unique(self.segment[members])
+        spans = [(self.first_ns[self.segment == c].min(), self.last_ns[self.segment == c].max()) for c in segments]
         return all(before[1] < after[0] for before, after in pairwise(sorted(spans)))
 
     def came_back(self, members: IntArray, place: IntArray | BoolArray) -> bool:
@@ -79,30 +79,30 @@ class Sightings:
         """
         parts = [members]
         if not self.one_after_the_other(members):
-            parts = [members[self.chain[members] == c] for c in np.unique(self.chain[members])]
+            parts = [members[self.segment[members] == c] for c in np.unique(self.segment[members])]
         at = dict(zip(members.tolist(), place.tolist(), strict=True))
         ways = [[at[s] for s in part.tolist()] for part in parts]
         changes = [[here for i, here in enumerate(way) if i == 0 or here != way[i - 1]] for way in ways]
         return any(len(set(way)) < len(way) for way in changes)
 
 
-def sightings_of(chains: Sequence[Chain], begins: BoolArray | None = None) -> Sightings:
-    """Cuts the readings of chains into sightings; instances of one id that a chain tells apart stay apart.
+def sightings_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Sightings:
+    """Cuts the readings of segments into sightings; instances of one id that a segment tells apart stay apart.
 
     Args:
-        chains: whose readings, one after the other, are M.
+        segments: whose readings, one after the other, are M.
         begins: (M,) readings with which another sighting begins though the tag was not out of sight.
     """
-    ids = tuple(sorted({tag.whole for chain in chains for tag in chain.tags}))
+    ids = tuple(sorted({tag.whole for segment in segments for tag in segment.tags}))
     index = {tag: i for i, tag in enumerate(ids)}
     rows, of_reading = [], []
     first, n_readings = 0, 0
-    for number, chain in enumerate(chains):
-        n = len(chain.readings)
+    for number, segment in enumerate(segments):
+        n = len(segment.readings)
         here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_readings : n_readings + n]
-        found, sighting = _of_chain(chain, here)
+        found, sighting = _of_segment(segment, here)
         n_readings += n
-        own_ids = np.array([index[tag.whole] for tag in chain.tags], dtype=np.int64)
+        own_ids = np.array([index[tag.whole] for tag in segment.tags], dtype=np.int64)
         rows.append(np.column_stack([own_ids[found[:, 0]], np.full(len(found), number), found]))
         of_reading.append(first + sighting)
         first += len(found)
@@ -110,26 +110,26 @@ def sightings_of(chains: Sequence[Chain], begins: BoolArray | None = None) -> Si
     order = np.lexsort((table[:, 3], table[:, 1], table[:, 0]))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    own, chain_of, tag, first_ns, last_ns, count = table[order].T
+    own, segment_of, tag, first_ns, last_ns, count = table[order].T
     sighting_of = rank[np.concatenate(of_reading)]
-    return Sightings(ids, sighting_of, sighting_of, own, chain_of, first_ns, last_ns, count, tag)
+    return Sightings(ids, sighting_of, sighting_of, own, segment_of, first_ns, last_ns, count, tag)
 
 
-def _of_chain(chain: Chain, cut: BoolArray) -> tuple[IntArray, IntArray]:
+def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
     """(s, 4) tag, first and last stamp, number of readings of each sighting; and (M,) the sighting of each reading."""
-    of_reading = passes_of(chain, cut)
-    order = np.lexsort((chain.readings.keyframe, chain.readings.tag))
+    of_reading = passes_of(segment, cut)
+    order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
     count = np.bincount(of_reading)
     ends = np.cumsum(count) - 1
     first, last = order[ends - count + 1], order[ends]
-    stamps_ns = chain.stamps_ns[chain.readings.keyframe]
-    rows = [chain.readings.tag[first], stamps_ns[first], stamps_ns[last], count]
+    stamps_ns = segment.stamps_ns[segment.readings.keyframe]
+    rows = [segment.readings.tag[first], stamps_ns[first], stamps_ns[last], count]
     return np.column_stack(rows).reshape(-1, 4), of_reading
 
 
-def places_told_apart(chains: Sequence[Chain], sightings: Sightings) -> IntArray:
-    """(S,) equal for sightings of what the chains take for one tag."""
-    keys = [(*chains[c].tags[t],) for c, t in zip(sightings.chain, sightings.tag, strict=True)]
+def places_told_apart(segments: Sequence[Segment], sightings: Sightings) -> IntArray:
+    """(S,) equal for sightings of what the segments take for one tag."""
+    keys = [(*segments[c].tags[t],) for c, t in zip(sightings.segment, sightings.tag, strict=True)]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     return np.array([number[key] for key in keys], dtype=np.int64)
 
@@ -140,7 +140,7 @@ def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[
     Args:
         sightings: S of them.
         place: (S,) equal where two sightings are of one tag.
-        only_in: put before the letter, so that no other chain has a tag of that name.
+        only_in: put before the letter, so that no other segment has a tag of that name.
     """
     names: dict[tuple[int, int], str] = {}
     n_places = np.zeros(len(sightings.ids), dtype=np.int64)
@@ -155,18 +155,18 @@ def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[
     ]
 
 
-def with_instances(chains: Sequence[Chain], sightings: Sightings, tag_of: Sequence[TagKey]) -> list[Chain]:
-    """The same chains with readings of the tags that each sighting (S,) is of."""
+def with_instances(segments: Sequence[Segment], sightings: Sightings, tag_of: Sequence[TagKey]) -> list[Segment]:
+    """The same segments with readings of the tags that each sighting (S,) is of."""
     relabelled = []
     first = 0
-    for chain in chains:
-        n = len(chain.readings)
+    for segment in segments:
+        n = len(segment.readings)
         read = [tag_of[s] for s in sightings.of_reading[first : first + n]]
         first += n
         tags = tuple(sorted(set(read)))
         index = {tag: i for i, tag in enumerate(tags)}
         tag = np.array([index[each] for each in read], dtype=np.int64)
-        relabelled.append(replace(chain, tags=tags, readings=replace(chain.readings, tag=tag)))
+        relabelled.append(replace(segment, tags=tags, readings=replace(segment.readings, tag=tag)))
     return relabelled
 
 

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import Chain
+from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
 from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
 from groundsbot.offline.sam import build_graph, solve
@@ -64,7 +64,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
         if strain[worst] < _STRAINED:
             break
         tried.add(worst)
-        freed = build_graph([_free_motions(local_map.chain, motions[[*found, worst]])])
+        freed = build_graph([_free_motions(local_map.segment, motions[[*found, worst]])])
         other = solve(freed.problem, solution.state)
         gain = 2.0 * (solution.cost - other.cost)
         if gain > bound:
@@ -76,13 +76,13 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
         Slip(first, end, unexplained_motion(local_map.graph, solution.state, first + 1, end), found[i])
         for i, (first, end) in zip(found, motions[list(found)].tolist(), strict=True)
     ]
-    freed_map = replace(local_map, chain=graph.chains[0], graph=graph, solution=solution)
+    freed_map = replace(local_map, segment=graph.segments[0], graph=graph, solution=solution)
     return freed_map, sorted(slips, key=lambda each: each.first)
 
 
 def sentence(local_map: LocalMap, slips: list[Slip]) -> str:
     """One sentence about the slips of a drive, the largest ones named."""
-    seconds = (local_map.chain.stamps_ns - local_map.chain.stamps_ns[0]) * 1e-9
+    seconds = (local_map.segment.stamps_ns - local_map.segment.stamps_ns[0]) * 1e-9
     worst = sorted(sorted(slips, key=lambda each: -each.chi_square)[:_MOST_NAMED], key=lambda each: each.first)
     places = ", ".join(
         f"{seconds[each.first]:.1f} to {seconds[each.end]:.1f} s by {hypot(*each.jump[:2]):.2f} m and "
@@ -91,7 +91,7 @@ def sentence(local_map: LocalMap, slips: list[Slip]) -> str:
     )
     most = ", the largest at " if len(slips) > _MOST_NAMED else ": "
     return (
-        f"{local_map.chain.name}: in {plural(len(slips), 'place')} the robot moved as its wheels do not explain{most}"
+        f"{local_map.segment.name}: in {plural(len(slips), 'place')} the robot moved as its wheels do not explain{most}"
         f"{places}; slipped, pushed or lifted? There only tags say where the drive goes on"
     )
 
@@ -102,8 +102,8 @@ def _motions_between_readings(local_map: LocalMap) -> IntArray:
     return np.stack([reading[:-1], reading[1:]], axis=-1)
 
 
-def _free_motions(chain: Chain, motions: IntArray) -> Chain:
-    covariance = chain.odometry.covariance.copy()
+def _free_motions(segment: Segment, motions: IntArray) -> Segment:
+    covariance = segment.odometry.covariance.copy()
     for first, end in motions.tolist():
         covariance[first:end] += _FREED * np.eye(3)
-    return replace(chain, odometry=replace(chain.odometry, covariance=covariance))
+    return replace(segment, odometry=replace(segment.odometry, covariance=covariance))

@@ -31,15 +31,15 @@ def figures(document: dict[str, Any], workings: Workings) -> dict[str, Any]:
     """
     colours = run_colours(document)
     components = [_component(document, i, solved, workings, colours) for i, solved in enumerate(workings.solved)]
-    events = events_of([chain for solved in workings.solved for chain in solved.graph.chains])
+    events = events_of([segment for solved in workings.solved for segment in solved.graph.segments])
     timelines: list[dict[str, Any]] = []
     for solved in workings.solved:
         sigmas = residual_sigmas(solved)
-        for i, chain in enumerate(solved.graph.chains):
+        for i, segment in enumerate(solved.graph.segments):
             if len(timelines) < _MOST_TIMELINES:
-                data = timeline(chain, sigmas[chain_of_reading(solved) == i], events[chain.name])
-                timelines.append(data | {"colour": colours[chain.name]})
-    n_timelines = sum(len(solved.graph.chains) for solved in workings.solved)
+                data = timeline(segment, sigmas[segment_of_reading(solved) == i], events[segment.name])
+                timelines.append(data | {"colour": colours[segment.name]})
+    n_timelines = sum(len(solved.graph.segments) for solved in workings.solved)
     return {
         "components": components,
         "timelines": timelines,
@@ -59,7 +59,7 @@ def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
 
 
 def run_colours(document: dict[str, Any]) -> dict[str, str]:
-    """Each chain's colour, that of its run in map.png."""
+    """Each segment's colour, that of its run in map.png."""
     runs = list(dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"]))
     return {
         run["run"]: RUN_COLOURS[runs.index(run["stretch_of"] or run["run"]) % len(RUN_COLOURS)]
@@ -73,24 +73,24 @@ def residual_sigmas(solved: Solved) -> FloatArray:
     return np.asarray(np.sqrt((residual**2).mean(axis=1)))
 
 
-def chain_of_reading(solved: Solved) -> IntArray:
-    """(M,) index of the chain that each reading belongs to."""
+def segment_of_reading(solved: Solved) -> IntArray:
+    """(M,) index of the segment that each reading belongs to."""
     return np.searchsorted(solved.graph.first_pose, solved.graph.problem.readings.pose, side="right") - 1
 
 
 def tag_readings(solved: Solved) -> list[list[dict[str, Any]]]:
-    """For each tag of a component, a record for each chain that read it: how often, and what that leaves over."""
-    n_chains, n_tags = len(solved.graph.chains), len(solved.graph.tags)
+    """For each tag of a component, a record for each segment that read it: how often, and what that leaves over."""
+    n_segments, n_tags = len(solved.graph.segments), len(solved.graph.tags)
     sigmas = residual_sigmas(solved)
-    cell = solved.graph.problem.readings.tag * n_chains + chain_of_reading(solved)
-    count = np.bincount(cell, minlength=n_tags * n_chains).reshape(n_tags, n_chains)
-    squares = np.bincount(cell, sigmas**2, n_tags * n_chains).reshape(n_tags, n_chains)
-    worst = np.zeros((n_tags, n_chains))
+    cell = solved.graph.problem.readings.tag * n_segments + segment_of_reading(solved)
+    count = np.bincount(cell, minlength=n_tags * n_segments).reshape(n_tags, n_segments)
+    squares = np.bincount(cell, sigmas**2, n_tags * n_segments).reshape(n_tags, n_segments)
+    worst = np.zeros((n_tags, n_segments))
     np.maximum.at(worst.reshape(-1), cell, sigmas)
     return [
         [
             {
-                "run": solved.graph.chains[c].name,
+                "run": solved.graph.segments[c].name,
                 "n": int(count[t, c]),
                 "rms": round(float(np.sqrt(squares[t, c] / count[t, c])), 2),
                 "worst": round(float(worst[t, c]), 1),
@@ -155,7 +155,7 @@ def _before(
         places = se2.apply(T_frame_start, np.array(list(local_map.tags_m.values())).reshape(-1, 2))
         x, y = _round_points(places)
         labels = [tag_label(tag._asdict(), several_families=several_families) for tag in local_map.tags_m]
-        trace = _trace(local_map.chain.name, colours, se2.compose(T_frame_start, local_map.T_start_base))
+        trace = _trace(local_map.segment.name, colours, se2.compose(T_frame_start, local_map.T_start_base))
         layers.append(trace | {"tags": {"label": labels, "x": x, "y": y}})
     return layers
 

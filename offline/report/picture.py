@@ -109,7 +109,7 @@ def _title(result: MapResult) -> str:
 
 
 def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
-    """Colour and dashes of each run; a run's stretches look alike."""
+    """Colour and dashes of each run; a run's segments look alike."""
     looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
     return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
 
@@ -186,8 +186,8 @@ def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fa
         parts = [part for part in result.runs if part.run == run]
         names = {part.name for part in parts}
         n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
-        stretches = f", {len(parts)} stretches" if len(parts) > 1 else ""
-        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{stretches}"
+        segments = f", {len(parts)} segments" if len(parts) > 1 else ""
+        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{segments}"
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
     handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
     shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"

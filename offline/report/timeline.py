@@ -6,42 +6,42 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.measurements import GAP_NS, Chain, RunEvent
+from groundsbot.offline.measurements import GAP_NS, RunEvent, Segment
 
 # As many points as a screen is wide.
 _MOST_POINTS: Final = 800
 _S: Final = 1e-9
 
 
-def timeline(chain: Chain, residual_sigmas: FloatArray, events: Sequence[RunEvent]) -> dict[str, Any]:
-    """One chain's columns over time, thinned: means of speed, largest of what else there is.
+def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[RunEvent]) -> dict[str, Any]:
+    """One segment's columns over time, thinned: means of speed, largest of what else there is.
 
     Args:
-        chain: whose keyframes are the times.
+        segment: whose keyframes are the times.
         residual_sigmas: (M,) what each of its readings leaves over, in sigmas a coordinate.
         events: of `events_of`.
     """
-    n = len(chain.stamps_ns)
-    seconds = (chain.stamps_ns - chain.stamps_ns[0]) * _S
-    n_tags = np.bincount(chain.readings.keyframe, minlength=n)
-    squares = np.bincount(chain.readings.keyframe, residual_sigmas**2, n)
+    n = len(segment.stamps_ns)
+    seconds = (segment.stamps_ns - segment.stamps_ns[0]) * _S
+    n_tags = np.bincount(segment.readings.keyframe, minlength=n)
+    squares = np.bincount(segment.readings.keyframe, residual_sigmas**2, n)
     worst = np.zeros(n)
-    np.maximum.at(worst, chain.readings.keyframe, residual_sigmas)
+    np.maximum.at(worst, segment.readings.keyframe, residual_sigmas)
     first = np.arange(0, n, -(-n // _MOST_POINTS))
     readings = np.add.reduceat(n_tags, first)
     # A run may be one keyframe long: then there is no speed.
-    step_m = np.append(chain.odometry.distance_m, 0.0)
+    step_m = np.append(segment.odometry.distance_m, 0.0)
     step_s = np.append(np.diff(seconds), 0.0)
     driven_m, lasting_s = np.add.reduceat(step_m, first), np.add.reduceat(step_s, first)
     return {
-        "run": chain.name,
+        "run": segment.name,
         "t_s": np.round(seconds[first], 2).tolist(),
         "speed_m_s": _mean_or_none(driven_m, lasting_s, 3),
         "tags": np.maximum.reduceat(n_tags, first).tolist(),
         "rms": _mean_or_none(np.add.reduceat(squares, first), readings, 4, root=True),
         "worst": _mean_or_none(np.where(readings > 0, np.maximum.reduceat(worst, first), 0.0), readings.clip(0, 1), 2),
-        "gaps": _gaps(chain),
-        "events": [_event_entry(event, chain) for event in events],
+        "gaps": _gaps(segment),
+        "events": [_event_entry(event, segment) for event in events],
     }
 
 
@@ -54,31 +54,31 @@ def _mean_or_none(
     return [value if known else None for value, known in zip(values, (count > 0).tolist(), strict=True)]
 
 
-def events_of(chains: Sequence[Chain]) -> dict[str, list[RunEvent]]:
-    """What recorders told, by the name of the chain that was driven then or, between two of them, nearest then."""
-    told: dict[str, list[RunEvent]] = {chain.name: [] for chain in chains}
-    for name in dict.fromkeys(chain.run.name for chain in chains):
-        own = [chain for chain in chains if chain.run.name == name]
-        spans = [(int(chain.stamps_ns[0]), int(chain.stamps_ns[-1])) for chain in own]
+def events_of(segments: Sequence[Segment]) -> dict[str, list[RunEvent]]:
+    """What recorders told, by the name of the segment that was driven then or, between two of them, nearest then."""
+    told: dict[str, list[RunEvent]] = {segment.name: [] for segment in segments}
+    for name in dict.fromkeys(segment.run.name for segment in segments):
+        own = [segment for segment in segments if segment.run.name == name]
+        spans = [(int(segment.stamps_ns[0]), int(segment.stamps_ns[-1])) for segment in own]
         for event in own[0].run.events:
             away_ns = [max(first - event.stamp_ns, event.stamp_ns - last, 0) for first, last in spans]
             told[own[away_ns.index(min(away_ns))].name].append(event)
     return told
 
 
-def _gaps(chain: Chain) -> list[list[float]]:
+def _gaps(segment: Segment) -> list[list[float]]:
     """Begin and end in seconds where no wheel was read for longer than a gap may be."""
-    if not chain.run.stretches:  # of a map that was kept: its log alone knows
+    if not segment.run.wheel_segments:  # of a map that was kept: its log alone knows
         return []
-    stamps_ns = np.concatenate([track.stamps_ns for track in chain.run.stretches])
-    stamps_ns = stamps_ns[(stamps_ns >= chain.stamps_ns[0]) & (stamps_ns <= chain.stamps_ns[-1])]
+    stamps_ns = np.concatenate([wheel_segment.stamps_ns for wheel_segment in segment.run.wheel_segments])
+    stamps_ns = stamps_ns[(stamps_ns >= segment.stamps_ns[0]) & (stamps_ns <= segment.stamps_ns[-1])]
     before = np.flatnonzero(np.diff(stamps_ns) > GAP_NS)
-    begin_s, end_s = ((stamps_ns[i] - chain.stamps_ns[0]) * _S for i in (before, before + 1))
+    begin_s, end_s = ((stamps_ns[i] - segment.stamps_ns[0]) * _S for i in (before, before + 1))
     gaps: list[list[float]] = np.round(np.stack([begin_s, end_s], axis=-1), 2).tolist()
     return gaps
 
 
-def _event_entry(event: RunEvent, chain: Chain) -> dict[str, Any]:
+def _event_entry(event: RunEvent, segment: Segment) -> dict[str, Any]:
     """An event at its time, or at the rim of the drive."""
-    at_ns = min(max(event.stamp_ns, int(chain.stamps_ns[0])), int(chain.stamps_ns[-1])) - int(chain.stamps_ns[0])
+    at_ns = min(max(event.stamp_ns, int(segment.stamps_ns[0])), int(segment.stamps_ns[-1])) - int(segment.stamps_ns[0])
     return {"t_s": round(at_ns * _S, 2), "loss": event.is_loss, "text": event.text}

@@ -1,6 +1,6 @@
 """The back end: square-root smoothing and mapping. Factors, graph, solver, covariances.
 
-In: chains of measurements. Out: `Graph` (which variables, which factors) and `Solution` (the most likely state, and
+In: segments of measurements. Out: `Graph` (which variables, which factors) and `Solution` (the most likely state, and
 exact covariances from its square-root factor). In the paper: square-root SAM, its Jacobians and its QR or Cholesky
 solve.
 """

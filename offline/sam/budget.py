@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs
-from groundsbot.offline.measurements import Chain
+from groundsbot.offline.measurements import Segment
 from groundsbot.offline.sam.solver import MAX_TRIES, Problem, Solution
 
 # Linearising a factor takes as long as so many multiplications in a leaf; those above run in larger blocks.
@@ -36,7 +36,7 @@ _BYTES_A_KEYFRAME: Final = 3300.0
 _BYTES_A_READING: Final = 2900.0
 _FREE_BYTES: Final = 56 << 20
 _BYTES_PER_BYTE: Final = 160.0
-# Stretches are laid over each other by the joint covariances of their tags. One stretch may see all tags that there
+# Segments are laid over each other by the joint covariances of their tags. One segment may see all tags that there
 # are; that others see them again takes a recorder some 26 readings of 200 bytes for each.
 _FREE_PLACES: Final = 652
 _BYTES_A_PLACE: Final = 5200
@@ -44,15 +44,15 @@ _BYTES_A_PLACE: Final = 5200
 
 @dataclass
 class Effort:
-    """What may be spent on a log or on one of its stretches, and what is left of it.
+    """What may be spent on a log or on one of its segments, and what is left of it.
 
     Attributes:
         allowed: work, by the log's size.
         left: what was not yet used.
         memory_bytes: that a map of it may take.
         promised: work of one step over all problems that were found to be affordable.
-        places: how many tags all stretches may see, each counted anew in each.
-        whole: the log's, where this is a stretch's.
+        places: how many tags all segments may see, each counted anew in each.
+        whole: the log's, where this is a segment's.
     """
 
     allowed: float
@@ -76,12 +76,12 @@ class Effort:
         )
 
     def split(self, sizes: Sequence[int]) -> list["Effort"]:
-        """Of stretches, each as much as its share of all their sizes."""
+        """Of segments, each as much as its share of all their sizes."""
         allowed = [self.allowed * size / max(1, sum(sizes)) for size in sizes]
         return [replace(self, allowed=each, left=each, whole=self) for each in allowed]
 
     def take(self, share: float) -> "Effort":
-        """A share of what is left, for a part of a stretch that was itself found to be affordable."""
+        """A share of what is left, for a part of a segment that was itself found to be affordable."""
         work = share * max(self.left, 0.0)
         self.left -= work
         return Effort(work, work, self.memory_bytes, promised=-np.inf)
@@ -102,14 +102,14 @@ class Effort:
         """Refuses a problem that it does not suffice for, beside those that were checked before.
 
         Raises:
-            OfflineError: naming log and chain, what a step would take, the limit and the way out.
+            OfflineError: naming log and segment, what a step would take, the limit and the way out.
         """
         whole = self.whole or self
         whole.promised += step_work(problem)
         whole.places -= len(problem.columns.tags)
         if whole.places < 0.0:
             raise OfflineError(
-                f"{log}: {name}: the run's stretches see more tags than a log of this size can tell of; "
+                f"{log}: {name}: the run's segments see more tags than a log of this size can tell of; "
                 "are the tags' numbers right? leave out some of the looks"
             )
         if whole.promised <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
@@ -135,21 +135,21 @@ class Effort:
             self.left -= _A_BUILDING * _A_FACTOR * _n_factors(solution.problem)
 
 
-def efforts_of(chains: Sequence[Chain], times: int = 1) -> list[Effort]:
-    """What each stretch of some runs is worth of its log, each of the times that a command maps them."""
-    of_run: dict[str, list[Chain]] = {}
-    for chain in chains:
-        of_run.setdefault(chain.run.name, []).append(chain)
+def efforts_of(segments: Sequence[Segment], times: int = 1) -> list[Effort]:
+    """What each segment of some runs is worth of its log, each of the times that a command maps them."""
+    of_run: dict[str, list[Segment]] = {}
+    for segment in segments:
+        of_run.setdefault(segment.run.name, []).append(segment)
     parts = {
         name: iter(Effort.of_log(some[0].run.log_bytes, some[0].run.inputs, times).split([size_of(c) for c in some]))
         for name, some in of_run.items()
     }
-    return [next(parts[chain.run.name]) for chain in chains]
+    return [next(parts[segment.run.name]) for segment in segments]
 
 
-def size_of(chain: Chain) -> int:
+def size_of(segment: Segment) -> int:
     """Its keyframes and readings: work grows with them."""
-    return len(chain.stamps_ns) + len(chain.readings)
+    return len(segment.stamps_ns) + len(segment.readings)
 
 
 def step_work(problem: Problem) -> float:

@@ -1,4 +1,4 @@
-"""From chains to one problem: which variables there are, which factor touches which, what is held."""
+"""From segments to one problem: which variables there are, which factor touches which, what is held."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, MOUNT_PARAMETERS, Mount
-from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
     Columns,
@@ -35,14 +35,14 @@ class Graph:
     """A problem and what its variables mean.
 
     Attributes:
-        chains: in order; the first one's start is held at its value: the frame.
-        first_pose: (number of chains,) index of each chain's start among the poses.
+        segments: in order; the first one's start is held at its value: the frame.
+        first_pose: (number of segments,) index of each segment's start among the poses.
         tags: in order.
         parameters: in order; the first is a held zero.
     """
 
     problem: Problem
-    chains: tuple[Chain, ...]
+    segments: tuple[Segment, ...]
     first_pose: IntArray
     tags: tuple[TagKey, ...]
     parameters: tuple[Parameter, ...]
@@ -50,27 +50,27 @@ class Graph:
     @property
     def has_corners(self) -> bool:
         """Whether any reading came from corners that the log still has."""
-        return any(chain.readings.from_corners.any() for chain in self.chains)
+        return any(segment.readings.from_corners.any() for segment in self.segments)
 
-    def poses_of(self, state: State, chain: int) -> FloatArray:
-        """(K, 3) of one chain."""
-        first = int(self.first_pose[chain])
-        return state.poses[first : first + len(self.chains[chain].stamps_ns)]
+    def poses_of(self, state: State, segment: int) -> FloatArray:
+        """(K, 3) of one segment."""
+        first = int(self.first_pose[segment])
+        return state.poses[first : first + len(self.segments[segment].stamps_ns)]
 
-    def wheel_calibration(self, state: State, chain: int) -> FloatArray:
-        """(3,) wheel parameters of one chain's robot."""
-        return state.calibration[self.wheel_parameters(chain)]
+    def wheel_calibration(self, state: State, segment: int) -> FloatArray:
+        """(3,) wheel parameters of one segment's robot."""
+        return state.calibration[self.wheel_parameters(segment)]
 
-    def wheel_parameters(self, chain: int) -> IntArray:
-        """(3,) indices of one chain's WHEEL_PARAMETERS."""
-        return _indices(self.parameters, parameters_of_wheels(self.chains[chain].run.robot))
+    def wheel_parameters(self, segment: int) -> IntArray:
+        """(3,) indices of one segment's WHEEL_PARAMETERS."""
+        return _indices(self.parameters, parameters_of_wheels(self.segments[segment].run.robot))
 
-    def mount_of(self, state: State, chain: int) -> Mount | None:
-        """Where one chain's camera sits, as corrected; None for a log without a camera."""
-        run = self.chains[chain].run
+    def mount_of(self, state: State, segment: int) -> Mount | None:
+        """Where one segment's camera sits, as corrected; None for a log without a camera."""
+        run = self.segments[segment].run
         if run.camera is None:
             return None
-        parameters = [*mount_parameters_of(run.robot), *camera_parameters_of(self.chains[chain])]
+        parameters = [*mount_parameters_of(run.robot), *camera_parameters_of(self.segments[segment])]
         found = state.calibration[_indices(self.parameters, parameters)].tolist()
         corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
         mount = run.robot.mount.model_dump()
@@ -79,9 +79,9 @@ class Graph:
                 mount[name.removeprefix(_MOUNT)] += value
         return Mount.model_validate(mount)
 
-    def tag_scales(self, chain: int) -> IntArray:
-        """Indices of the scales of all batches of tags that one chain read."""
-        owner = self.chains[chain]
+    def tag_scales(self, segment: int) -> IntArray:
+        """Indices of the scales of all batches of tags that one segment read."""
+        owner = self.segments[segment]
         scales = sorted({scale_parameter_of(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
         return _indices(self.parameters, scales)
 
@@ -110,22 +110,22 @@ class Graph:
         return np.bincount(self.problem.readings.tag, minlength=len(self.tags))
 
 
-def build_graph(chains: Sequence[Chain]) -> Graph:
-    """All chains in one problem. The first chain's start is held: it is the frame."""
-    tags = tuple(sorted({tag for chain in chains for tag in chain.tags}))
-    parameters = tuple(sorted({p for chain in chains for p in _parameters(chain)}, key=lambda p: p[:3]))
+def build_graph(segments: Sequence[Segment]) -> Graph:
+    """All segments in one problem. The first segment's start is held: it is the frame."""
+    tags = tuple(sorted({tag for segment in segments for tag in segment.tags}))
+    parameters = tuple(sorted({p for segment in segments for p in _parameters(segment)}, key=lambda p: p[:3]))
     parameters = (NO_PARAMETER, *parameters)
-    lengths = np.array([len(chain.stamps_ns) for chain in chains])
+    lengths = np.array([len(segment.stamps_ns) for segment in segments])
     first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    readings = _reading_factors(chains, first_pose, tags, parameters)
+    readings = _reading_factors(segments, first_pose, tags, parameters)
     problem = Problem(
-        odometry=_odometry_factors(chains, first_pose, parameters),
+        odometry=_odometry_factors(segments, first_pose, parameters),
         readings=readings,
         prior=CalibrationPrior(np.array([p.sigma for p in parameters])),
         columns=_columns(int(lengths.sum()), len(tags), parameters),
         anchor=_middle_readings(readings, len(tags)),
     )
-    return Graph(problem, tuple(chains), first_pose, tags, parameters)
+    return Graph(problem, tuple(segments), first_pose, tags, parameters)
 
 
 def unheld(graph: Graph) -> Graph:
@@ -158,57 +158,57 @@ def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Colu
 
 
 def _odometry_factors(
-    chains: Sequence[Chain], first_pose: IntArray, parameters: Sequence[Parameter]
+    segments: Sequence[Segment], first_pose: IntArray, parameters: Sequence[Parameter]
 ) -> OdometryFactors:
     first, indices = [], []
-    for chain, start in zip(chains, first_pose, strict=True):
-        n = len(chain.odometry)
+    for segment, start in zip(segments, first_pose, strict=True):
+        n = len(segment.odometry)
         first.append(start + np.arange(n))
-        indices.append(np.tile(_indices(parameters, parameters_of_wheels(chain.run.robot)), (n, 1)))
+        indices.append(np.tile(_indices(parameters, parameters_of_wheels(segment.run.robot)), (n, 1)))
     return OdometryFactors(
         first=np.concatenate(first),
-        motion=np.concatenate([chain.odometry.motion for chain in chains]),
-        whitening=whitening(np.concatenate([chain.odometry.covariance for chain in chains])),
-        jacobian=np.concatenate([chain.odometry.jacobian for chain in chains]),
+        motion=np.concatenate([segment.odometry.motion for segment in segments]),
+        whitening=whitening(np.concatenate([segment.odometry.covariance for segment in segments])),
+        jacobian=np.concatenate([segment.odometry.jacobian for segment in segments]),
         parameters=np.concatenate(indices),
     )
 
 
 def _reading_factors(
-    chains: Sequence[Chain], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
+    segments: Sequence[Segment], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
 ) -> ReadingFactors:
     tag_index = {tag: i for i, tag in enumerate(tags)}
     pose, tag, mount, mount_parameters, scale_parameter, camera_parameters = [], [], [], [], [], []
-    for chain, start in zip(chains, first_pose, strict=True):
-        readings = chain.readings
-        own_tags = np.array([tag_index[t] for t in chain.tags], dtype=np.int64)
-        scales = np.array([parameters.index(scale_parameter_of(chain, t)) for t in chain.tags], dtype=np.int64)
+    for segment, start in zip(segments, first_pose, strict=True):
+        readings = segment.readings
+        own_tags = np.array([tag_index[t] for t in segment.tags], dtype=np.int64)
+        scales = np.array([parameters.index(scale_parameter_of(segment, t)) for t in segment.tags], dtype=np.int64)
         pose.append(start + readings.keyframe)
         tag.append(own_tags[readings.tag])
         by_camera = readings.in_camera[:, None]
-        mount.append(np.where(by_camera, chain.T_base_camera, 0.0))
-        mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(chain.run.robot)), 0))
-        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(chain)), (len(readings), 1)))
+        mount.append(np.where(by_camera, segment.T_base_camera, 0.0))
+        mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(segment.run.robot)), 0))
+        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(segment)), (len(readings), 1)))
         scale_parameter.append(scales[readings.tag])
     return ReadingFactors(
         pose=np.concatenate(pose),
         tag=np.concatenate(tag),
-        value=np.concatenate([chain.readings.value for chain in chains]),
-        polar=np.concatenate([chain.readings.polar for chain in chains]),
-        whitening=whitening(np.concatenate([chain.readings.covariance for chain in chains])),
+        value=np.concatenate([segment.readings.value for segment in segments]),
+        polar=np.concatenate([segment.readings.polar for segment in segments]),
+        whitening=whitening(np.concatenate([segment.readings.covariance for segment in segments])),
         mount=np.concatenate(mount),
         mount_parameters=np.concatenate(mount_parameters),
         scale_parameter=np.concatenate(scale_parameter),
-        by_camera=np.concatenate([chain.readings.by_camera for chain in chains]),
+        by_camera=np.concatenate([segment.readings.by_camera for segment in segments]),
         camera_parameters=np.concatenate(camera_parameters),
     )
 
 
-def _parameters(chain: Chain) -> list[Parameter]:
-    robot = chain.run.robot
-    found = parameters_of_wheels(robot) + [scale_parameter_of(chain, tag) for tag in chain.tags]
-    found += camera_parameters_of(chain)
-    if chain.readings.in_camera.any():
+def _parameters(segment: Segment) -> list[Parameter]:
+    robot = segment.run.robot
+    found = parameters_of_wheels(robot) + [scale_parameter_of(segment, tag) for tag in segment.tags]
+    found += camera_parameters_of(segment)
+    if segment.readings.in_camera.any():
         found += mount_parameters_of(robot)
     return [p for p in found if p != NO_PARAMETER]
 

@@ -12,7 +12,7 @@ from groundsbot.calib.robot import (
     WHEEL_PARAMETERS,
     Robot,
 )
-from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.measurements import Segment, TagKey
 
 
 class Parameter(NamedTuple):
@@ -55,10 +55,10 @@ def mount_parameters_of(robot: Robot) -> list[Parameter]:
     ]
 
 
-def camera_parameters_of(chain: Chain) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS; none where no reading of the chain depends on it."""
-    by_camera = chain.readings.by_camera
-    parameters = parameters_of_camera(chain.run.robot)
+def camera_parameters_of(segment: Segment) -> list[Parameter]:
+    """In the order of CAMERA_PARAMETERS; none where no reading of the segment depends on it."""
+    by_camera = segment.readings.by_camera
+    parameters = parameters_of_camera(segment.run.robot)
     return [each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)]
 
 
@@ -75,9 +75,9 @@ def parameters_of_camera(robot: Robot) -> list[Parameter]:
     ]
 
 
-def scale_parameter_of(chain: Chain, tag: TagKey) -> Parameter:
-    """Of the batch of a tag that a chain read."""
-    return parameter_of_scale(chain.run.robot, tag)
+def scale_parameter_of(segment: Segment, tag: TagKey) -> Parameter:
+    """Of the batch of a tag that a segment read."""
+    return parameter_of_scale(segment.run.robot, tag)
 
 
 def parameter_of_scale(robot: Robot, tag: TagKey) -> Parameter:

@@ -1,6 +1,6 @@
 """Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
 
-Linearise all factors, eliminate the chains, meet in the border, substitute back: see `arrowhead.system`. Dellaert and
+Linearise all factors, eliminate the segments, meet in the border, substitute back: see `arrowhead.system`. Dellaert and
 Kaess, "Square Root SAM" (2006). How a step is taken stands in `step`, what comes of it in `damping`. Readings carry
 Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
 """

@@ -1,7 +1,7 @@
 """Which numbers of robot.yaml the drives overrule, and a robot.yaml with what they found.
 
-In: runs and chains. Out: runs with parameters freed, the reasons, and corrected robot files. The paper takes its robot
-as calibrated.
+In: runs and segments. Out: runs with parameters freed, the reasons, and corrected robot files. The paper takes its
+robot as calibrated.
 """
 
 from lazy_loader import attach_stub

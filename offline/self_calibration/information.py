@@ -1,6 +1,6 @@
-"""What stretches of drives tell of the calibration, each on its own.
+"""What segments of drives tell of the calibration, each on its own.
 
-A drive is cut into a few stretches. Each is solved with a start and a place for each tag of its own, and with every
+A drive is cut into a few segments. Each is solved with a start and a place for each tag of its own, and with every
 number that might be freed open as far as it could be off at all. What it tells of the calibration is the information of
 that estimate less what it was given: no map is needed, no alignment, and a tag moved in between spoils nothing. The
 noise is the one that windows of the drive leave over (`local_map.goodness_of_fit`), so that it matters little what was
@@ -18,7 +18,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
-from groundsbot.offline.measurements import ODOMETRY_NOISE, Chain, least_shared
+from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared
 from groundsbot.offline.noise import in_cell, spread_of_corners
 from groundsbot.offline.sam import Effort, Parameter, Solution, build_graph, solve
 from groundsbot.offline.self_calibration.selection import Told
@@ -26,7 +26,7 @@ from groundsbot.offline.self_calibration.selection import Told
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
 _STRETCHES: Final = 5
 _FEWEST: Final = 2  # of a short one
-# Of what a drive is worth: for its windows, and for each stretch, which are smaller by as much.
+# Of what a drive is worth: for its windows, and for each segment, which are smaller by as much.
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.2
 
@@ -35,8 +35,8 @@ _SOLVING_SHARE: Final = 0.2
 _SIGMAS_NOT_GIVEN: Final[Mapping[str, float]] = MappingProxyType({FOCAL_SCALE: 1e-3, RANGE_OFFSET: 0.002})
 
 
-class _Stretch(NamedTuple):
-    """What one stretch tells: information (C, C) and vector (C,) of parameters, which have the sigmas it was given."""
+class _SegmentInformation(NamedTuple):
+    """What one segment tells: information (C, C) and vector (C,) of parameters, which have the sigmas it was given."""
 
     parameters: tuple[Parameter, ...]
     information: FloatArray
@@ -51,7 +51,7 @@ def information_of(
     *,
     corners: bool,
 ) -> Told:
-    """What all stretches of some runs tell.
+    """What all segments of some runs tell.
 
     Args:
         maps: of the runs, solved alone, with all open that may ever be freed.
@@ -60,27 +60,25 @@ def information_of(
         efforts: what is left of what each of them is worth.
         corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
     """
-    stretches: list[_Stretch] = []
+    parts: list[_SegmentInformation] = []
     priors: dict[tuple[object, ...], Parameter] = {}
     for each, effort in zip(maps, efforts, strict=True):
-        robot = robots[each.chain.run.name]
-        given = build_graph([replace(each.chain, run=replace(each.chain.run, robot=robot))])
+        robot = robots[each.segment.run.name]
+        given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
         priors |= {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters}
-        chain = _under_own_noise(each, noise, effort)
-        for first, end in _cuts(chain):
-            stretch = _information_of_segment(chain, each, first, end, effort, corners=corners)
-            if stretch is not None:
-                stretches.append(stretch)
-                priors = {
-                    parameter[:3]: _with_file_sigma(parameter, robot) for parameter in stretch.parameters
-                } | priors
+        segment = _under_own_noise(each, noise, effort)
+        for first, end in _cuts(segment):
+            part = _information_of_segment(segment, each, first, end, effort, corners=corners)
+            if part is not None:
+                parts.append(part)
+                priors = {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in part.parameters} | priors
     parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
     index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
     n = len(parameters)
-    information, vector = np.zeros((len(stretches), n, n)), np.zeros((len(stretches), n))
-    for k, stretch in enumerate(stretches):
-        at = [index[parameter[:3]] for parameter in stretch.parameters]
-        information[k][np.ix_(at, at)], vector[k, at] = stretch.information, stretch.vector
+    information, vector = np.zeros((len(parts), n, n)), np.zeros((len(parts), n))
+    for k, part in enumerate(parts):
+        at = [index[parameter[:3]] for parameter in part.parameters]
+        information[k][np.ix_(at, at)], vector[k, at] = part.information, part.vector
     return Told(parameters, information, vector)
 
 
@@ -92,34 +90,34 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
-def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Chain:
-    """The chain under the noise that its windows leave over, errors that neighbouring readings share included."""
-    least = least_shared(local_map.chain.readings)
+def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Segment:
+    """The segment under the noise that its windows leave over, errors that neighbouring readings share included."""
+    least = least_shared(local_map.segment.readings)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_readings = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
-    chain = local_map.chain.with_noise(own)
-    if not len(chain.readings):
-        return chain
-    of_corners = spread_of_corners(chain, in_cell(chain), own.sigma_corner_px)
+    segment = local_map.segment.with_noise(own)
+    if not len(segment.readings):
+        return segment
+    of_corners = spread_of_corners(segment, in_cell(segment), own.sigma_corner_px)
     of_corners = np.maximum(windows.sharing.max(axis=-1), of_corners)
-    return replace(chain, readings=chain.readings.spread(windows.sharing, of_corners))
+    return replace(segment, readings=segment.readings.spread(windows.sharing, of_corners))
 
 
-def _cuts(chain: Chain) -> list[tuple[int, int]]:
-    """First keyframe and end of each stretch; they are equally long."""
-    along_m = chain.along_m
+def _cuts(segment: Segment) -> list[tuple[int, int]]:
+    """First keyframe and end of each segment; they are equally long."""
+    along_m = segment.along_m
     n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _STRETCHES))
     ends = np.searchsorted(along_m, along_m[-1] * np.arange(1, n) / n, side="right").tolist()
     return list(zip([0, *ends], [*ends, len(along_m)], strict=True))
 
 
 def _information_of_segment(
-    chain: Chain, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
-) -> _Stretch | None:
-    """None where a stretch reads no tag or cannot be solved alone."""
-    part = chain.part(first, end)
+    segment: Segment, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
+) -> _SegmentInformation | None:
+    """None where a segment reads no tag or cannot be solved alone."""
+    part = segment.part(first, end)
     if not len(part.readings):
         return None
     graph = build_graph([part])
@@ -143,11 +141,11 @@ def _information_of_segment(
     )
 
 
-def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _Stretch:
+def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _SegmentInformation:
     """What an estimate (C,) with its covariance says beyond the sigmas about zero that its parameters were given."""
     sigma = np.array([each.sigma for each in parameters])
     information = np.linalg.inv(covariance / np.outer(sigma, sigma))  # in these sigmas
     vector = information @ (value / sigma)
     values, vectors = np.linalg.eigh(information - np.eye(len(sigma)))
     own = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding may leave less than nothing
-    return _Stretch(parameters, own / np.outer(sigma, sigma), vector / sigma)
+    return _SegmentInformation(parameters, own / np.outer(sigma, sigma), vector / sigma)

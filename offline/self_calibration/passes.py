@@ -1,4 +1,4 @@
-"""Passes of tags: short stretches of readings of one tag, and the wheel readings under them.
+"""Passes of tags: short segments of readings of one tag, and the wheel readings under them.
 
 Within a pass wheels err by little, so that what its readings tell of the sensor needs no map: each pass has a place of
 its own for its tag. They are chosen by stamps alone, and only chosen readings are worked out: a log may have millions.
@@ -39,12 +39,12 @@ _LEAST_SIGMA: Final = (0.005, 0.002)  # m, rad
 
 @dataclass(frozen=True)
 class WheelAxis:
-    """Wheel readings of all stretches on one time axis, with pauses of 10 s, of which nothing is used.
+    """Wheel readings of all segments on one time axis, with pauses of 10 s, of which nothing is used.
 
     Attributes:
         time_s: (N,) rising.
         motion: (N, 4) cumulative distances of the left and of the right wheel in m, and their speeds in m/s.
-        begins_s: of each stretch on this axis, in order of runs and of their stretches.
+        begins_s: of each segment on this axis, in order of runs and of their segments.
         track_m: between the wheels, by robot.yaml.
     """
 
@@ -153,11 +153,11 @@ def gather_passes(runs: Sequence[Run]) -> Passes | None:
 
 def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
     times, wheels, begins_s, end_s = [], [], [], 0.0
-    for track in (track for run in runs for track in run.stretches):
+    for wheel_segment in (wheel_segment for run in runs for wheel_segment in run.wheel_segments):
         begins_s.append(end_s)
-        if len(track.stamps_ns):
-            times.append(end_s + _since_s(track.stamps_ns, track.stamps_ns[0]))
-            wheels.append(np.stack([track.left_m, track.right_m]))
+        if len(wheel_segment.stamps_ns):
+            times.append(end_s + _since_s(wheel_segment.stamps_ns, wheel_segment.stamps_ns[0]))
+            wheels.append(np.stack([wheel_segment.left_m, wheel_segment.right_m]))
             end_s = times[-1][-1] + _BETWEEN_STRETCHES_S
     if sum(map(len, times)) < 2:
         return None
@@ -181,12 +181,12 @@ def _looks(runs: Sequence[Run], wheels: WheelAxis) -> _Looks:
     for number, run in enumerate(runs):
         stamps_ns = np.concatenate([run.positions.stamps_ns, run.detections.stamps_ns])
         tag = np.concatenate([run.positions.tag, run.detections.tag])
-        for track, begin_s in zip(run.stretches, begins_s, strict=False):
-            if not len(track.stamps_ns):
+        for wheel_segment, begin_s in zip(run.wheel_segments, begins_s, strict=False):
+            if not len(wheel_segment.stamps_ns):
                 continue
-            first_ns, last_ns = track.stamps_ns[0] + reach_ns, track.stamps_ns[-1] - reach_ns
+            first_ns, last_ns = wheel_segment.stamps_ns[0] + reach_ns, wheel_segment.stamps_ns[-1] - reach_ns
             index = np.flatnonzero((stamps_ns >= first_ns) & (stamps_ns <= last_ns))
-            time_s = begin_s + _since_s(stamps_ns[index], track.stamps_ns[0])
+            time_s = begin_s + _since_s(stamps_ns[index], wheel_segment.stamps_ns[0])
             where = (np.interp(time_s, wheels.time_s, each) for each in (way_m, turn_rad))
             moved.append(np.stack([time_s, *where]))
             names.append(np.stack([tag[index], np.full(len(index), number), index]))

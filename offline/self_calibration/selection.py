@@ -1,7 +1,7 @@
 """Which calibration numbers the drives may set themselves, and why the others stay as robot.yaml has them.
 
-What a stretch of a drive tells of the calibration c, everything else eliminated, is a quadratic form: information L_k
-and a vector h_k with log p(stretch | c) = h_k^T c - c^T L_k c / 2 + constant. Stretches have starts and tags of their
+What a segment of a drive tells of the calibration c, everything else eliminated, is a quadratic form: information L_k
+and a vector h_k with log p(segment | c) = h_k^T c - c^T L_k c / 2 + constant. Segments have starts and tags of their
 own, so they are independent given c, and all questions below are asked of sums of these forms.
 """
 
@@ -37,7 +37,7 @@ _NOT_ASKED: Final = "it was not asked for"
 
 @dataclass(frozen=True)
 class Told:
-    """What S stretches tell of C numbers.
+    """What S segments tell of C numbers.
 
     Attributes:
         parameters: C, each with the sigma that robot.yaml gives it.
@@ -167,9 +167,9 @@ class _Judge:
         if whole.variance >= prior**2 and not is_wrong:
             reason = TELLS_LESS
         elif gain is None:
-            reason = "a single stretch tells of it, and nothing bears that out"
+            reason = "a single segment tells of it, and nothing bears that out"
         elif gain <= 0.0:
-            reason = "what some stretches tell of it does not foretell the others better than robot.yaml does"
+            reason = "what some segments tell of it does not foretell the others better than robot.yaml does"
         elif abs(whole.value) > most:
             reason = f"it would be off by more than {most:g}, no error of calibration; is the file this robot's?"
         elif self._asked and not is_asked:
@@ -207,9 +207,9 @@ def _plausible(choice: CalibrationChoice) -> float:
 
 
 def _cross_validated_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
-    """Log likelihood of each stretch by what all others tell of the number, over that by robot.yaml; summed.
+    """Log likelihood of each segment by what all others tell of the number, over that by robot.yaml; summed.
 
-    None where no two stretches tell anything of it.
+    None where no two segments tell anything of it.
     """
     prior, limit, gains = told.parameters[index].sigma, OPEN_SIGMAS[told.parameters[index].name], []
     for k in range(len(told.vector)):
@@ -224,7 +224,7 @@ def _cross_validated_gain(told: Told, sigmas: FloatArray, index: int) -> float |
 
 
 def _estimate(told: Told, which: BoolArray, sigmas: FloatArray, index: int) -> _Estimate:
-    """By some stretches (S,), the others at their sigmas about zero and this one without what holds it."""
+    """By some segments (S,), the others at their sigmas about zero and this one without what holds it."""
     limit = OPEN_SIGMAS[told.parameters[index].name]
     unit = sigmas.copy()
     unit[index] = limit

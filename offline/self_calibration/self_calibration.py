@@ -16,7 +16,7 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
-from groundsbot.offline.measurements import Run, chains_of, without_unconfirmed_tracks
+from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import efforts_of
 from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.left_open import by_robot
@@ -61,7 +61,7 @@ class Freed(NamedTuple):
 def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool) -> Freed:
     """Frees what the drives can tell and robot.yaml has wrong.
 
-    Each robot is first estimated as if nobody had measured it; what stretches of its drives tell is then a quadratic
+    Each robot is first estimated as if nobody had measured it; what segments of its drives tell is then a quadratic
     form about these values, and of that the numbers of robot.yaml are asked one by one (`selection`). Robots whose file
     leaves them open have their say in the map as they are.
 
@@ -75,11 +75,11 @@ def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collecti
     if not started:
         return Freed(list(runs), (), {}, {})
     opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
-    chains = [without_unconfirmed_tracks(chain) for run in opened_runs for chain in chains_of(run, noise)]
-    efforts = efforts_of(chains, TIMES_MAPPED)
+    segments = [without_unconfirmed_tracks(segment) for run in opened_runs for segment in segments_of(run, noise)]
+    efforts = efforts_of(segments, TIMES_MAPPED)
     maps = [
-        solve_local_map(chain, effort, noise_is_open=True).without_factors()
-        for chain, effort in zip(chains, efforts, strict=True)
+        solve_local_map(segment, effort, noise_is_open=True).without_factors()
+        for segment, effort in zip(segments, efforts, strict=True)
     ]
     told = information_of(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
     starts = {owned: each for _, learnt in started for owned, each in learnt.items()}

@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import ShownNoise, first_solution, noise_of_windows
-from groundsbot.offline.measurements import Run, chains_of, coarse_keyframes, coarsen, without_unconfirmed_tracks
+from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
@@ -71,17 +71,17 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Show
     Args:
         runs: of one robot.
         noise: where the noise begins.
-        shown: by chain, what windows show of it; what is missing is added.
+        shown: by segment, what windows show of it; what is missing is added.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:
-        for chain in chains_of(run, noise):
-            if chain.tags and len(chain.stamps_ns) > 1:
-                likely = without_unconfirmed_tracks(chain)
+        for segment in segments_of(run, noise):
+            if segment.tags and len(segment.stamps_ns) > 1:
+                likely = without_unconfirmed_tracks(segment)
                 coarse = coarsen(likely, coarse_keyframes(likely))
-                if chain.name not in shown:
-                    shown[chain.name] = noise_of_windows(coarse)
-                solved.append(first_solution(coarse, shown[chain.name]))
+                if segment.name not in shown:
+                    shown[segment.name] = noise_of_windows(coarse)
+                solved.append(first_solution(coarse, shown[segment.name]))
     found: dict[str, Learnt] = {}
     for name in _SMALL:
         values, informations = [], []

@@ -212,7 +212,7 @@ def _spread(passes: Passes, found: _Estimate) -> tuple[float, float]:
 
     By the jackknife: by how much the estimate moves when a block of passes is left out, to first order (CR3 of Bell and
     McCaffrey 2002, Bias reduction in standard errors for linear regression with multi-stage samples). A block is a
-    stretch of the drives, and all blocks tell about as much of the offset. Infinite where there are too few of them.
+    segment of the drives, and all blocks tell about as much of the offset. Infinite where there are too few of them.
     """
     model = linearise(passes, found.parameters, found.tags_m)
     weights, curvature = _weights(passes, model.residual, found.scale)

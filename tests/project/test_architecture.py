@@ -108,7 +108,7 @@ def test_no_folder_is_crowded() -> None:
         ("offline/attic.py", "", "rooms of offline"),
         (
             "offline/measurements/run.py",
-            "from groundsbot.offline.measurements.chain import Chain",
+            "from groundsbot.offline.measurements.segment import Segment",
             "inside measurements",
         ),
         ("offline/sam/graph.py", "from groundsbot import build_map", "used by their public names"),

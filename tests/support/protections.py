@@ -278,8 +278,8 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "29",
-        "a new epoch is a new stretch of the map",
-        "offline/measurements/motion_model/stretches.py",
+        "a new epoch is a new segment of the map",
+        "offline/measurements/motion_model/segments.py",
         "cuts = np.flatnonzero(np.diff(table[:, 1])) + 1",
         "cuts = np.flatnonzero(np.diff(table[:, 1]))[:0]",
         test="mid_run",

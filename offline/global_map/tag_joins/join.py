@@ -139,7 +139,7 @@ class _Joiner:
         return bool(back)
 
     def _try(self, a: SolvedComponent, b: SolvedComponent) -> _Try | None:
-        a, b = sorted((a, b), key=lambda each: min(chain.name for chain in each.graph.chains))
+        a, b = sorted((a, b), key=lambda each: min(segment.name for segment in each.graph.segments))
         key = _key(a, b)
         if key in self.refused or any(frozenset((m, n)) in self._decided for m in key[0] for n in key[1]):
             return None
@@ -156,8 +156,8 @@ class _Joiner:
         found = verdict(self._maps, a, b, tags)
         if found is None:
             return None
-        seen = [next(i for i, chain in enumerate(each.graph.chains) if tags[0] in chain.tags) for each in (a, b)]
-        names = [each.graph.chains[i].name for each, i in zip((a, b), seen, strict=True)]
+        seen = [next(i for i, segment in enumerate(each.graph.segments) if tags[0] in segment.tags) for each in (a, b)]
+        names = [each.graph.segments[i].name for each, i in zip((a, b), seen, strict=True)]
         starts = [_poses(each)[each.graph.first_pose[i]] for each, i in zip((a, b), seen, strict=True)]
         T_a_b, *rivals = (
             se2.compose(se2.between(starts[0], fit.T_a_b), starts[1]) for fit in (found.best, *found.rivals)
@@ -173,7 +173,10 @@ class _Joiner:
         for each, T in placed:
             own = se2.compose(T, _poses(each))
             for i, m in enumerate(each.members.members):
-                poses[m] = each.graph.chains[i], own[each.graph.first_pose[i] :][: len(each.graph.chains[i].stamps_ns)]
+                poses[m] = (
+                    each.graph.segments[i],
+                    own[each.graph.first_pose[i] :][: len(each.graph.segments[i].stamps_ns)],
+                )
         members = tuple(sorted(poses))
         graph = with_measurements(build_graph([poses[m][0] for m in members]), self._measurements)
         tags, calibration = dict[TagKey, FloatArray](), dict[Parameter, float]()
@@ -190,7 +193,7 @@ class _Joiner:
 
 
 def _with_heading_priors(graph: Graph, start: State) -> Graph:
-    """The graph with the headings of all chains held softly where they start."""
+    """The graph with the headings of all segments held softly where they start."""
     poses = graph.first_pose[1:]
     measured = graph.problem.measured
     softly = np.tile(np.diag([0.0, 0.0, 1.0 / _HELD_RAD]), (len(poses), 1, 1))

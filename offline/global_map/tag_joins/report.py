@@ -56,7 +56,7 @@ def _result(components: Sequence[SolvedComponent], join: TagJoin) -> AlignmentRe
 def _in_map(components: Sequence[SolvedComponent], join: TagJoin) -> tuple[FloatArray, FloatArray | None]:
     """T_a_b (3,) of two starts as the map has it, and its covariance (3, 3) as x, y, theta in a's frame."""
     for graph, refined in ((each.graph, each.refined) for each in components):
-        names = [chain.name for chain in graph.chains]
+        names = [segment.name for segment in graph.segments]
         if refined is None or not {join.a, join.b} <= {*names}:
             continue
         a, b = (int(graph.first_pose[names.index(name)]) for name in (join.a, join.b))

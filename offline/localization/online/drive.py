@@ -1,4 +1,4 @@
-"""What a robot has driven and read since it was put down: as factors for a sweep, and as a chain for a solve."""
+"""What a robot has driven and read since it was put down: as factors for a sweep, and as a segment for a solve."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
 from groundsbot.offline.local_map import run_without_log, segment_from_arrays
 from groundsbot.offline.localization.online.kernels import Motions, Sights
-from groundsbot.offline.measurements import Chain, TagKey
+from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam import (
     NO_PARAMETER,
     Parameter,
@@ -150,7 +150,7 @@ class Drive:
         table = self._readings
         return Sights(table["keyframe"][begin:end] - keyframe, *(table[name][begin:end] for name in Sights._fields[1:]))
 
-    def chain(self, tags: Mapping[TagKey, int]) -> Chain:
+    def segment(self, tags: Mapping[TagKey, int]) -> Segment:
         """All of it, as from a log; the tags by their indices."""
         ordered = tuple(sorted(tags))
         place = np.empty(len(tags), dtype=np.int64)

@@ -104,7 +104,7 @@ class OnlineLocalizer:
         return tuple(sorted(each[0] for each in instances if len(each) == 1))
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> OnlinePose | None:
-        """A motion by the wheels, as of `ChainOdometry`.
+        """A motion by the wheels, as of `SegmentOdometry`.
 
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.

@@ -2,7 +2,7 @@
 
 A square root information matrix, lower triangular in the order in which tags were seen: each tag of the map comes in
 where the map foretells it from the calibration and those of its tags that hold the robot already, with what is left of
-the map's covariance. So the map's joint covariance enters as a chain of conditionals, two rows for each tag, and tags
+the map's covariance. So the map's joint covariance enters as a segment of conditionals, two rows for each tag, and tags
 not yet seen cost nothing. Of other tags nothing is known beforehand: their rows are empty.
 """
 

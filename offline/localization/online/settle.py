@@ -28,7 +28,7 @@ def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: KnownM
     """
     if not tags.keys() & known.instances.keys():
         return None
-    return locate(solve_local_map(smoother.drive.chain(tags)), known, _COMPONENT)
+    return locate(solve_local_map(smoother.drive.segment(tags)), known, _COMPONENT)
 
 
 def solve_again(
@@ -69,11 +69,11 @@ def solve_again(
 
 def _local_map(smoother: Smoother, tags: Mapping[TagKey, int], parameters: Sequence[Parameter]) -> LocalMap:
     """In the frame of its start."""
-    chain = smoother.drive.chain(tags)
-    graph = build_graph([chain])
+    segment = smoother.drive.segment(tags)
+    graph = build_graph([segment])
     T_start_map = se2.inverse(smoother.drive.poses[0])
     places = dict(zip(tags, se2.apply(T_start_map, smoother.places_m), strict=True))
     numbers = dict(zip(parameters, smoother.calibration.tolist(), strict=True))
     begun = graph.start(se2.compose(T_start_map, smoother.drive.poses), places, numbers)
     unsolved = Solution(begun, (graph.problem.cost(begun),), "as smoothed", converged=False, problem=graph.problem)
-    return LocalMap(chain, graph, unsolved, _UNJUDGED)
+    return LocalMap(segment, graph, unsolved, _UNJUDGED)

@@ -1,7 +1,7 @@
 """Wheel readings between keyframes -> one motion, its covariance and its dependence on the wheel calibration.
 
 No reading is thinned out: exact arcs from reading to reading, composed, with the noise of each carried to the
-keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the chain's first wheel reading.
+keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the segment's first wheel reading.
 """
 
 from dataclasses import dataclass, replace
@@ -35,8 +35,8 @@ _SMALLEST_QUANTUM_M: Final = 1e-4
 
 
 @dataclass(frozen=True)
-class WheelTrack:
-    """Wheel readings of one stretch: unbroken cumulative distances.
+class WheelSegment:
+    """Wheel readings of one segment: unbroken cumulative distances.
 
     Attributes:
         stamps_ns: (N,) strictly increasing.
@@ -73,7 +73,7 @@ class WheelTrack:
 
 
 @dataclass(frozen=True)
-class ChainOdometry:
+class SegmentOdometry:
     """Motion from each of K keyframes to the next.
 
     Attributes:
@@ -94,10 +94,10 @@ class ChainOdometry:
         """Number of steps."""
         return len(self.motion)
 
-    def part(self, first: int, end: int) -> "ChainOdometry":
+    def part(self, first: int, end: int) -> "SegmentOdometry":
         """Steps first to end - 1 only."""
         steps = slice(first, end)
-        return ChainOdometry(
+        return SegmentOdometry(
             self.motion[steps],
             self.covariance[steps],
             self.parts.where(steps),
@@ -105,7 +105,7 @@ class ChainOdometry:
             self.distance_m[steps],
         )
 
-    def with_noise(self, noise: NoiseParameters) -> "ChainOdometry":
+    def with_noise(self, noise: NoiseParameters) -> "SegmentOdometry":
         """The same motions under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
@@ -118,23 +118,25 @@ class ChainOdometry:
 
 
 def compose_odometry(
-    track: WheelTrack, keyframe_stamps_ns: IntArray, track_m: float, noise: NoiseParameters
-) -> ChainOdometry:
+    wheel_segment: WheelSegment, keyframe_stamps_ns: IntArray, track_m: float, noise: NoiseParameters
+) -> SegmentOdometry:
     """Composes all wheel readings between keyframes.
 
     Args:
-        track: the stretch's readings.
-        keyframe_stamps_ns: (K,) strictly increasing, within the stretch.
+        wheel_segment: its readings.
+        keyframe_stamps_ns: (K,) strictly increasing, within the segment.
         track_m: nominal distance between the wheels.
         noise: what is added per metre and per radian.
     """
     if len(keyframe_stamps_ns) < 2:
         none = np.zeros((0, 3, 3))
         parts = CovarianceParts(ODOMETRY_NOISE, np.zeros((len(ODOMETRY_NOISE), 0, 3, 3)), none)
-        return ChainOdometry(np.zeros((0, 3)), none, parts, none, np.zeros(0))
-    inner = track.stamps_ns[(track.stamps_ns >= keyframe_stamps_ns[0]) & (track.stamps_ns <= keyframe_stamps_ns[-1])]
+        return SegmentOdometry(np.zeros((0, 3)), none, parts, none, np.zeros(0))
+    inner = wheel_segment.stamps_ns[
+        (wheel_segment.stamps_ns >= keyframe_stamps_ns[0]) & (wheel_segment.stamps_ns <= keyframe_stamps_ns[-1])
+    ]
     grid_ns = np.union1d(inner, keyframe_stamps_ns)
-    left_m, right_m = track.at(grid_ns)
+    left_m, right_m = wheel_segment.at(grid_ns)
     left_m, right_m = np.diff(left_m), np.diff(right_m)
     pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
     poses = chain_motions(pieces, np.zeros(3))
@@ -145,11 +147,11 @@ def compose_odometry(
     to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
 
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
-    while_of_piece = _whiles(step_of_piece, 0.5 * (np.abs(left_m) + np.abs(right_m)), track.quantum_m)
+    while_of_piece = _whiles(step_of_piece, 0.5 * (np.abs(left_m) + np.abs(right_m)), wheel_segment.quantum_m)
     net_forward_m = _net(0.5 * (left_m + right_m), duration_s, while_of_piece)
     net_turn_rad = np.abs(_net(right_m - left_m, duration_s, while_of_piece)) / track_m
     unit, in_gap = _piece_covariances(net_forward_m, net_turn_rad, duration_s)
-    known = _logged_covariances(track, grid_ns)
+    known = _logged_covariances(wheel_segment, grid_ns)
     is_given = np.isfinite(known).all((-1, -2))
     unit[:, is_given] = 0.0
     known[~is_given] = 0.0
@@ -157,11 +159,11 @@ def compose_odometry(
         ODOMETRY_NOISE,
         np.stack([_sum_by_step(_carry(to_step_end, each), ends) for each in unit]),
         _sum_by_step(_carry(to_step_end, in_gap + known), ends)
-        + np.diag(_quantisation_variance(track.quantum_m, track_m)),
+        + np.diag(_quantisation_variance(wheel_segment.quantum_m, track_m)),
     )
     tangent = se2.right_tangent_from_coordinates(pieces)
     jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
-    return ChainOdometry(
+    return SegmentOdometry(
         motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
         covariance=parts.under(noise),
         parts=parts,
@@ -175,13 +177,13 @@ def _carry(to_step_end: FloatArray, covariance: FloatArray) -> FloatArray:
     return carried
 
 
-def _logged_covariances(track: WheelTrack, grid_ns: IntArray) -> FloatArray:
+def _logged_covariances(wheel_segment: WheelSegment, grid_ns: IntArray) -> FloatArray:
     """(N, 3, 3) covariances of pieces as the readings have them, shared out by duration; NaN where they have none."""
-    if track.covariance is None:
+    if wheel_segment.covariance is None:
         return np.full((len(grid_ns) - 1, 3, 3), np.nan)
-    reading = np.searchsorted(track.stamps_ns, grid_ns[1:])
-    share = np.diff(grid_ns) / (track.stamps_ns[reading] - track.stamps_ns[reading - 1])
-    return np.asarray(share[:, None, None] * track.covariance[reading])
+    reading = np.searchsorted(wheel_segment.stamps_ns, grid_ns[1:])
+    share = np.diff(grid_ns) / (wheel_segment.stamps_ns[reading] - wheel_segment.stamps_ns[reading - 1])
+    return np.asarray(share[:, None, None] * wheel_segment.covariance[reading])
 
 
 def _whiles(step_of_piece: IntArray, rolled_m: FloatArray, quantum_m: float) -> IntArray:

@@ -1,4 +1,4 @@
-"""Tag readings in metres, each with its covariance: what a chain is solved from.
+"""Tag readings in metres, each with its covariance: what a segment is solved from.
 
 A reading is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
 """

@@ -56,7 +56,7 @@ def read_detections(
 
     Args:
         run: whose camera and tag sizes apply.
-        detections: (M,) of one stretch.
+        detections: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
         twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
         noise: for the corners' sigma.
@@ -171,7 +171,7 @@ def read_positions(
 
     Args:
         robot: whose sensor it is: its mount, and by how much it reads ranges too long.
-        positions: (M,) of one stretch.
+        positions: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
         twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
         noise: for the sigmas of range and bearing.

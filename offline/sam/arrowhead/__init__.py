@@ -1,4 +1,4 @@
-"""The normal equations as an arrowhead: chains eliminated one by one, met in tags and calibration.
+"""The normal equations as an arrowhead: segments eliminated one by one, met in tags and calibration.
 
 Ordering (`dissection`, `tree`), elimination, substitution, and exact covariances from the factor (`covariance`,
 `marginals`).

@@ -39,7 +39,7 @@ class Pieces(NamedTuple):
 
 def pieces_of(tree: Tree, system: System, rows: Rows) -> Pieces:
     """Of a factorisation."""
-    n_slots = np.diff(tree.slot_start)[tree.chain]
+    n_slots = np.diff(tree.slot_start)[tree.segment]
     return Pieces(
         tree.level, tree.first, tree.end, tree.right, tree.front_start, tree.front, tree.calibration_at, n_slots,
         tree.n_eliminated, tree.rows_start, tree.reading_start, tree.reading_at,
@@ -180,7 +180,7 @@ def _add_coupling(pieces: Pieces, leaf: int, inside: FloatArray, outside: FloatA
     """
     first, end, n_left = pieces.first[leaf], pieces.end[leaf], pieces.calibration_at[leaf]
     if first == end:
-        return  # a chain of one pose, which the top eliminates
+        return  # a segment of one pose, which the top eliminates
     right = pieces.front_start[leaf + 1] - pieces.front_start[leaf] - 3
     for i in range(3):
         for j in range(3):

@@ -28,43 +28,43 @@ def build_arrowhead(
 ) -> Arrowhead:
     """Sorts factors by pose and settles the order of elimination.
 
-    Poses that odometry joins to the next one form a chain.
+    Poses that odometry joins to the next one form a segment.
     """
     n_poses, n_tags = len(columns.poses), len(columns.tags)
-    starts_chain = np.ones(n_poses + 1, dtype=np.bool_)
-    starts_chain[odometry.first + 1] = False
-    chain_start = np.flatnonzero(starts_chain)
-    chain_of = np.cumsum(starts_chain[:-1]) - 1
+    starts_segment = np.ones(n_poses + 1, dtype=np.bool_)
+    starts_segment[odometry.first + 1] = False
+    segment_start = np.flatnonzero(starts_segment)
+    segment_of = np.cumsum(starts_segment[:-1]) - 1
     is_free = columns.calibration >= 0
     free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
     by_pose = _sorted_readings(readings)
     motions = compiled_motions(odometry, np.argsort(odometry.first, kind="stable"))
     first, parameters = motions.first, motions.parameters
-    uses = np.zeros((len(chain_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
-    for chain, used in ((chain_of[first], parameters), (chain_of[by_pose.pose], by_pose.parameters)):
-        uses[chain[:, None], free_calibration[used]] = True
+    uses = np.zeros((len(segment_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
+    for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
+        uses[segment[:, None], free_calibration[used]] = True
     uses[:, -1] = False  # where held
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
-    chains_in_top, tags_in_top = ends_in_top(measured, chain_start)
+    segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     tree = build_tree(
         Couplings(
-            chain_start=chain_start,
+            segment_start=segment_start,
             reading_pose=by_pose.pose,
             reading_tag=by_pose.tag,
             slot_start=slot_start,
             slots=np.nonzero(uses)[1],
             n_tags=n_tags,
             n_free=int(is_free.sum()),
-            top_chains=chains_in_top,
+            top_segments=segments_in_top,
             top_tags=tags_in_top,
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
     return Arrowhead(
         tree=tree,
-        odometry=motions._replace(slots=slot[chain_of[first][:, None], free_calibration[parameters]]),
-        readings=by_pose._replace(slots=slot[chain_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
+        odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
+        readings=by_pose._replace(slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
         prior_sigma=prior.sigma,
         free=free,
         tangent=_tangent_order(columns),
@@ -100,18 +100,18 @@ def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFa
 
 
 def build_skeleton(whole: Arrowhead) -> Skeleton:
-    """Keeps the poses that read something, those that are held in part, and the first of each chain."""
+    """Keeps the poses that read something, those that are held in part, and the first of each segment."""
     tree, odometry, readings = whole.tree, whole.odometry, whole.readings
     is_kept = np.diff(tree.reading_start) > 0
     is_kept[whole.free.held_poses] = True
-    is_kept[tree.chain_start[:-1]] = True
+    is_kept[tree.segment_start[:-1]] = True
     if whole.measured is not None:
         is_kept[whole.measured.factors.starts.pose] = True
     index = np.where(is_kept, np.cumsum(is_kept) - 1, -1)
-    chain_start = np.concatenate([index[tree.chain_start[:-1]], [int(is_kept.sum())]])
+    segment_start = np.concatenate([index[tree.segment_start[:-1]], [int(is_kept.sum())]])
     n = int(is_kept.sum())
-    # From each kept pose to the next, but for the last of a chain; the parameters are those of its motions.
-    first = np.delete(np.arange(n), chain_start[1:] - 1)
+    # From each kept pose to the next, but for the last of a segment; the parameters are those of its motions.
+    first = np.delete(np.arange(n), segment_start[1:] - 1)
     begins = np.searchsorted(odometry.first, np.flatnonzero(is_kept)[first])
     composed = Odometry(
         first=first,
@@ -125,17 +125,17 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     compose(odometry, index, composed)
     places = _as_places(readings)._replace(pose=index[readings.pose])
     measured = NOTHING_MEASURED if whole.measured is None else whole.measured.factors.among(index)
-    chains_in_top, tags_in_top = ends_in_top(measured, chain_start)
+    segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     own_tree = build_tree(
         Couplings(
-            chain_start=chain_start,
+            segment_start=segment_start,
             reading_pose=places.pose,
             reading_tag=places.tag,
             slot_start=tree.slot_start,
             slots=tree.slots,
             n_tags=tree.n_tags,
             n_free=tree.n_calibration,
-            top_chains=chains_in_top,
+            top_segments=segments_in_top,
             top_tags=tags_in_top,
         )
     )

@@ -1,4 +1,4 @@
-"""Cuts chains into nested pieces; see `arrowhead.tree`."""
+"""Cuts segments into nested pieces; see `arrowhead.tree`."""
 
 from typing import Final, NamedTuple
 
@@ -17,13 +17,13 @@ class Pieces(NamedTuple):
     """The tree before tags.
 
     Attributes:
-        level, parent, chain, first, end, left, right: (N,) as in `arrowhead.tree.Tree`.
+        level, parent, segment, first, end, left, right: (N,) as in `arrowhead.tree.Tree`.
         pose_level: (P,) at which each pose is eliminated.
     """
 
     level: IntArray
     parent: IntArray
-    chain: IntArray
+    segment: IntArray
     first: IntArray
     end: IntArray
     left: IntArray
@@ -31,25 +31,25 @@ class Pieces(NamedTuple):
     pose_level: IntArray
 
 
-def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
-    """Cuts each chain evenly into leaves, and joins these; the first poses of some chains become separators too."""
-    n_poses = int(chain_start[-1])
+def cut(segment_start: IntArray, top_segments: IntArray) -> Pieces:
+    """Cuts each segment evenly into leaves, and joins these; the first poses of some segments become separators too."""
+    n_poses = int(segment_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
-    in_top = set(top_chains.tolist())
-    rows = []  # level, chain, cut on the left, cut on the right
-    for chain, (first, end) in enumerate(zip(chain_start[:-1].tolist(), chain_start[1:].tolist(), strict=True)):
-        # A cut is a pose, a separator; those at the chain's ends lie outside of it, or the first one is the top's.
-        is_top = chain in in_top
+    in_top = set(top_segments.tolist())
+    rows = []  # level, segment, cut on the left, cut on the right
+    for segment, (first, end) in enumerate(zip(segment_start[:-1].tolist(), segment_start[1:].tolist(), strict=True)):
+        # A cut is a pose, a separator; those at the segment's ends lie outside of it, or the first one is the top's.
+        is_top = segment in in_top
         pose_level[first : first + is_top] = LEVELS - 1
         cuts = _thin(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
         for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):
             pose_level[cuts[1:-1]] = level + 1
             n = len(cuts) - 1
-            rows.append(np.stack([np.full(n, level), np.full(n, chain), cuts[:-1], cuts[1:]]))
+            rows.append(np.stack([np.full(n, level), np.full(n, segment), cuts[:-1], cuts[1:]]))
             cuts = _thin(cuts, n_joined)
-    level, chain_of, left, right = np.concatenate(rows, axis=1)
+    level, segment_of, left, right = np.concatenate(rows, axis=1)
     order = np.lexsort([level, right])
-    level, chain_of, left, right = level[order], chain_of[order], left[order], right[order]
+    level, segment_of, left, right = level[order], segment_of[order], left[order], right[order]
     top = len(level)
     parent = np.full(top, top)
     for lower in range(LEVELS - 2):
@@ -59,11 +59,11 @@ def cut(chain_start: IntArray, top_chains: IntArray) -> Pieces:
     return Pieces(
         level=np.append(level, LEVELS - 1),
         parent=np.append(parent, top),
-        chain=np.append(chain_of, -1),
+        segment=np.append(segment_of, -1),
         first=np.append(left + 1, 0),
         end=np.append(right, n_poses),
-        left=np.append(np.where(left < chain_start[chain_of], -1, left), -1),
-        right=np.append(np.where(right == chain_start[chain_of + 1], -1, right), -1),
+        left=np.append(np.where(left < segment_start[segment_of], -1, left), -1),
+        right=np.append(np.where(right == segment_start[segment_of + 1], -1, right), -1),
         pose_level=pose_level,
     )
 

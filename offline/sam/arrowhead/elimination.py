@@ -70,9 +70,9 @@ def _add_separators(tree: Tree, system: System, damping: float, node: int, front
             for i in range(3):
                 for j in range(2):
                     front[row + i, tree.reading_at[m] + j] += system.pose_tag[m, i, j]
-        chain = tree.separator_chain[k]
-        for a in range(tree.slot_start[chain], tree.slot_start[chain + 1]):
-            slot = a - tree.slot_start[chain]
+        segment = tree.separator_segment[k]
+        for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
+            slot = a - tree.slot_start[segment]
             at = tree.calibration_at[node] + (tree.slots[a] if is_top else slot)
             for i in range(3):
                 front[row + i, at] += system.pose_calibration[pose, i, slot]
@@ -90,7 +90,7 @@ def _add_tags(tree: Tree, system: System, damping: float, node: int, front: Floa
         front[row, row + 1] += system.tag[tag, 0, 1]
         front[row + 1, row + 1] += (1.0 + damping) * system.tag[tag, 1, 1]
         for a in range(n_calibration):
-            column = a if is_top else tree.slots[tree.slot_start[tree.chain[node]] + a]
+            column = a if is_top else tree.slots[tree.slot_start[tree.segment[node]] + a]
             for i in range(2):
                 front[row + i, tree.calibration_at[node] + a] += system.tag_calibration[tag, i, column]
         row += 2

@@ -1,9 +1,9 @@
-"""Starting values from one pass in order of time over all chains, like a filter that keeps no cross terms.
+"""Starting values from one pass in order of time over all segments, like a filter that keeps no cross terms.
 
-Each chain carries its newest pose with a 3 x 3 covariance, each tag a place with a 2 x 2 one, both of all that drifted
-since the frame. Errors of pose and tag are correlated in ways that nobody books. So whichever is known clearly better
-teaches the other, and near equals teach each other nothing: a tag that the pose itself has just placed leaves its
-covariance honest, an older one pulls the pose back. What comes out is not the optimum, but a long drive comes out
+Each segment carries its newest pose with a 3 x 3 covariance, each tag a place with a 2 x 2 one, both of all that
+drifted since the frame. Errors of pose and tag are correlated in ways that nobody books. So whichever is known clearly
+better teaches the other, and near equals teach each other nothing: a tag that the pose itself has just placed leaves
+its covariance honest, an older one pulls the pose back. What comes out is not the optimum, but a long drive comes out
 unbent.
 
 All errors are in map axes: there a motion carries the position over unturned, and a tag's covariance stays as it is.
@@ -23,7 +23,7 @@ from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_corre
 _GATE: Final = 6.0
 # How many times the other's variance is clearly worse.
 _CLEARLY: Final = 2.0
-# So many poses of a chain are taken at a time, for the sake of the processor's cache.
+# So many poses of a segment are taken at a time, for the sake of the processor's cache.
 _BLOCK: Final = 16
 
 _Covariance = tuple[float, float, float]  # xx, xy, yy
@@ -33,8 +33,8 @@ class _Filter(NamedTuple):
     """What the pass knows besides the values.
 
     Attributes:
-        pose: (number of chains, 6) covariance of the newest pose: xx, xy, yy, x heading, y heading, heading.
-        turn: (number of chains, 2) cosine and sine of its heading.
+        pose: (number of segments, 6) covariance of the newest pose: xx, xy, yy, x heading, y heading, heading.
+        turn: (number of segments, 2) cosine and sine of its heading.
         tag: (T, 3) covariance xx, xy, yy; known: (T,) whether it has been placed.
     """
 
@@ -47,20 +47,20 @@ class _Filter(NamedTuple):
 def starting_pass(
     tree: Tree, odometry: Odometry, readings: Readings, start: Values, start_variance: FloatArray, out: Values
 ) -> None:
-    """Runs all chains side by side, some poses of each at a time.
+    """Runs all segments side by side, some poses of each at a time.
 
     Args:
-        tree: the chains and who reads what.
+        tree: the segments and who reads what.
         odometry: the motions; calibration is taken from `start`.
         readings: of tags, as places.
-        start: its poses count at the start of each chain only.
-        start_variance: (number of chains, 3) of each start's right tangent.
+        start: its poses count at the start of each segment only.
+        start_variance: (number of segments, 3) of each start's right tangent.
         out: takes the result.
     """
-    n_chains = len(tree.chain_start) - 1
+    n_segments = len(tree.segment_start) - 1
     known = _Filter(
-        pose=np.zeros((n_chains, 6)),
-        turn=np.empty((n_chains, 2)),
+        pose=np.zeros((n_segments, 6)),
+        turn=np.empty((n_segments, 2)),
         tag=np.zeros((tree.n_tags, 3)),
         known=np.zeros(tree.n_tags, dtype=np.bool_),
     )
@@ -81,21 +81,21 @@ def _run(
 ) -> None:
     tree, odometry, readings = borrowed(tree), borrowed(odometry), borrowed(readings)
     start, known, out = borrowed(start), borrowed(known), borrowed(out)
-    n_chains = len(tree.chain_start) - 1
+    n_segments = len(tree.segment_start) - 1
     longest = 0
-    for chain in range(n_chains):
-        longest = max(longest, tree.chain_start[chain + 1] - tree.chain_start[chain])
+    for segment in range(n_segments):
+        longest = max(longest, tree.segment_start[segment + 1] - tree.segment_start[segment])
     for block in range(0, longest, _BLOCK):
-        for chain in range(n_chains):
-            first, end = tree.chain_start[chain], tree.chain_start[chain + 1]
+        for segment in range(n_segments):
+            first, end = tree.segment_start[segment], tree.segment_start[segment + 1]
             for pose in range(first + block, min(first + block + _BLOCK, end)):
-                P, turn = known.pose[chain], known.turn[chain]
+                P, turn = known.pose[segment], known.turn[segment]
                 if pose == first:
                     for i in range(3):
                         out.poses[pose, i] = start.poses[pose, i]
-                    _begin(start_variance[chain], start.poses[pose, 2], P, turn)
+                    _begin(start_variance[segment], start.poses[pose, 2], P, turn)
                 else:
-                    m = pose - 1 - chain  # one motion less than poses in each chain
+                    m = pose - 1 - segment  # one motion less than poses in each segment
                     _predict(odometry, m, start.calibration, out.poses[pose - 1], out.poses[pose], P, turn)
                 for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
                     _read(readings, m, out.calibration, out.poses[pose], P, turn, out.tags[readings.tag[m]], known)

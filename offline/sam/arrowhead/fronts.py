@@ -49,8 +49,8 @@ def fronts_of(
             n_eliminated[node] = at - start[node]
             at = _add_pose(pieces.left[node], front, at, is_filling)
             calibration_at[node] = at - start[node]
-            if pieces.chain[node] >= 0:
-                at = _add_columns(slots, pieces.chain[node], first_free, 1, front, at, is_filling)
+            if pieces.segment[node] >= 0:
+                at = _add_columns(slots, pieces.segment[node], first_free, 1, front, at, is_filling)
             else:
                 n_eliminated[node] += n_free
                 for a in range(n_free):
@@ -78,7 +78,7 @@ def _add_columns(lists: Lists, member: int, base: int, width: int, front: IntArr
 
 @inner
 def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
-    """The columns of a separator at an end, unless it is a chain's end."""
+    """The columns of a separator at an end, unless it is a segment's end."""
     if pose < 0:
         return at
     if is_filling:

@@ -1,4 +1,4 @@
-"""Compiled elimination of a leaf, the poses of a chain between two separators: see `arrowhead.elimination`."""
+"""Compiled elimination of a leaf, the poses of a segment between two separators: see `arrowhead.elimination`."""
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import inner

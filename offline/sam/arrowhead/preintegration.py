@@ -1,4 +1,4 @@
-"""The skeleton of the chains: the poses that read tags, with the motions between them composed.
+"""The skeleton of the segments: the poses that read tags, with the motions between them composed.
 
 Where keyframes are dense, most of them read nothing. What the tags say about the shape of a drive is settled among
 those that do; how a composed motion's error divides among its parts, their covariances say. Compare the pre-integrated
@@ -43,7 +43,7 @@ def compose(odometry: Odometry, index: IntArray, out: Odometry) -> None:
 
     Args:
         odometry: of all poses.
-        index: (P,) of each pose in the skeleton, -1 where it is not kept; the first of a chain is.
+        index: (P,) of each pose in the skeleton, -1 where it is not kept; the first of a segment is.
         out: its motion, covariance, information and jacobian are set.
     """
     odometry, index, out = borrowed(odometry), borrowed(index), borrowed(out)

@@ -122,8 +122,8 @@ def prior_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | 
     return MeasuredBlocks(factors, columns, ends, place[ends], place[columns.tags[factors.known.tags].reshape(-1)])
 
 
-def ends_in_top(factors: Measured, chain_start: IntArray) -> tuple[IntArray, IntArray]:
-    """Chains at whose first pose a distance ends, and tags at which one does or that a map holds.
+def ends_in_top(factors: Measured, segment_start: IntArray) -> tuple[IntArray, IntArray]:
+    """Segments at whose first pose a distance ends, and tags at which one does or that a map holds.
 
     Raises:
         ValueError: one ends at another pose.
@@ -132,9 +132,9 @@ def ends_in_top(factors: Measured, chain_start: IntArray) -> tuple[IntArray, Int
         return _NONE, factors.tags
     ends = np.concatenate([factors.distances.pose_a, factors.distances.pose_b])
     poses = np.unique(ends[ends >= 0])
-    if not np.isin(poses, chain_start[:-1]).all():
-        raise ValueError("a distance can be measured from the first pose of a chain, and from no other")
-    return np.searchsorted(chain_start, poses), factors.tags
+    if not np.isin(poses, segment_start[:-1]).all():
+        raise ValueError("a distance can be measured from the first pose of a segment, and from no other")
+    return np.searchsorted(segment_start, poses), factors.tags
 
 
 def _ends(distances: DistanceFactors, columns: Columns) -> IntArray:

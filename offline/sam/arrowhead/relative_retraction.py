@@ -1,8 +1,8 @@
-"""A step taken motion by motion along each chain, instead of pose by pose.
+"""A step taken motion by motion along each segment, instead of pose by pose.
 
 Poses that move on their own arcs keep the motion between neighbours to first order only. Odometry knows it to a
-millimetre, so where a stretch of a hundred metres bends by a metre, what is left of second order outweighs everything
-and only tiny steps would go down. Here each motion takes its own part of the step and the chain is laid out anew from
+millimetre, so where a segment of a hundred metres bends by a metre, what is left of second order outweighs everything
+and only tiny steps would go down. Here each motion takes its own part of the step and the segment is laid out anew from
 its start: odometry then follows its linear model all but exactly, and what is left shows where a tag is seen again.
 """
 
@@ -15,23 +15,23 @@ from groundsbot.offline.sam.linearisation.kernels import Values
 
 @njit
 def retract_relative(
-    values: Values, step: FloatArray, anchor: IntArray, chain_start: IntArray, moved: Values, out: Values
+    values: Values, step: FloatArray, anchor: IntArray, segment_start: IntArray, moved: Values, out: Values
 ) -> None:
-    """Lays the chains out anew.
+    """Lays the segments out anew.
 
     Args:
         values: before the step.
         step: (3 P + 2 T + C,) in the arrowhead's order.
         anchor: (T,) poses that the tags go along with.
-        chain_start: (number of chains + 1,)
+        segment_start: (number of segments + 1,)
         moved: the same step pose by pose; tags keep their place about their anchors.
         out: takes poses and tags.
     """
-    for chain in range(len(chain_start) - 1):
-        first = chain_start[chain]
+    for segment in range(len(segment_start) - 1):
+        first = segment_start[segment]
         for i in range(3):
             out.poses[first, i] = moved.poses[first, i]
-        for pose in range(first, chain_start[chain + 1] - 1):
+        for pose in range(first, segment_start[segment + 1] - 1):
             _roll_on(values.poses[pose], values.poses[pose + 1], step[3 * pose : 3 * pose + 6], out.poses, pose)
     for tag in range(len(moved.tags)):
         before, after = moved.poses[anchor[tag]], out.poses[anchor[tag]]

@@ -111,7 +111,7 @@ def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, out
     n_left = tree.calibration_at[leaf]
     size = tree.front_start[leaf + 1] - tree.front_start[leaf]
     if first == end:
-        return  # a chain of one pose, which the top eliminates
+        return  # a segment of one pose, which the top eliminates
     for i in range(3):
         for j in range(3):
             if n_left:
@@ -160,9 +160,9 @@ def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
     y = np.zeros(len(x))
     first_tag = 3 * tree.n_poses
     first_calibration = first_tag + 2 * tree.n_tags
-    for chain in range(len(tree.chain_start) - 1):
-        first, end = tree.chain_start[chain], tree.chain_start[chain + 1]
-        slots = tree.slots[tree.slot_start[chain] : tree.slot_start[chain + 1]]
+    for segment in range(len(tree.segment_start) - 1):
+        first, end = tree.segment_start[segment], tree.segment_start[segment + 1]
+        slots = tree.slots[tree.slot_start[segment] : tree.slot_start[segment + 1]]
         for pose in range(first, end):
             p = 3 * pose
             _add_one_way(system.pose[pose], p, x, y)

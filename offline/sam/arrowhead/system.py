@@ -1,7 +1,7 @@
-"""The normal equations of chains that meet in tags and calibration: an arrowhead, eliminated chain by chain.
+"""The normal equations of segments that meet in tags and calibration: an arrowhead, eliminated segment by segment.
 
-Linearise all factors, eliminate every piece of every chain on its own, meet in the small border, substitute back.
-Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissection along the chains, see
+Linearise all factors, eliminate every piece of every segment on its own, meet in the small border, substitute back.
+Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissection along the segments, see
 `arrowhead.tree`.
 """
 
@@ -87,11 +87,11 @@ class Arrowhead:
         return State(*out)
 
     def retract_relative(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
-        """The state after the same step as `moved`, taken motion by motion along each chain."""
+        """The state after the same step as `moved`, taken motion by motion along each segment."""
         values = Values(before.poses, before.tags, before.calibration)
         by_pose = Values(moved.poses, moved.tags, moved.calibration)
         out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
-        retract_relative(values, step, anchor, self.tree.chain_start, by_pose, out)
+        retract_relative(values, step, anchor, self.tree.segment_start, by_pose, out)
         return State(*out)
 
     @cached_property
@@ -270,8 +270,8 @@ class Skeleton:
         """Poses and tags from one pass in order of time.
 
         Args:
-            state: its calibration counts, and the pose at the start of each chain.
-            start_sigma: (number of chains, 3) how far off these starts may be, in their own axes.
+            state: its calibration counts, and the pose at the start of each segment.
+            start_sigma: (number of segments, 3) how far off these starts may be, in their own axes.
         """
         own, start = self.arrowhead, self._select(state)
         values = Values(start.poses, start.tags, start.calibration)

@@ -1,12 +1,12 @@
-"""In which order the arrowhead system is eliminated: chains cut into nested pieces, tags where their last reading is.
+"""In which order the arrowhead system is eliminated: segments cut into nested pieces, tags where their last reading is.
 
-A chain of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
+A segment of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
 what is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators
 inside of it and the tags that are read nowhere else; its front holds them, then what they are coupled to: the
-separators at both ends, the calibration of the chain, tags that others read too.
+separators at both ends, the calibration of the segment, tags that others read too.
 
-A chain's first pose can be a separator too, and a tag can be made the top's, so that what a tape measured between them
-couples columns of the top alone.
+A segment's first pose can be a separator too, and a tag can be made the top's, so that what a tape measured between
+them couples columns of the top alone.
 
 Columns are numbered 3 for each pose, 2 for each tag, then the calibration that is free.
 """
@@ -27,28 +27,28 @@ class Tree(NamedTuple):
     Attributes:
         level: (N,) 0 for a leaf, LEVELS - 1 for the top, which is the last node.
         parent: (N,) node; the top's own index for the top.
-        chain: (N,) whose calibration it is coupled to; -1 for the top.
+        segment: (N,) whose calibration it is coupled to; -1 for the top.
         first, end: (N,) poses first to end - 1 lie in the node; in a leaf all of them are eliminated there.
-        left, right: (N,) separator poses at both ends; -1 at a chain's ends.
+        left, right: (N,) separator poses at both ends; -1 at a segment's ends.
         n_eliminated: (N,) columns, the first ones of the front; 0 for a leaf, whose own poses are not in its front.
         front_start, front: columns of each node's front.
         up: place of each of `front` in the parent's front; -1 where eliminated.
         calibration_at: (N,) place of the first calibration column in the front.
         separator_start, separators: poses that a node above the leaves eliminates, in the front's order;
-            separator_chain: the chain of each.
+            separator_segment: the segment of each.
         tag_start, tags: tags that a node eliminates, in the front's order after the separators.
         rows_start: (N,) where a node's eliminated rows are kept.
         workspace_start: (LEVELS,) where the front of each level is built up.
         reading_start: (P+1,) readings of each pose; reading_tag: (M,) tag of each; reading_at: (M,) its place in the
             front of the node that eliminates the pose.
-        slot_start, slots: calibration that each chain is coupled to, as indices among what is free.
-        chain_start: first pose of each chain, then the number of poses.
-        n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest chain list.
+        slot_start, slots: calibration that each segment is coupled to, as indices among what is free.
+        segment_start: first pose of each segment, then the number of poses.
+        n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest segment list.
     """
 
     level: IntArray
     parent: IntArray
-    chain: IntArray
+    segment: IntArray
     first: IntArray
     end: IntArray
     left: IntArray
@@ -60,7 +60,7 @@ class Tree(NamedTuple):
     up: IntArray
     separator_start: IntArray
     separators: IntArray
-    separator_chain: IntArray
+    separator_segment: IntArray
     tag_start: IntArray
     tags: IntArray
     rows_start: IntArray
@@ -70,7 +70,7 @@ class Tree(NamedTuple):
     reading_at: IntArray
     slot_start: IntArray
     slots: IntArray
-    chain_start: IntArray
+    segment_start: IntArray
     n_poses: int
     n_tags: int
     n_calibration: int
@@ -79,38 +79,38 @@ class Tree(NamedTuple):
 
 @inner
 def n_slots_of(tree: Tree, node: int) -> int:
-    """How much calibration the chain of a node is coupled to."""
-    chain = tree.chain[node]
-    return int(tree.slot_start[chain + 1] - tree.slot_start[chain])
+    """How much calibration the segment of a node is coupled to."""
+    segment = tree.segment[node]
+    return int(tree.slot_start[segment + 1] - tree.slot_start[segment])
 
 
 class Couplings(NamedTuple):
     """Who is coupled to whom.
 
     Attributes:
-        chain_start: (number of chains + 1,) first pose of each, then the number of poses.
+        segment_start: (number of segments + 1,) first pose of each, then the number of poses.
         reading_pose: (M,) rising; reading_tag: (M,).
-        slot_start: (number of chains + 1,) where each chain's slots begin; slots: the free calibration that each is
+        slot_start: (number of segments + 1,) where each segment's slots begin; slots: the free calibration that each is
             coupled to.
         n_tags, n_free: how many tags there are, and how much calibration is free.
-        top_chains: whose first pose is eliminated in the top; top_tags: likewise.
+        top_segments: whose first pose is eliminated in the top; top_tags: likewise.
     """
 
-    chain_start: IntArray
+    segment_start: IntArray
     reading_pose: IntArray
     reading_tag: IntArray
     slot_start: IntArray
     slots: IntArray
     n_tags: int
     n_free: int
-    top_chains: IntArray
+    top_segments: IntArray
     top_tags: IntArray
 
 
 def build_tree(couplings: Couplings) -> Tree:
     """The tree of a problem."""
-    chain_start, reading_pose, reading_tag = couplings[:3]
-    pieces = cut(chain_start, couplings.top_chains)
+    segment_start, reading_pose, reading_tag = couplings[:3]
+    pieces = cut(segment_start, couplings.top_segments)
     n_nodes = len(pieces.level)
     node_of = nodes_of_poses(pieces.level, pieces.first, pieces.end, pieces.pose_level)
     home = homes_of_tags(node_of, n_nodes - 1, reading_pose, reading_tag, couplings.n_tags)
@@ -120,7 +120,7 @@ def build_tree(couplings: Couplings) -> Tree:
     tags = _group(home, np.arange(couplings.n_tags), n_nodes)
     shared_tags = _group(*tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
     slots = Lists(couplings.slot_start, couplings.slots)
-    n_poses = int(chain_start[-1])
+    n_poses = int(segment_start[-1])
     fronts = fronts_of(pieces, separators, tags, shared_tags, slots, n_poses, couplings.n_tags, couplings.n_free)
     up, reading_at = _places(pieces.parent, fronts, node_of[reading_pose, pieces.pose_level[reading_pose]], couplings)
     size = np.diff(fronts.front_start)
@@ -131,7 +131,7 @@ def build_tree(couplings: Couplings) -> Tree:
         up=up,
         separator_start=separators.start,
         separators=separators.values,
-        separator_chain=np.searchsorted(chain_start, separators.values, side="right") - 1,
+        separator_segment=np.searchsorted(segment_start, separators.values, side="right") - 1,
         tag_start=tags.start,
         tags=tags.values,
         rows_start=np.concatenate([[0], np.cumsum((fronts.n_eliminated * size)[:-1])]),
@@ -141,7 +141,7 @@ def build_tree(couplings: Couplings) -> Tree:
         reading_at=reading_at,
         slot_start=couplings.slot_start,
         slots=couplings.slots,
-        chain_start=chain_start,
+        segment_start=segment_start,
         n_poses=n_poses,
         n_tags=couplings.n_tags,
         n_calibration=couplings.n_free,
@@ -153,7 +153,7 @@ def _places(
     parent: IntArray, fronts: Fronts, home_of_reading: IntArray, couplings: Couplings
 ) -> tuple[IntArray, IntArray]:
     """Of each front's columns in the parent's front, and of each reading's tag in the front of its pose's node."""
-    first_tag = 3 * int(couplings.chain_start[-1])
+    first_tag = 3 * int(couplings.segment_start[-1])
     up, reading_at = places_of(
         parent,
         np.argsort(parent[:-1], kind="stable"),

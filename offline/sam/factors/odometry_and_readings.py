@@ -19,7 +19,7 @@ class State:
     """Values of all variables.
 
     Attributes:
-        poses: (P, 3) T_map_base of all chains, one after the other.
+        poses: (P, 3) T_map_base of all segments, one after the other.
         tags: (T, 2) in map.
         calibration: (C,) corrections to nominal values.
     """

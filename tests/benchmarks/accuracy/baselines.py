@@ -1,6 +1,6 @@
 """What maps are compared with: the wheels alone, and the scheme of the paper as it was.
 
-Both take keyframes and tag readings as `groundsbot.offline.measurements.chain` has them, so that only what is made of
+Both take keyframes and tag readings as `groundsbot.offline.measurements.segment` has them, so that only what is made of
 them differs, and lay runs over each other by the tags that they share. Neither has covariances that could be believed,
 so none are stated.
 """
@@ -19,8 +19,8 @@ from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
-from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 
 # The paper's solver: odometry's x, y, then heading; a tag reading's x and y.
@@ -66,26 +66,28 @@ def paper_scheme(runs: Sequence[Run]) -> MapResult:
     return _as_map(drives, *_least_squares(drives, start, places, transforms))
 
 
-def _chain(run: Run) -> Chain:
-    (chain,) = chains_of(run, NoiseParameters())
-    return chain
+def _segment(run: Run) -> Segment:
+    (segment,) = segments_of(run, NoiseParameters())
+    return segment
 
 
 def _keyframes(run: Run) -> _Drive:
-    chain = _chain(run)
-    readings, odometry = chain.readings, chain.odometry
+    segment = _segment(run)
+    readings, odometry = segment.readings, segment.odometry
     return _Drive(
-        run, chain.stamps_ns, odometry.motion, odometry.dead_reckon(), readings.keyframe, chain.tags, readings.tag,
-        _places_in_base(chain),
+        run, segment.stamps_ns, odometry.motion, odometry.dead_reckon(), readings.keyframe, segment.tags, readings.tag,
+        _places_in_base(segment),
     )  # fmt: skip
 
 
 def _states(run: Run) -> _Drive:
     """Poses at every fifth reading: the speeds that it tells count until the next one. Readings belong to the last."""
-    chain, (track,) = _chain(run), run.stretches
-    stamps_ns = track.stamps_ns[::EVERY]
-    seconds = np.diff(track.stamps_ns) * 1e-9
-    left_m_s, right_m_s = (np.diff(each, prepend=each[0])[::EVERY] for each in (track.left_m, track.right_m))
+    segment, (wheel_segment,) = _segment(run), run.wheel_segments
+    stamps_ns = wheel_segment.stamps_ns[::EVERY]
+    seconds = np.diff(wheel_segment.stamps_ns) * 1e-9
+    left_m_s, right_m_s = (
+        np.diff(each, prepend=each[0])[::EVERY] for each in (wheel_segment.left_m, wheel_segment.right_m)
+    )
     seconds = np.concatenate([[1.0], seconds])[::EVERY]
     step_s = np.diff(stamps_ns) * 1e-9
     left_m, right_m = (each[:-1] / seconds[:-1] * step_s for each in (left_m_s, right_m_s))
@@ -94,14 +96,14 @@ def _states(run: Run) -> _Drive:
     heading = np.concatenate([[0.0], np.cumsum(motion[:, 2])])
     steps = motion[:, :1] * np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=-1)
     poses = np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), heading])
-    at = np.searchsorted(stamps_ns, chain.stamps_ns[chain.readings.keyframe], side="right") - 1
-    return _Drive(run, stamps_ns, motion, poses, at, chain.tags, chain.readings.tag, _places_in_base(chain))
+    at = np.searchsorted(stamps_ns, segment.stamps_ns[segment.readings.keyframe], side="right") - 1
+    return _Drive(run, stamps_ns, motion, poses, at, segment.tags, segment.readings.tag, _places_in_base(segment))
 
 
-def _places_in_base(chain: Chain) -> FloatArray:
-    readings = chain.readings
+def _places_in_base(segment: Segment) -> FloatArray:
+    readings = segment.readings
     range_m, bearing = readings.value.T
-    return se2.apply(chain.T_base_camera, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
+    return se2.apply(segment.T_base_camera, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
 
 
 def _lay_out(maps: Sequence[dict[TagKey, FloatArray]]) -> tuple[list[FloatArray], dict[TagKey, FloatArray]]:

@@ -86,18 +86,18 @@ def cramer_rao(runs: Sequence[TrueRun], tags: TrueTags, noise: Noise) -> Bound:
     runs = [_run_in_frame(run, origin, heading_rad) for run in runs]
     tags = _tags_in_frame(tags, origin, heading_rad)
     columns = _Columns.of(runs, tags)
-    chains = [_Chain(run, tags, noise, columns, index) for index, run in enumerate(runs)]
-    chains[0].hold_start()
-    S = np.diag(columns.prior) + sum(chain.eliminated() for chain in chains)
+    segments = [_Segment(run, tags, noise, columns, index) for index, run in enumerate(runs)]
+    segments[0].hold_start()
+    S = np.diag(columns.prior) + sum(segment.eliminated() for segment in segments)
     scale = 1.0 / np.sqrt(np.diag(S))
     covariance = scale[:, None] * linalg.inv(scale[:, None] * S * scale) * scale
     rows = (6 * np.arange(len(columns.seen))[:, None] + np.arange(2)).ravel()
-    starts = [chain.start_covariance(covariance) for chain in chains[1:]]
+    starts = [segment.start_covariance(covariance) for segment in segments[1:]]
     vectors = np.array([[run.place[0].real, run.place[0].imag] for run in runs[1:]])
     return Bound(columns.seen, covariance[np.ix_(rows, rows)], np.array(starts).reshape(-1, 2, 2), vectors)
 
 
-class _Chain:
+class _Segment:
     """The information of one run: its own poses, block by block, what couples them with the border, and the border's.
 
     All arrays of the border have one column more than it has, for what nobody asks about.

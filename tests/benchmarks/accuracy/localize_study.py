@@ -45,7 +45,7 @@ from groundsbot.offline.localization.online.drive import TagReading
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.result import LocatedRun
 from groundsbot.offline.maps.result import Component, MapResult
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from tests.benchmarks.command_line import exit_code, say, seeds_of
 from tests.support.data.long_drives import LongDrive, Town, make_long_drive, make_town
 
@@ -122,17 +122,17 @@ def make_scene(seed: int) -> Scene | None:
     town = make_town(seed, TAG_SPACING_M, N_CROSSINGS)
     first = _SEEDS_A_TOWN * seed
     map_drives = tuple(_drive(first + i, town, MAP_LENGTH_M) for i in range(2))
-    maps = [solve_local_map(each.chain) for each in map_drives]
+    maps = [solve_local_map(each.segment) for each in map_drives]
     component = _join(maps)
     if component is None:
         return None
     known = MapResult((component,), (), NoiseParameters(), kept=tuple(archive_map(each) for each in maps))
     later, moved = _with_moved_tags(town, rng) if seed % _MOVED_EVERY == _MOVED_EVERY - 1 else (town, frozenset[int]())
     drive = _drive(first + 2, later, float(rng.uniform(25.0, 100.0)))
-    seen = {tag.tag_id for tag in drive.chain.tags}
+    seen = {tag.tag_id for tag in drive.segment.tags}
     T_map_town = se2.inverse(map_drives[0].T_town_start)
     true = se2.compose(se2.compose(T_map_town, drive.T_town_start), drive.T_start_base)
-    return Scene(known, map_drives, drive, solve_local_map(drive.chain), true, moved & seen)
+    return Scene(known, map_drives, drive, solve_local_map(drive.segment), true, moved & seen)
 
 
 def _drive(seed: int, town: Town, length_m: float) -> LongDrive:
@@ -157,7 +157,7 @@ def _join(maps: Sequence[LocalMap]) -> Component | None:
 def judge(seed: int, scene: Scene) -> Told:
     """Localises the run of a scene, and compares."""
     in_map = {tag.tag_id for tag in scene.known.components[0].tags}
-    told = Told(seed, len({tag.tag_id for tag in scene.drive.chain.tags} & in_map - scene.moved))
+    told = Told(seed, len({tag.tag_id for tag in scene.drive.segment.tags} & in_map - scene.moved))
     try:
         found = localize_maps([scene.local_map], scene.known)
     except OfflineError as error:
@@ -203,10 +203,10 @@ def judge(seed: int, scene: Scene) -> Told:
 
 def filter_online(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
     """The run's motions and readings, one by one, and the processor time that each took, in ms."""
-    chain = scene.drive.chain
-    online = OnlineLocalizer(scene.known, chain.run.robot)
+    segment = scene.drive.segment
+    online = OnlineLocalizer(scene.known, segment.run.robot)
     milliseconds = []
-    for motion, readings in taken_one_by_one(chain):
+    for motion, readings in taken_one_by_one(segment):
         for reading in readings if motion is None else [None, *readings]:
             began_ns = time.thread_time_ns()
             if reading is not None:
@@ -217,15 +217,15 @@ def filter_online(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
     return online, milliseconds
 
 
-def taken_one_by_one(chain: Chain) -> Iterator[Taken]:
+def taken_one_by_one(segment: Segment) -> Iterator[Taken]:
     """Of each keyframe the motion that leads to it, if any, and what was read there."""
-    odometry, readings = chain.odometry, chain.readings
-    begin = np.searchsorted(readings.keyframe, np.arange(len(chain.stamps_ns) + 1))
-    for k in range(len(chain.stamps_ns)):
+    odometry, readings = segment.odometry, segment.readings
+    begin = np.searchsorted(readings.keyframe, np.arange(len(segment.stamps_ns) + 1))
+    for k in range(len(segment.stamps_ns)):
         motion = None if k == 0 else (odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1])
         read = []
         for m in range(begin[k], begin[k + 1]):
-            family, tag_id, _ = chain.tags[readings.tag[m]]
+            family, tag_id, _ = segment.tags[readings.tag[m]]
             form = bool(readings.polar[m]), bool(readings.in_camera[m])
             by_camera = readings.by_camera[m] if readings.by_camera.any() else None
             read.append(TagReading(family, tag_id, readings.value[m], readings.covariance[m], by_camera, *form))
@@ -245,7 +245,7 @@ def against(run: LocatedRun, online: OnlineLocalizer) -> tuple[float | None, flo
 
 def extended_against(scene: Scene) -> tuple[float | None, float | None]:
     """The kept map solved with the run against all runs solved at once: places in sigmas, and sigmas; the worst."""
-    at_once = _join([*(solve_local_map(each.chain) for each in scene.map_drives), scene.local_map])
+    at_once = _join([*(solve_local_map(each.segment) for each in scene.map_drives), scene.local_map])
     extended = _join([*(local_map_of(each) for each in scene.known.kept), scene.local_map])
     if at_once is None or extended is None:
         return None, None

@@ -4,7 +4,7 @@
 
 Drives without rendering. By processor time, in one process that has compiled everything, the least of some repeats:
 `whole` is all that `--model corners` adds but for covariances (problem, order of elimination, start, solve, whether
-the floor is even, stretches that are not level); `solve` is the minimisation alone, as the floor's solve is: its graph
+the floor is even, segments that are not level); `solve` is the minimisation alone, as the floor's solve is: its graph
 and order of elimination are made in the stage before and do not count, nor do the local maps where it starts.
 Writes build/benchmarks/corners.jsonl. Exit 1 where the whole takes more than three solves on the floor.
 """

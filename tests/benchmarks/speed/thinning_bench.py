@@ -3,7 +3,7 @@
     python -m tests.benchmarks.speed.thinning_bench [--worlds room,nsh] [--seed 0]
 
 A picture becomes a keyframe when the robot moved or turned by a little, or when it shows a tag that the last one did
-not (`offline/measurements/chain.py`); others are passed over. Drives without rendering are mapped so and with every
+not (`offline/measurements/segment.py`); others are passed over. Drives without rendering are mapped so and with every
 picture a keyframe, under the true noise, on places and on corners. Information of one dimension is that of the joint
 covariance of all tags' places, (det S)^(-1/n). Writes build/benchmarks/thinning.jsonl; exit 1 where more than a
 twentieth is lost.

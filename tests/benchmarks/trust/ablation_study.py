@@ -33,8 +33,8 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.outliers.kinds import PHANTOM
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.self_calibration.option import Calibrate
@@ -54,9 +54,9 @@ def map_runs(runs: Sequence[Run], without: str) -> MapResult:
         return build_map(runs, NoiseParameters() if without == "lasting noise" else None, calibrate=calibrate)
 
 
-def _not_noisy(chain: Chain, effort: Effort, *, noise_is_open: bool) -> LocalMap:
+def _not_noisy(segment: Segment, effort: Effort, *, noise_is_open: bool) -> LocalMap:
     """Solves a drive whose noise is to be fitted, and takes it for one whose noise is as was told."""
-    return replace(solve_local_map(chain, effort, noise_is_open=noise_is_open), is_noisy=False)
+    return replace(solve_local_map(segment, effort, noise_is_open=noise_is_open), is_noisy=False)
 
 
 def _as_measured(run: Run) -> Run:

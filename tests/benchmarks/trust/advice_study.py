@@ -30,7 +30,7 @@ from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.graph import Graph, build_graph
@@ -58,10 +58,10 @@ class Scene:
     solution: Solution
     candidates: Candidates
 
-    def drive(self, chain: int) -> LongDrive:
-        """Whose chain it is."""
-        name = self.graph.chains[chain].name
-        return next(drive for drive in self.drives if drive.chain.name == name)
+    def drive(self, segment: int) -> LongDrive:
+        """Whose segment it is."""
+        name = self.graph.segments[segment].name
+        return next(drive for drive in self.drives if drive.segment.name == name)
 
 
 def make_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) -> Scene:
@@ -71,7 +71,7 @@ def make_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) 
         make_long_drive(100 * seed + i, length_m, _EVERY, town=town, noise=NOISE, noise_factors=(1.0, 1.0))
         for i in range(n_drives)
     ]
-    maps = [solve_local_map(drive.chain) for drive in drives]
+    maps = [solve_local_map(drive.segment) for drive in drives]
     graph, solution = _map_runs(maps, None)
     return Scene(drives, maps, graph, solution, candidates_of(graph, solution.state))
 
@@ -87,12 +87,13 @@ def with_candidate(scene: Scene, wanted: Pass | Place, seed: int) -> list[LocalM
     """The local maps after what was wanted has been done."""
     rng = np.random.default_rng([seed, 7])
     if isinstance(wanted, Pass):
-        return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.chain), wanted))]
+        return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.segment), wanted))]
     true_m = se2.apply(_T_town_map_at(scene, wanted), wanted.position_m)
     face = se2.apply(_T_town_map_at(scene, wanted), _sensor(scene, wanted)[:2]) - true_m
-    chains = [_past_new_tag(rng, scene, drive, true_m, face) for drive in scene.drives]
+    segments = [_past_new_tag(rng, scene, drive, true_m, face) for drive in scene.drives]
     return [
-        each if chain is each.chain else solve_local_map(chain) for chain, each in zip(chains, scene.maps, strict=True)
+        each if segment is each.segment else solve_local_map(segment)
+        for segment, each in zip(segments, scene.maps, strict=True)
     ]
 
 
@@ -104,23 +105,23 @@ def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pa
     passes: list[Pass | Place] = []
     while len(passes) < n:
         begin = sightings[rng.integers(len(sightings))]
-        way = ways[begin.chain]
+        way = ways[begin.segment]
         reached = [
             each
             for each in sightings
-            if each.chain == begin.chain
+            if each.segment == begin.segment
             and each.tag != begin.tag
             and each.first > begin.first
             and way[each.last] <= way[begin.first] + length_m
         ]
         if reached:
             end = max(reached, key=lambda each: each.last)
-            passes.append(Pass(begin.chain, begin.first, end.last, begin.tag, end.tag))
+            passes.append(Pass(begin.segment, begin.first, end.last, begin.tag, end.tag))
     places: list[Pass | Place] = []
     while len(places) < n:
-        chain = int(rng.integers(len(ways)))
-        keyframe = int(np.searchsorted(ways[chain], rng.uniform(0.0, float(ways[chain][-1]))))
-        place = place_beside(found.drives, found.view, chain, keyframe, float(rng.choice([-1.0, 1.0])))
+        segment = int(rng.integers(len(ways)))
+        keyframe = int(np.searchsorted(ways[segment], rng.uniform(0.0, float(ways[segment][-1]))))
+        place = place_beside(found.drives, found.view, segment, keyframe, float(rng.choice([-1.0, 1.0])))
         if len(place.viewers) > 1:
             places.append(place)
     return passes + places
@@ -129,14 +130,14 @@ def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pa
 def _map_runs(maps: Sequence[LocalMap], before: Graph | None) -> tuple[Graph, Solution]:
     """The largest component; or that which holds the first run of an earlier map."""
     groups = merge(maps).groups
-    first = None if before is None else before.chains[0].name
-    group = next(each for each in groups if first is None or first in {maps[m].chain.name for m in each.members})
+    first = None if before is None else before.segments[0].name
+    group = next(each for each in groups if first is None or first in {maps[m].segment.name for m in each.members})
     return solve_global_map(maps, group, Stages())
 
 
-def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Chain:
-    """That part of a chain with other errors, as a run of its own."""
-    part = drive.chain.part(wanted.first, wanted.last + 1)
+def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Segment:
+    """That part of a segment with other errors, as a run of its own."""
+    part = drive.segment.part(wanted.first, wanted.last + 1)
     part = replace(part, name=f"{part.name}_again", run=replace(part.run, name=f"{part.run.name}_again"))
     graph = build_graph([part])
     T_part_start = se2.inverse(drive.T_start_base[wanted.first])
@@ -157,36 +158,38 @@ def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Ch
 
 def _past_new_tag(
     rng: np.random.Generator, scene: Scene, drive: LongDrive, true_m: FloatArray, face: FloatArray
-) -> Chain:
-    """A drive's chain as it is, had it read a new tag besides."""
-    chain, view = drive.chain, scene.candidates.view
+) -> Segment:
+    """A drive's segment as it is, had it read a new tag besides."""
+    segment, view = drive.segment, scene.candidates.view
     off = np.array([drive.calibration[name] for name in ("mount_x_m", "mount_y_m", "mount_yaw_rad")])
-    sensors = se2.compose(se2.compose(drive.T_town_start, drive.T_start_base), chain.T_base_camera + off)
+    sensors = se2.compose(se2.compose(drive.T_town_start, drive.T_start_base), segment.T_base_camera + off)
     is_read = is_in_view(sensors, true_m, face, view) & (rng.random(len(sensors)) < READ_SHARE)
     keyframe = np.flatnonzero(is_read)
     if not len(keyframe):
-        return chain
+        return segment
     sight = se2.apply(se2.inverse(sensors[keyframe]), true_m) / (1.0 + drive.calibration["tag_scale"])
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
     value += SIGMA_READING * rng.standard_normal(value.shape)
-    like = chain.readings.where(np.zeros(len(keyframe), dtype=np.int64))
-    new = replace(like, keyframe=keyframe, tag=np.full(len(keyframe), len(chain.tags)), value=value)
-    both = concatenate_observations(chain.readings, new)
-    return replace(chain, tags=(*chain.tags, _NEW_TAG), readings=both.where(np.argsort(both.keyframe, kind="stable")))
+    like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
+    new = replace(like, keyframe=keyframe, tag=np.full(len(keyframe), len(segment.tags)), value=value)
+    both = concatenate_observations(segment.readings, new)
+    return replace(
+        segment, tags=(*segment.tags, _NEW_TAG), readings=both.where(np.argsort(both.keyframe, kind="stable"))
+    )
 
 
 def _sensor(scene: Scene, place: Place) -> FloatArray:
     """Where the camera is, by the map, at the keyframe beside which a place lies."""
-    pose = scene.graph.poses_of(scene.solution.state, place.chain)[place.keyframe]
-    return se2.compose(pose, scene.graph.chains[place.chain].T_base_camera)
+    pose = scene.graph.poses_of(scene.solution.state, place.segment)[place.keyframe]
+    return se2.compose(pose, scene.graph.segments[place.segment].T_base_camera)
 
 
 def _T_town_map_at(scene: Scene, place: Place) -> FloatArray:
     """A person goes by what is near: the map laid over the town at that keyframe."""
-    drive = scene.drive(place.chain)
+    drive = scene.drive(place.segment)
     T_town_base = se2.compose(drive.T_town_start, drive.T_start_base[place.keyframe])
     return se2.compose(
-        T_town_base, se2.inverse(scene.graph.poses_of(scene.solution.state, place.chain)[place.keyframe])
+        T_town_base, se2.inverse(scene.graph.poses_of(scene.solution.state, place.segment)[place.keyframe])
     )
 
 

@@ -130,7 +130,7 @@ def solved_drive(
     places = np.where(moved[:, None], se2.apply(T_moved, town.tags_m), town.tags_m)
     noise = NoiseParameters()
     drive = make_long_drive(seed, length_m, town=replace(town, tags_m=places), noise=noise, noise_factors=(1.0, 1.0))
-    local_map = solve_local_map(drive.chain)
+    local_map = solve_local_map(drive.segment)
     condensed = condense(local_map, local_map.graph.tags)
     root = condensed.T_start_anchor[condensed.root]
     T_town_root = se2.compose(drive.T_town_start, drive.T_start_base[local_map.graph.problem.anchor[condensed.root]])

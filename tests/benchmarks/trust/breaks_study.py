@@ -9,7 +9,7 @@ on both sides and agree, and contradict the wheels: where the two parts, cut at 
 believing the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom, all
 readings counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
 nothing: headings wander by more. Map errors are RMS over the tags
-of the stretches laid over the truth, and the same of two runs, cut at the true place.
+of the segments laid over the truth, and the same of two runs, cut at the true place.
 """
 
 import argparse
@@ -53,7 +53,7 @@ class Outcome:
     kind: str
     seed: int
     can_be_told: bool
-    n_stretches: int
+    n_segments: int
     rms_m: float
     two_runs_rms_m: float
     said: tuple[str, ...]
@@ -68,19 +68,19 @@ def broken_drive(kind: str, seed: int) -> BrokenDrive:
         return carry(drive, 0.496, 2.0)  # a crossing is at 125 m
     if kind == "slipped":
         return slip(drive, 0.55, 3.0)
-    return BrokenDrive(drive, len(drive.chain.stamps_ns))
+    return BrokenDrive(drive, len(drive.segment.stamps_ns))
 
 
 def outcome_of(kind: str, seed: int) -> Outcome:
     """What becomes of one drive."""
     broken = broken_drive(kind, seed)
-    chain = broken.drive.chain
-    whole = solve_local_map(chain)
+    segment = broken.drive.segment
+    whole = solve_local_map(segment)
     mended = split_at_breaks([whole])
     two_runs, can_be_told = [whole], False
     if kind != "clean":
-        ends = (0, broken.end), (broken.begin, len(chain.stamps_ns))
-        two_runs = [solve_local_map(replace(chain.part(*part), name=f"{chain.name}{part[0]}")) for part in ends]
+        ends = (0, broken.end), (broken.begin, len(segment.stamps_ns))
+        two_runs = [solve_local_map(replace(segment.part(*part), name=f"{segment.name}{part[0]}")) for part in ends]
         can_be_told = _align_for_sure(*two_runs) and _costs_more_than_chance(whole, broken)
     return Outcome(
         kind, seed, can_be_told, len(mended.maps), _rms_m(mended.maps, broken), _rms_m(two_runs, broken),
@@ -96,7 +96,7 @@ def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
     weak = np.where(inside[:, None, None], _FREED, 1.0) * odometry.whitening
     apart = solve(problem.reweigh(weak, problem.readings.whitening), state)
     joined = min(whole.solution.cost, solve(problem, apart.state).cost)
-    n_places = len(np.unique(whole.chain.readings.keyframe))
+    n_places = len(np.unique(whole.segment.readings.keyframe))
     return 2.0 * (joined - apart.cost) > float(chi2.isf(FALSE_ALARM / n_places, 3))
 
 
@@ -118,8 +118,8 @@ def _rms_m(maps: Sequence[LocalMap], broken: BrokenDrive) -> float:
 def summary(outcomes: Sequence[Outcome]) -> str:
     """One kind in words."""
     told = [each for each in outcomes if each.can_be_told]
-    found = [each for each in told if each.n_stretches > 1]
-    split = sum(each.n_stretches > 1 for each in outcomes)
+    found = [each for each in told if each.n_segments > 1]
+    split = sum(each.n_segments > 1 for each in outcomes)
     text = f"{outcomes[0].kind}: {split} of {len(outcomes)} drives split"
     if not told:
         return text

@@ -55,20 +55,20 @@ class Figures:
 def study_seed(seed: int) -> Figures:
     """Drives, solves and checks one seed."""
     drive = make_long_drive(seed)
-    chain = drive.chain
-    dead_reckoned = chain.odometry.dead_reckon()
+    segment = drive.segment
+    dead_reckoned = segment.odometry.dead_reckon()
     turned = se2.between(drive.T_start_base[:-1], drive.T_start_base[1:])[:, 2].sum()
-    graph = build_graph([chain])
+    graph = build_graph([segment])
     best = solve(graph.problem, drive.true_state(graph))
     plain = solve(graph.problem, graph.start(dead_reckoned, {}, {}))
     began = time.perf_counter()
-    ours = solve_local_map(chain)
+    ours = solve_local_map(segment)
     seconds = time.perf_counter() - began
     windows = fit_windows(graph.problem)
     return Figures(
         seed,
         float(np.hypot(*(dead_reckoned[-1] - drive.T_start_base[-1])[:2])),
-        float(np.degrees(abs(chain.odometry.motion[:, 2].sum() - turned))),
+        float(np.degrees(abs(segment.odometry.motion[:, 2].sum() - turned))),
         best.cost,
         plain.cost - best.cost,
         ours.solution.cost - best.cost,

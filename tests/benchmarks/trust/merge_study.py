@@ -61,9 +61,9 @@ def apart(maps: Sequence[LocalMap]) -> list[str]:
 
 def in_other_building(drive: LongDrive) -> LocalMap:
     """The same drive, past tags that nobody else saw."""
-    chain = drive.chain
-    tags = tuple(TagKey(tag.family, tag.tag_id + _OTHER_BUILDING) for tag in chain.tags)
-    return solve_local_map(replace(chain, tags=tags))
+    segment = drive.segment
+    tags = tuple(TagKey(tag.family, tag.tag_id + _OTHER_BUILDING) for tag in segment.tags)
+    return solve_local_map(replace(segment, tags=tags))
 
 
 def corridor(seed: int, length_m: float = LENGTH_M) -> list[LocalMap]:
@@ -78,7 +78,7 @@ def corridor(seed: int, length_m: float = LENGTH_M) -> list[LocalMap]:
             tags.append(places)
             moved.append(places + np.where(np.arange(len(along))[:, None] % 4 < 2, move, 0.0))
     before, after = (Town(np.concatenate(each), 0.0) for each in (tags, moved))
-    return [solve_local_map(_drive(seed + i, town, length_m).chain) for i, town in enumerate((before, after))]
+    return [solve_local_map(_drive(seed + i, town, length_m).segment) for i, town in enumerate((before, after))]
 
 
 def _drive(seed: int, town: Town, length_m: float) -> LongDrive:
@@ -92,7 +92,8 @@ def _places(maps: Sequence[LocalMap]) -> dict[object, FloatArray]:
         raise ValueError("; ".join(merge_warnings(maps, merged)))
     graph, solution = solve_global_map(maps, merged.groups[0], Stages())
     starts = {
-        chain.name: solution.state.poses[first] for chain, first in zip(graph.chains, graph.first_pose, strict=True)
+        segment.name: solution.state.poses[first]
+        for segment, first in zip(graph.segments, graph.first_pose, strict=True)
     }
     T_first_map = se2.inverse(starts[min(starts)])
     places: dict[object, FloatArray] = {
@@ -109,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args(arguments)
     drives = drives_of(given.runs, given.seed)
-    maps = [solve_local_map(drive.chain) for drive in drives]
+    maps = [solve_local_map(drive.segment) for drive in drives]
     began_s = time.perf_counter()
     merged = merge(maps)
     say(f"{len(merged.pairs)} pairs of {given.runs} runs aligned in {time.perf_counter() - began_s:.1f} s")

@@ -93,7 +93,7 @@ def map_runs(maps: Sequence[LocalMap]) -> Searched | None:
 def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
     """Maps a scene and adds what came of it; `compare`: also with the map without the tags in question."""
     counts.n_maps += 1
-    searched = map_runs([solve_local_map(drive.chain) for drive in scene.drives])
+    searched = map_runs([solve_local_map(drive.segment) for drive in scene.drives])
     if searched is None:
         counts.n_apart += 1
         counts.told += [Told(0.0, named=False, right=False) for _ in scene.ids]
@@ -109,8 +109,8 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
         counts.told.append(Told(sigmas[tag_id], found is not None, right))
     counts.n_false += len(named.keys() - set(scene.ids))
     if compare and scene.ids:
-        chains = [without(drive.chain, scene.ids) for drive in scene.drives]
-        alone = fit_and_weigh([solve_local_map(chain) for chain in chains], NoiseParameters()).maps
+        segments = [without(drive.segment, scene.ids) for drive in scene.drives]
+        alone = fit_and_weigh([solve_local_map(segment) for segment in segments], NoiseParameters()).maps
         merged = merge(alone)
         if len(merged.groups) == 1:
             counts.squares_m2.append(map_error_m2(scene, searched.graph, searched.solution))
@@ -148,9 +148,9 @@ def foretold_sigmas(scene: Scene, searched: Searched) -> dict[int, float]:
 def _truly_other(scene: Scene, searched: Searched) -> BoolArray:
     """(S,) which sightings are of the other place of their tag."""
     other: list[BoolArray] = []
-    for run, chain in enumerate(searched.graph.chains):
-        mask = np.zeros(len(chain.readings), dtype=np.bool_)
-        ids = np.array([tag.tag_id for tag in chain.tags], dtype=np.int64)[chain.readings.tag]
+    for run, segment in enumerate(searched.graph.segments):
+        mask = np.zeros(len(segment.readings), dtype=np.bool_)
+        ids = np.array([tag.tag_id for tag in segment.tags], dtype=np.int64)[segment.readings.tag]
         for tag_id in set(scene.ids) & set(ids.tolist()):
             mask[ids == tag_id] = scene.is_other(run, tag_id)
         other.append(mask)
@@ -162,9 +162,9 @@ def _can_be_told(scene: Scene, searched: Searched, of_tag: IntArray, members: In
     """Whether sightings of a tag, some of its other place, show what was done to it."""
     if not 0 < len(members) < len(of_tag):
         return False
-    chain = searched.sightings.chain[searched.evidence.which]
+    segment = searched.sightings.segment[searched.evidence.which]
     if scene.kind == MOVING:
-        return bool(set(chain[members]) & set(chain[np.setdiff1d(of_tag, members)]))
+        return bool(set(segment[members]) & set(segment[np.setdiff1d(of_tag, members)]))
     return scene.kind != DUPLICATED or _came_back(searched, of_tag, members)
 
 

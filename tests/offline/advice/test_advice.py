@@ -11,7 +11,7 @@ from groundsbot.offline.advice.information_gain import Known
 from groundsbot.offline.advice.new_tags import Place, gain_of_place, place_beside
 from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
 from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.report.sentences import advice_sentence
@@ -39,10 +39,10 @@ def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
     wanted = candidates.passes[len(candidates.passes) // 2]
     gain = gain_of_pass(scene.graph, scene.solution.state, wanted)
     foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
-    part = scene.graph.chains[wanted.chain].part(wanted.first, wanted.last + 1)
-    graph = build_graph([*scene.graph.chains, replace(part, name="again")])
+    part = scene.graph.segments[wanted.segment].part(wanted.first, wanted.last + 1)
+    graph = build_graph([*scene.graph.segments, replace(part, name="again")])
     state = scene.solution.state
-    driven = scene.graph.poses_of(state, wanted.chain)[wanted.first : wanted.last + 1]
+    driven = scene.graph.poses_of(state, wanted.segment)[wanted.first : wanted.last + 1]
     exact = sigmas_at(graph, State(np.concatenate([state.poses, driven]), state.tags, state.calibration))
     np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
     assert foretold.max() < 0.999 * joint_covariance_of(scene.solution, []).sigmas_m().max()
@@ -53,26 +53,26 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
     place = max(found.places, key=lambda each: each.n_sightings)
     gain = gain_of_place(found.drives, found.view, place)
     foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
-    state, chains = scene.solution.state, list(scene.graph.chains)
-    for i, chain in enumerate(chains):
+    state, segments = scene.solution.state, list(scene.graph.segments)
+    for i, segment in enumerate(segments):
         first = int(scene.graph.first_pose[i])
-        keyframe = place.viewers[(place.viewers >= first) & (place.viewers < first + len(chain.stamps_ns))] - first
+        keyframe = place.viewers[(place.viewers >= first) & (place.viewers < first + len(segment.stamps_ns))] - first
         if not len(keyframe):
             continue
-        like = chain.readings.where(np.zeros(len(keyframe), dtype=np.int64))
+        like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
         n_each = max(found.view.n_a_sighting * place.n_sightings / len(place.viewers), 1.0)
         new = replace(
             like,
             keyframe=keyframe,
-            tag=np.full(len(keyframe), len(chain.tags)),
+            tag=np.full(len(keyframe), len(segment.tags)),
             value=_tags_seen(found.drives.sensors[first + keyframe], place),
             covariance=like.covariance / n_each,  # all readings of these drives have the same
         )
-        both = concatenate_observations(chain.readings, new)
+        both = concatenate_observations(segment.readings, new)
         both = both.where(np.argsort(both.keyframe, kind="stable"))
-        chains[i] = replace(chain, tags=(*chain.tags, NEW), readings=both)
+        segments[i] = replace(segment, tags=(*segment.tags, NEW), readings=both)
     exact = sigmas_at(
-        build_graph(chains), State(state.poses, np.vstack([state.tags, place.position_m]), state.calibration)
+        build_graph(segments), State(state.poses, np.vstack([state.tags, place.position_m]), state.calibration)
     )
     del exact[NEW]
     np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
@@ -82,12 +82,12 @@ def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
     """Its mount and scale would be another robot's."""
     found = candidates_of(scene.graph, scene.solution.state)
     place = found.places[0]
-    pose = int(scene.graph.first_pose[place.chain]) + place.keyframe
-    assert pose in place_beside(found.drives, found.view, place.chain, place.keyframe, 1.0).viewers
-    lengths = [len(each.stamps_ns) for each in scene.graph.chains]
-    is_silent = np.repeat(np.arange(len(lengths)), lengths) == place.chain
+    pose = int(scene.graph.first_pose[place.segment]) + place.keyframe
+    assert pose in place_beside(found.drives, found.view, place.segment, place.keyframe, 1.0).viewers
+    lengths = [len(each.stamps_ns) for each in scene.graph.segments]
+    is_silent = np.repeat(np.arange(len(lengths)), lengths) == place.segment
     drives = found.drives._replace(example=np.where(is_silent, -1, found.drives.example))
-    assert not len(place_beside(drives, found.view, place.chain, place.keyframe, 1.0).viewers)
+    assert not len(place_beside(drives, found.view, place.segment, place.keyframe, 1.0).viewers)
 
 
 def _tags_seen(sensors: FloatArray, place: Place) -> FloatArray:
@@ -130,7 +130,7 @@ def test_the_same_map_gets_the_same_advice(scene: Scene) -> None:
 
 def test_covariances_that_mean_nothing_give_no_advice(scene: Scene) -> None:
     assert advise(scene.graph, replace(scene.solution, converged=False), 0) == []
-    alone = build_graph([replace(chain, name=str(i)) for i, chain in enumerate(_strangers(scene))])
+    alone = build_graph([replace(segment, name=str(i)) for i, segment in enumerate(_strangers(scene))])
     state = State(
         np.concatenate([each.T_start_base for each in scene.maps[:2]]),
         np.zeros((len(alone.tags), 2)),
@@ -139,8 +139,8 @@ def test_covariances_that_mean_nothing_give_no_advice(scene: Scene) -> None:
     assert advise(alone, Solution(state, (0.0,), "", True, alone.problem), 0) == []
 
 
-def _strangers(scene: Scene) -> list[Chain]:
-    first, second, *_ = (each.chain for each in scene.maps)
+def _strangers(scene: Scene) -> list[Segment]:
+    first, second, *_ = (each.segment for each in scene.maps)
     return [first, replace(second, tags=tuple(TagKey(tag.family, tag.tag_id + 200) for tag in second.tags))]
 
 

@@ -22,7 +22,7 @@ from tests.support.data.long_drives import NOISE, make_long_drive, make_town
 def solve_town(seed: int, noise: NoiseParameters = NOISE) -> LocalMap:
     """Through one town; by default with a heading that wanders by 2 degrees a metre's root."""
     drive = make_long_drive(seed, 300.0, town=make_town(7, (2.0, 8.0)), noise=noise, noise_factors=(1.0, 1.0))
-    return solve_local_map(drive.chain)
+    return solve_local_map(drive.segment)
 
 
 def fit_of(a: LocalMap, b: LocalMap, unmodelled_sigma_m: float = 0.0) -> JointFit:

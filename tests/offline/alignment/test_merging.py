@@ -13,7 +13,7 @@ from groundsbot.offline.alignment.budget import AlignmentEffort, AlignmentTooLon
 from groundsbot.offline.alignment.merging import Merge, merge
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import alignment_results, merge_warnings
-from groundsbot.offline.measurements.chain import chains_of
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import Placement
 from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
@@ -38,14 +38,14 @@ def local_map(
     run = make_run(
         [drive.track], robot=make_robot(name), tags=[TagKey(FAMILY, i) for i in tag_ids], positions=positions
     )
-    (chain,) = chains_of(run, NoiseParameters())
-    return solve_local_map(chain)
+    (segment,) = segments_of(run, NoiseParameters())
+    return solve_local_map(segment)
 
 
 STARTS = {"a": [0.0, 0.0, 0.0], "b": [5.0, 1.0, 2.0], "c": [9.0, -1.0, -3.0], "d": [14.0, 0.5, 1.0]}
 
 
-def chain_of_maps() -> list[LocalMap]:
+def segment_of_maps() -> list[LocalMap]:
     """The first and the last share nothing: only those between join them."""
     return [
         local_map("a", STARTS["a"], [0, 1, 2, 3]),
@@ -57,18 +57,18 @@ def chain_of_maps() -> list[LocalMap]:
 
 def join_maps(maps: list[LocalMap], merged: Merge | None = None) -> list[tuple[tuple[str, ...], FloatArray]]:
     merged = merged or merge(maps)
-    return [(tuple(maps[m].chain.run.robot_id for m in g.members), g.T_frame_start) for g in merged.groups]
+    return [(tuple(maps[m].segment.run.robot_id for m in g.members), g.T_frame_start) for g in merged.groups]
 
 
 def test_maps_are_joined_through_others() -> None:
-    ((names, starts),) = join_maps(chain_of_maps())
+    ((names, starts),) = join_maps(segment_of_maps())
     assert names == ("a", "b", "c", "d")
     np.testing.assert_allclose(starts, [STARTS[name] for name in names], atol=1e-6)
 
 
 @pytest.mark.parametrize("order", [[3, 2, 1, 0], [1, 3, 0, 2], [2, 0, 3, 1]])
 def test_the_order_changes_the_frame_only(order: list[int]) -> None:
-    maps = chain_of_maps()
+    maps = segment_of_maps()
     ((names, starts),) = join_maps([maps[i] for i in order])
     in_frame = se2.between(np.array(STARTS[names[0]]), np.array([STARTS[name] for name in names]))
     assert names == tuple("abcd"[i] for i in order)
@@ -78,7 +78,7 @@ def test_the_order_changes_the_frame_only(order: list[int]) -> None:
 def test_what_nothing_joins_stays_apart_largest_first() -> None:
     lone = local_map("e", [0.0, 0.0, 0.0], [10])
     blind = local_map("f", [0.0, 0.0, 0.0], [])
-    maps = [lone, *chain_of_maps()[:2], blind, *chain_of_maps()[3:]]
+    maps = [lone, *segment_of_maps()[:2], blind, *segment_of_maps()[3:]]
     assert [names for names, _ in join_maps(maps)] == [("a", "b"), ("d",), ("e",), ("f",)]
 
 
@@ -97,7 +97,7 @@ def test_starts_follow_from_the_strongest_alignments() -> None:
 def test_pairs_that_take_more_than_the_logs_are_worth_are_left_and_that_is_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    maps = chain_of_maps()
+    maps = segment_of_maps()
     monkeypatch.setattr(AlignmentEffort, "of_logs", lambda _: AlignmentEffort(250e6))  # of two pairs
     merged = merge(maps)
     assert [pair.is_searched for pair in merged.pairs] == [True, False, False]

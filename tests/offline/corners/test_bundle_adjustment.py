@@ -231,7 +231,7 @@ def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, 
     np.testing.assert_allclose(
         found.covariance(wanted) / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-4
     )
-    tags = slice(3 * len(solved.graph.chains), None)
+    tags = slice(3 * len(solved.graph.segments), None)
     np.testing.assert_allclose(result.components[0].tag_covariance, expected[tags, tags], rtol=1e-2, atol=1e-8)
 
 
@@ -277,14 +277,14 @@ def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResu
         return corner_graph(graph, solved.solution.state)[0].problem.corners.looks.sigma_px
 
     biased = [
-        replace(chain.readings, corner_bias_px=refined_bias_px(chain.readings.corners_px))
-        for chain in solved.graph.chains
+        replace(segment.readings, corner_bias_px=refined_bias_px(segment.readings.corners_px))
+        for segment in solved.graph.segments
     ]
-    chains = [replace(chain, readings=each) for chain, each in zip(solved.graph.chains, biased, strict=True)]
+    segments = [replace(segment, readings=each) for segment, each in zip(solved.graph.segments, biased, strict=True)]
     times = np.concatenate([each.corner_sigmas for each in biased])
     bias_px = np.concatenate([each.corner_bias_px[:, 1] for each in biased])
     wanted = np.hypot(sigmas_px(solved.graph), times * bias_px)
-    np.testing.assert_allclose(sigmas_px(replace(solved.graph, chains=tuple(chains))), wanted, rtol=1e-12)
+    np.testing.assert_allclose(sigmas_px(replace(solved.graph, segments=tuple(segments))), wanted, rtol=1e-12)
     assert bias_px.max() > 1.5 * bias_px.min()
 
 

@@ -284,7 +284,7 @@ def assemble(order: Fronts, matrices: list[FloatArray]) -> System:
 
 
 def test_fronts_solve_as_a_dense_matrix_does() -> None:
-    """Along a chain of 40 poses with tags seen here and there, nodes without a column of their own among them."""
+    """Along a segment of 40 poses with tags seen here and there, nodes without a column of their own among them."""
     rng = np.random.default_rng(4)
     n_leaves, n_own = 5, 3
     parent = np.array([5, 5, 6, 6, 6, 7, 7, -1])

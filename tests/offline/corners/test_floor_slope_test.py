@@ -33,7 +33,7 @@ def ramp_run(folder: Path, pitch_deg: float, height_m: float, tilt_deg: float) -
     eye, rng, found = robot.mount.T_base_camera, np.random.default_rng(3), run.detections
     corners_px = found.corners_px.copy()
     for stamp_ns in np.unique(found.stamps_ns):
-        on_ramp = RAMP_S[0] < (stamp_ns - run.stretches[0].stamps_ns[0]) / S < RAMP_S[1]
+        on_ramp = RAMP_S[0] < (stamp_ns - run.wheel_segments[0].stamps_ns[0]) / S < RAMP_S[1]
         tilt = np.radians(tilt_deg) * rng.standard_normal(2) + np.radians([0.0, pitch_deg * on_ramp])
         pose = drive.at(np.array([stamp_ns]))[0]
         for i in np.flatnonzero(found.stamps_ns == stamp_ns):

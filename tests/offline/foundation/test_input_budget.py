@@ -9,18 +9,16 @@ from groundsbot.offline.foundation.input_budget import ALONE, Inputs, size_bytes
 
 
 def test_drives_that_were_driven_may_be_any_number() -> None:
-    Inputs(1000, 1000 * 100_000).check_stretches(1000, Path("r999"))
-    Inputs(20, 20 * 1000).check_stretches(20, Path("r19"))  # a few may have broken off at once
-    ALONE.check_stretches(10_000, Path("r"))  # one log's own limits are others
+    Inputs(1000, 1000 * 100_000).check_segments(1000, Path("r999"))
+    Inputs(20, 20 * 1000).check_segments(20, Path("r19"))  # a few may have broken off at once
+    ALONE.check_segments(10_000, Path("r"))  # one log's own limits are others
 
 
 def test_a_thousand_tiny_ones_are_refused_with_a_way_out() -> None:
     with pytest.raises(OfflineError) as refused:
-        Inputs(1000, 1 << 20).check_stretches(1000, Path("r999"))
+        Inputs(1000, 1 << 20).check_segments(1000, Path("r999"))
     (line,) = str(refused.value).splitlines()
-    assert line.startswith(
-        "r999: with it there are 1000 drives or stretches of such in 1000 logs, limit 41 for 1048576"
-    )
+    assert line.startswith("r999: with it there are 1000 drives or segments of such in 1000 logs, limit 41 for 1048576")
     assert "--extend" in line
 
 

@@ -21,7 +21,7 @@ from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
 def map_runs(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
     """Two runs under fitted noise, joined; tags are moved between them and taken for one all the same."""
     drives = make_scene(41, kind, n_tags, 0.5).drives[1:3]
-    maps = fit_and_weigh([solve_local_map(drive.chain) for drive in drives], NoiseParameters()).maps
+    maps = fit_and_weigh([solve_local_map(drive.segment) for drive in drives], NoiseParameters()).maps
     (group,) = merge(maps).groups
     _, solution = solve_global_map(maps, group, Stages())
     return maps, solution

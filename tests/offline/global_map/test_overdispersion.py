@@ -19,8 +19,8 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.findings import Found
 from groundsbot.offline.maps.result import Component
 from groundsbot.offline.maps.widening import inflate_covariances
-from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.passes import passes_of
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.outliers.sightings import instances, sightings_of, with_instances
@@ -33,20 +33,20 @@ MOVED_M = 0.5
 Solved = tuple[list[LocalMap], Graph, Solution]
 
 
-def with_errors_of_passes(chain: Chain, sigmas: float) -> Chain:
+def with_errors_of_passes(segment: Segment, sigmas: float) -> Segment:
     """Each pass of a tag errs by so many sigmas that all of its readings share."""
-    readings, of_pass = chain.readings, passes_of(chain)
+    readings, of_pass = segment.readings, passes_of(segment)
     drawn = np.random.default_rng(SEED).standard_normal((int(of_pass.max()) + 1, 2))[of_pass]
     own = np.sqrt(np.diagonal(readings.covariance, axis1=1, axis2=2))
-    return replace(chain, readings=replace(readings, value=readings.value + sigmas * own * drawn))
+    return replace(segment, readings=replace(readings, value=readings.value + sigmas * own * drawn))
 
 
 @cache
 def solve_drives(kind: str, n_tags: int = 0, sigmas: float = 0.0) -> Solved:
     """Two drives as one map, moved tags taken for one."""
     drives = make_scene(SEED, kind, n_tags, MOVED_M).drives[1:3]
-    chains = [drives[0].chain, with_errors_of_passes(drives[1].chain, sigmas)]
-    maps = fit_and_weigh([solve_local_map(chain) for chain in chains], NoiseParameters()).maps
+    segments = [drives[0].segment, with_errors_of_passes(drives[1].segment, sigmas)]
+    maps = fit_and_weigh([solve_local_map(segment) for segment in segments], NoiseParameters()).maps
     (group,) = merge(maps).groups
     return maps, *solve_global_map(maps, group, Stages())
 
@@ -80,7 +80,7 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
     assert misfit is not None
     assert misfit.kind == what
     if sigmas:
-        assert misfit.run == graph.chains[1].name
+        assert misfit.run == graph.segments[1].name
     before = component_of(graph, solution)
     after = inflate_covariances(
         before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_freedom(maps))
@@ -117,9 +117,9 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
 def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
     """A drive's own solve has one place for a tag to which the joint solve gives two: it is solved again with both."""
     maps, graph, solution = solve_drives(CLEAN, 0, 3.0)
-    sightings = sightings_of([maps[1].chain])
-    apart = with_instances([maps[1].chain], sightings, instances(sightings, np.arange(len(sightings)), "second "))[0]
-    again = build_graph([graph.chains[0], apart])
+    sightings = sightings_of([maps[1].segment])
+    apart = with_instances([maps[1].segment], sightings, instances(sightings, np.arange(len(sightings)), "second "))[0]
+    again = build_graph([graph.segments[0], apart])
     start = again.start(solution.state.poses, {}, graph.calibration_of(solution.state))
     split = solve(again.problem, start)
     alone = _alone(maps[1], again, split, 1)
@@ -134,7 +134,7 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     (group,) = merge(maps).groups
     found, misfit = Found(), misfit_of(maps, graph, solution)
     assert misfit is not None
-    nothing = parse_measurements(TapeOptions(), [chain.name for chain in graph.chains], list(graph.tags))
+    nothing = parse_measurements(TapeOptions(), [segment.name for segment in graph.segments], list(graph.tags))
     found.take(maps, SolvedComponent(group, graph, solution, []), nothing, Stages())
     (component,) = found.components
     factor = misfit.variance_factor**0.5

@@ -22,7 +22,7 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import (
     CalibrationPrior,
@@ -40,7 +40,7 @@ from tests.support.data.graphs import make_graph, with_measured
 LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
 
 
-def chain_past(name: str, start: Sequence[float], tags: dict[int, tuple[float, float]]) -> Chain:
+def segment_past(name: str, start: Sequence[float], tags: dict[int, tuple[float, float]]) -> Segment:
     """A drive that reads each of some tags ten times, exactly."""
     drive: MadeDrive = make_drive(start, LEGS, step_ns=100_000_000)
     keys = sorted(tags)
@@ -53,7 +53,7 @@ def chain_past(name: str, start: Sequence[float], tags: dict[int, tuple[float, f
         tags=[TagKey(FAMILY, key) for key in keys],
         positions=make_positions(drive.stamps_ns[at], tag, read),
     )
-    return replace(chains_of(run, NoiseParameters())[0], name=name)
+    return replace(segments_of(run, NoiseParameters())[0], name=name)
 
 
 STARTS = {"a": (0.0, 0.0, 0.0), "b": (3.0, 1.0, 2.0), "c": (-1.0, 2.0, -1.0), "d": (1.0, -3.0, 0.5)}
@@ -61,17 +61,17 @@ PLACES = {1: (2.0, 1.0), 2: (1.0, -2.0), 3: (-1.0, 1.0), 4: (3.0, 3.0), 5: (0.0,
 
 
 def solve_drives(tags_of: dict[str, Sequence[int]]) -> tuple[Graph, Solution]:
-    """Chains that read some tags each, solved from the truth in the frame of the first one's start."""
-    chains = [chain_past(name, STARTS[name], {tag: PLACES[tag] for tag in tags}) for name, tags in tags_of.items()]
-    graph = build_graph(chains)
-    poses = [make_drive(STARTS[c.name], LEGS, step_ns=100_000_000).at(c.stamps_ns) for c in chains]
+    """Segments that read some tags each, solved from the truth in the frame of the first one's start."""
+    segments = [segment_past(name, STARTS[name], {tag: PLACES[tag] for tag in tags}) for name, tags in tags_of.items()]
+    graph = build_graph(segments)
+    poses = [make_drive(STARTS[c.name], LEGS, step_ns=100_000_000).at(c.stamps_ns) for c in segments]
     start = graph.start(se2.compose(se2.inverse(np.array(STARTS["a"])), np.concatenate(poses)), {}, {})
     return graph, solve(graph.problem, start)
 
 
 def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_is_known() -> None:
     graph, solution = solve_drives({"a": (1, 2), "b": (3, 4)})
-    assert solution.unobservable.chains == (1,)
+    assert solution.unobservable.segments == (1,)
     assert solution.rank == graph.problem.columns.n - 3
     (sentence,) = [s for s in weak_parts(graph, solution) if s.startswith("b ")]
     assert "b shares no tag with the others" in sentence
@@ -93,7 +93,7 @@ def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tags_of", "n_untied", "chains"),
+    ("tags_of", "n_untied", "segments"),
     [
         ({"a": (1, 2), "b": (1, 2)}, 0, ()),
         ({"a": (1, 2), "b": (2, 3), "c": (3, 1)}, 0, ()),  # three bars, three joints
@@ -102,12 +102,12 @@ def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
         ({"a": (1, 2), "b": (3, 4), "c": (3, 4)}, 3, (1, 2)),
     ],
 )
-def test_chains_and_shared_tags_are_bars_and_joints(
-    tags_of: dict[str, Sequence[int]], n_untied: int, chains: tuple[int, ...]
+def test_segments_and_shared_tags_are_bars_and_joints(
+    tags_of: dict[str, Sequence[int]], n_untied: int, segments: tuple[int, ...]
 ) -> None:
     graph, solution = solve_drives(tags_of)
     assert solution.unobservable.n_directions == n_untied
-    assert solution.unobservable.chains == chains
+    assert solution.unobservable.segments == segments
     assert np.isfinite(solution.covariance(np.arange(graph.problem.columns.n))).all()
 
 

@@ -70,7 +70,7 @@ def test_times_of_receiving_are_used_where_asked_for(tmp_path: Path, log: Path) 
     bare = [s._replace(fields=s.fields | {"child_frame_id": BASE}) if s.topic == "/odom" else s for s in bare]
     report, run = import_run(bare, tmp_path, replace(SIZED, receive_times=True))
     np.testing.assert_array_equal(run.picture_stamps_ns, made.run.picture_stamps_ns + 90_000_000)
-    assert run.stretches[0].stamps_ns[0] == made.track.stamps_ns[0] + 5_000_000
+    assert run.wheel_segments[0].stamps_ns[0] == made.track.stamps_ns[0] + 5_000_000
     assert "times are those at which the bag received the messages" in report.remarks
 
 
@@ -80,7 +80,7 @@ def test_messages_out_of_order_twice_or_without_a_time_do_no_harm(tmp_path: Path
     nameless = made.sent[5]._replace(fields=made.sent[5].fields | {"header": header(0, "odom")})
     messages = [made.sent[0], *swapped, made.sent[7]._replace(received_ns=made.sent[7].received_ns + 99), nameless]
     report, run = import_run(messages, tmp_path)
-    np.testing.assert_array_equal(run.stretches[0].stamps_ns, made.track.stamps_ns)
+    np.testing.assert_array_equal(run.wheel_segments[0].stamps_ns, made.track.stamps_ns)
     np.testing.assert_array_equal(run.detections.stamps_ns, made.run.detections.stamps_ns)
     assert "/odom: 1 message left out: their times were there already" in report.remarks
     assert "/odom: 1 message left out: their header stamps are 0" in report.remarks
@@ -164,8 +164,8 @@ def test_joints_may_be_named_and_start_over_after_a_turn(tmp_path: Path, log: Pa
         sent.append(each)
     options = BagOptions(left_joint="a", right_joint="b", tag_size_m=0.15)
     _, run = import_run(sent, tmp_path, options, wheel_radius_m=0.1, track_width_m=0.5)
-    np.testing.assert_allclose(run.stretches[0].left_m, made.track.left_m, atol=1e-9)
-    np.testing.assert_allclose(run.stretches[0].right_m, made.track.right_m, atol=1e-9)
+    np.testing.assert_allclose(run.wheel_segments[0].left_m, made.track.left_m, atol=1e-9)
+    np.testing.assert_allclose(run.wheel_segments[0].right_m, made.track.right_m, atol=1e-9)
 
 
 @pytest.mark.parametrize("late_ns", [0, 7_000_000])
@@ -186,8 +186,8 @@ def test_each_joint_may_come_in_messages_of_its_own(tmp_path: Path, log: Path, l
             }
             sent.append(each._replace(fields=each.fields | own))
     _, run = import_run(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
-    (track,) = run.stretches
-    (whole,) = made.run.stretches
+    (track,) = run.wheel_segments
+    (whole,) = made.run.wheel_segments
     there = whole.at(track.stamps_ns)
     assert len(track.stamps_ns) == len(whole.stamps_ns) - (late_ns > 0)
     np.testing.assert_allclose(np.diff(track.left_m), np.diff(there[0]), atol=1e-9)

@@ -24,7 +24,7 @@ def dense_drive(seed: int) -> LongDrive:
 
 
 def drifting_graph(drive: LongDrive) -> Graph:
-    return build_graph([with_drifting_readings(drive.chain, SIGMAS, DRIFT_M, seed=1)])
+    return build_graph([with_drifting_readings(drive.segment, SIGMAS, DRIFT_M, seed=1)])
 
 
 @pytest.mark.parametrize("seed", [4, 7, 8])
@@ -39,7 +39,7 @@ def test_errors_that_neighbours_share_raise_no_alarm(seed: int) -> None:
 
 def test_a_moved_tag_is_noticed_among_them() -> None:
     drive = dense_drive(5)
-    drifting = with_drifting_readings(drive.chain, SIGMAS, DRIFT_M, seed=1)
+    drifting = with_drifting_readings(drive.segment, SIGMAS, DRIFT_M, seed=1)
     graph = build_graph([with_a_moved_tag(drive, drifting)])
     best = solve(graph.problem, drive.true_state(graph))
     assert not fit_windows(graph.problem).judge(best.state).fits
@@ -50,7 +50,7 @@ def test_a_wrong_end_is_noticed_among_them() -> None:
     drive = dense_drive(0)
     graph = drifting_graph(drive)
     right = solve(graph.problem, drive.true_state(graph))
-    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckon(), {}, {}))
+    wrong = solve(graph.problem, graph.start(drive.segment.odometry.dead_reckon(), {}, {}))
     assert wrong.converged
     assert wrong.cost > 1.01 * right.cost
     windows = fit_windows(graph.problem)
@@ -64,14 +64,14 @@ def test_the_shared_part_is_found(drawn: float) -> None:
     shared, own = [], []
     for seed in range(4):
         drive = dense_drive(seed)
-        problem = build_graph([drive.chain]).problem
+        problem = build_graph([drive.segment]).problem
         readings = problem.readings
         cell = np.unique(10_000 * readings.tag + readings.pose // 50, return_inverse=True)[1]
         error = np.sqrt(drawn) * np.random.default_rng(seed).standard_normal(cell.max() + 1)[cell]
         value = readings.value + np.column_stack([error / readings.whitening[:, 0, 0], np.zeros(len(cell))])
         windows = in_windows(replace(problem, readings=replace(readings, value=value)))
         places = np.zeros((len(windows.columns.tags), 2))
-        true = drive.true_state(build_graph([drive.chain]))
+        true = drive.true_state(build_graph([drive.segment]))
         places[windows.readings.tag] = true.tags[readings.tag]
         found = fit_shared_errors(solve(windows, replace(true, tags=places), losses=PLAIN_SQUARES), cell)
         shared.append(found.shared[0])
@@ -94,16 +94,16 @@ def test_factors_and_freedom_follow_from_the_parts() -> None:
 
 
 def test_drives_that_only_a_tape_joins_have_nothing_to_contradict() -> None:
-    chain = dense_drive(0).chain.prefix(200)
-    chain = replace(chain, tags=(), readings=chain.readings.where(chain.readings.tag < 0))
-    problem = build_graph([chain, chain]).problem
+    segment = dense_drive(0).segment.prefix(200)
+    segment = replace(segment, tags=(), readings=segment.readings.where(segment.readings.tag < 0))
+    problem = build_graph([segment, segment]).problem
     none, first, second = np.array([-1]), np.array([0]), np.array([200])
     placed = np.array([[3.0, 4.0, 0.0]])
     measured = Measured(
         StartFactors(second, placed, np.diag([100.0, 100.0, 100.0])[None]),
         DistanceFactors(first, none, second, none, np.array([9.0]), np.array([0.01])),
     )
-    alone = chain.odometry.dead_reckon()
+    alone = segment.odometry.dead_reckon()
     poses = np.concatenate([alone, alone + placed])
     state = State(poses, np.zeros((0, 2)), np.zeros(len(problem.prior.sigma)))
     verdict = fit_windows(replace(problem, measured=measured)).judge(state)

@@ -14,8 +14,8 @@ from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows, 
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import local_maps_without_outliers
 from groundsbot.offline.sam.budget import Effort
@@ -27,17 +27,17 @@ from tests.support.data.long_drives import make_long_drive, with_a_moved_tag
 LENGTH_M = 500.0
 
 
-def judge(chain: Chain) -> Goodness:
-    return solve_local_map(chain).goodness
+def judge(segment: Segment) -> Goodness:
+    return solve_local_map(segment).goodness
 
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     """Plain Levenberg-Marquardt from dead reckoning ends in a wrong valley here; the same windows judge both."""
     drive = make_long_drive(seed, LENGTH_M)
-    graph = build_graph([drive.chain])
+    graph = build_graph([drive.segment])
     right = solve(graph.problem, drive.true_state(graph))
-    wrong = solve(graph.problem, graph.start(drive.chain.odometry.dead_reckon(), {}, {}))
+    wrong = solve(graph.problem, graph.start(drive.segment.odometry.dead_reckon(), {}, {}))
     assert wrong.cost > 1.01 * right.cost
     windows = fit_windows(graph.problem)
     assert windows.judge(right.state).fits
@@ -51,14 +51,14 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
 
 def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
     """Told of twice the wheels' noise and half that of the readings, the check finds as much less and more."""
-    chain = make_long_drive(5, LENGTH_M).chain
-    odometry, readings = chain.odometry, chain.readings
+    segment = make_long_drive(5, LENGTH_M).segment
+    odometry, readings = segment.odometry, segment.readings
     told_wrong = replace(
-        chain,
+        segment,
         odometry=replace(odometry, covariance=4.0 * odometry.covariance),
         readings=replace(readings, covariance=0.25 * readings.covariance),
     )
-    one, other = judge(chain), judge(told_wrong)
+    one, other = judge(segment), judge(told_wrong)
     # What was told counts a little: like four measurements.
     assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
     assert other.reading_factor == pytest.approx(2.0 * one.reading_factor, rel=0.05)
@@ -73,7 +73,7 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
     places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]
     positions = make_positions(stamps_ns, tag, se2.apply(se2.inverse(drive.at(stamps_ns)), places))
     tags = [TagKey(FAMILY, i) for i in range(3)]
-    (chain,) = chains_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    (segment,) = segments_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     rounds = []
     left_over = goodness_of_fit._mean_squares
 
@@ -82,17 +82,17 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
         return left_over(solution)
 
     monkeypatch.setattr(goodness_of_fit, "_mean_squares", counted)
-    windows = fit_windows(build_graph([chain]).problem)
+    windows = fit_windows(build_graph([segment]).problem)
     assert (windows.factors < 0.1).all()
     assert len(rounds) <= 8
 
 
 def test_single_wrong_readings_do_not_count_against_a_map() -> None:
-    chain = make_long_drive(5, LENGTH_M).chain
-    readings = chain.readings
+    segment = make_long_drive(5, LENGTH_M).segment
+    readings = segment.readings
     value = readings.value.copy()
     value[::20] += [1.0, 0.5]
-    assert judge(replace(chain, readings=replace(readings, value=value))).fits
+    assert judge(replace(segment, readings=replace(readings, value=value))).fits
 
 
 def test_a_tag_that_moved_in_between_is_noticed() -> None:
@@ -105,17 +105,17 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])
 def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
-    chain = with_a_moved_tag(make_long_drive(5, LENGTH_M))
-    readings = chain.readings
+    segment = with_a_moved_tag(make_long_drive(5, LENGTH_M))
+    readings = segment.readings
     parts = CovarianceParts(
         ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
     )
     biased = replace(readings, parts=parts, corner_bias_px=np.full((len(readings), 2), bias_px))
-    assert judge(replace(chain, readings=biased)).fits is (bias_px > 0.0)
+    assert judge(replace(segment, readings=biased)).fits is (bias_px > 0.0)
 
 
 def test_windows_share_neither_poses_nor_tags() -> None:
-    problem = build_graph([make_long_drive(5, LENGTH_M).chain]).problem
+    problem = build_graph([make_long_drive(5, LENGTH_M).segment]).problem
     apart = in_windows(problem, 10.0)
     windows = np.cumsum(apart.columns.poses[:, 0] < 0)
     assert windows[-1] == pytest.approx(LENGTH_M / 10.0, abs=2)
@@ -129,7 +129,7 @@ def test_windows_share_neither_poses_nor_tags() -> None:
 def test_what_no_condition_joins_fits() -> None:
     """A drive of one window has nothing to contradict."""
     drive = make_long_drive(5, LENGTH_M)
-    verdict = judge(drive.chain.prefix(30))
+    verdict = judge(drive.segment.prefix(30))
     assert verdict.expected == 0
     assert verdict.fits
 
@@ -139,9 +139,9 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
-    def contradictory(chain: Chain, _: Effort, *, noise_is_open: bool) -> LocalMap:
+    def contradictory(segment: Segment, _: Effort, *, noise_is_open: bool) -> LocalMap:
         assert noise_is_open
-        return replace(solve_local_map(chain), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
+        return replace(solve_local_map(segment), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
 
     monkeypatch.setattr(local_maps_without_outliers, "solve_local_map", contradictory)
     (warning,) = build_map(read_runs([log])).warnings

@@ -1,4 +1,4 @@
-"""One chain solved alone: a long drive ends where it would from the truth, and soon."""
+"""One segment solved alone: a long drive ends where it would from the truth, and soon."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,9 +12,9 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
 from groundsbot.offline.local_map import local_map
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.coarse_chain import coarse_keyframes, coarsen, refine_poses
+from groundsbot.offline.measurements.coarse_segment import coarse_keyframes, coarsen, refine_poses
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
@@ -33,10 +33,10 @@ def test_study_keeps_its_promises_on_a_few_seeds() -> None:
 
 def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = make_long_drive(0, 500.0)
-    graph = build_graph([drive.chain])
+    graph = build_graph([drive.segment])
     best = solve(graph.problem, drive.true_state(graph))
     starts = _first_from_dead_reckoning(monkeypatch)
-    found = solve_local_map(drive.chain)
+    found = solve_local_map(drive.segment)
     assert is_right(found.solution, best)
     assert found.goodness.fits
     assert len(starts) >= 2
@@ -46,7 +46,7 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
     drive = make_long_drive(0, 500.0)
     monkeypatch.setattr(local_map, "_OTHER_STARTS", 0)
     _first_from_dead_reckoning(monkeypatch)
-    found = solve_local_map(drive.chain)
+    found = solve_local_map(drive.segment)
     assert not found.goodness.fits
 
 
@@ -54,14 +54,14 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
     drive = make_long_drive(seed, length_m)
-    odometry, readings = drive.chain.odometry, drive.chain.readings
-    chain = replace(
-        drive.chain,
+    odometry, readings = drive.segment.odometry, drive.segment.readings
+    segment = replace(
+        drive.segment,
         odometry=replace(odometry, covariance=100.0 * odometry.covariance),
         readings=readings.spread(np.full((len(readings), 2), 10.0)),
     )
-    graph = build_graph([chain])
-    found = solve_local_map(chain)
+    graph = build_graph([segment])
+    found = solve_local_map(segment)
     assert is_right(found.solution, solve(graph.problem, drive.true_state(graph)))
     assert found.goodness.fits
     # Drives are made with 0.7 to 1.4 times their noise, and a factor is known to some 10 % at least.
@@ -69,65 +69,65 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     assert 0.05 < found.goodness.reading_factor < 0.2
 
 
-def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Chain]:
+def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]:
     """Has the first start be dead reckoning; gathers what is started from."""
-    starts: list[Chain] = []
-    built_up: Callable[[Chain, Effort], Any] = local_map._build_up
+    starts: list[Segment] = []
+    built_up: Callable[[Segment, Effort], Any] = local_map._build_up
 
-    def worse(chain: Chain, effort: Effort) -> Any:
-        starts.append(chain)
-        known = built_up(chain, effort)
+    def worse(segment: Segment, effort: Effort) -> Any:
+        starts.append(segment)
+        known = built_up(segment, effort)
         if len(starts) > 1:
             return known
         return known._replace(
-            poses=chain.odometry.dead_reckon(), wheel_calibration=np.zeros(3), tags={}, calibration={}
+            poses=segment.odometry.dead_reckon(), wheel_calibration=np.zeros(3), tags={}, calibration={}
         )
 
     monkeypatch.setattr(local_map, "_build_up", worse)
     return starts
 
 
-def test_a_coarse_chain_is_the_same_drive() -> None:
-    chain = make_long_drive(4, 100.0).chain
-    keyframes = coarse_keyframes(chain)
-    coarse = coarsen(chain, keyframes)
-    assert len(keyframes) < 0.5 * len(chain.stamps_ns)
-    assert (keyframes[0], keyframes[-1]) == (0, len(chain.stamps_ns) - 1)
+def test_a_coarse_segment_is_the_same_drive() -> None:
+    segment = make_long_drive(4, 100.0).segment
+    keyframes = coarse_keyframes(segment)
+    coarse = coarsen(segment, keyframes)
+    assert len(keyframes) < 0.5 * len(segment.stamps_ns)
+    assert (keyframes[0], keyframes[-1]) == (0, len(segment.stamps_ns) - 1)
     calibration = 1e-4 * np.array([1.0, -2.0, 3.0])
     np.testing.assert_allclose(
-        se2.between(coarse.odometry.dead_reckon(), chain.odometry.dead_reckon()[keyframes]), 0.0, atol=1e-9
+        se2.between(coarse.odometry.dead_reckon(), segment.odometry.dead_reckon()[keyframes]), 0.0, atol=1e-9
     )
     np.testing.assert_allclose(
-        se2.between(coarse.odometry.dead_reckon(calibration), chain.odometry.dead_reckon(calibration)[keyframes]),
+        se2.between(coarse.odometry.dead_reckon(calibration), segment.odometry.dead_reckon(calibration)[keyframes]),
         0.0,
         atol=1e-4,
     )
-    assert coarse.odometry.distance_m.sum() == pytest.approx(chain.odometry.distance_m.sum())
-    assert {chain.tags[t] for t in np.unique(chain.readings.tag)} == set(coarse.tags)
-    # Wherever a chain is cut in between, covariances and Jacobians come out the same.
+    assert coarse.odometry.distance_m.sum() == pytest.approx(segment.odometry.distance_m.sum())
+    assert {segment.tags[t] for t in np.unique(segment.readings.tag)} == set(coarse.tags)
+    # Wherever a segment is cut in between, covariances and Jacobians come out the same.
     again = coarsen(coarse, np.array([0, len(keyframes) // 3, len(keyframes) - 1]))
-    at_once = coarsen(chain, keyframes[[0, len(keyframes) // 3, -1]])
+    at_once = coarsen(segment, keyframes[[0, len(keyframes) // 3, -1]])
     np.testing.assert_allclose(again.odometry.covariance, at_once.odometry.covariance, rtol=1e-9)
     np.testing.assert_allclose(again.odometry.jacobian, at_once.odometry.jacobian, rtol=1e-9, atol=1e-12)
 
 
 def test_refined_poses_go_through_the_coarse_ones() -> None:
-    chain = make_long_drive(4, 100.0).chain
-    keyframes = coarse_keyframes(chain)
+    segment = make_long_drive(4, 100.0).segment
+    keyframes = coarse_keyframes(segment)
     poses = np.random.default_rng(0).normal(size=(len(keyframes), 3))
-    found = refine_poses(chain, keyframes, poses, np.zeros(3))
+    found = refine_poses(segment, keyframes, poses, np.zeros(3))
     np.testing.assert_allclose(se2.between(found[keyframes], poses), 0.0, atol=1e-9)
-    inside = np.setdiff1d(np.arange(len(chain.stamps_ns) - 1), keyframes - 1)
+    inside = np.setdiff1d(np.arange(len(segment.stamps_ns) - 1), keyframes - 1)
     np.testing.assert_allclose(
-        se2.between(se2.between(found[inside], found[inside + 1]), chain.odometry.motion[inside]), 0.0, atol=1e-9
+        se2.between(se2.between(found[inside], found[inside + 1]), segment.odometry.motion[inside]), 0.0, atol=1e-9
     )
 
 
 def _n_pieces(length_m: float, wheel_sigma: float) -> int:
-    chain = make_long_drive(2, length_m).chain
-    pieces, n_keyframes, found = local_map._Pieces(chain), 1, 0
+    segment = make_long_drive(2, length_m).segment
+    pieces, n_keyframes, found = local_map._Pieces(segment), 1, 0
     pieces.wheel_covariance = wheel_sigma**2 * np.eye(3)
-    while n_keyframes < len(chain.stamps_ns):
+    while n_keyframes < len(segment.stamps_ns):
         n_keyframes, found = pieces.next_end(n_keyframes), found + 1
     return found
 
@@ -150,14 +150,14 @@ def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> 
         run = load_run(log)
         wheels = run.robot.wheels.model_copy(update={"track_m_sigma": 0.2})
         robot = run.robot.model_copy(update={"wheels": wheels, "edge_shift_px_sigma": 1.0})
-        (chain,) = chains_of(replace(run, robot=robot), NoiseParameters())
-        readings = chain.readings
+        (segment,) = segments_of(replace(run, robot=robot), NoiseParameters())
+        readings = segment.readings
         times = 1.0 + 0.1 * rng.standard_normal(len(readings))
         value, by_camera = readings.value.copy(), readings.by_camera.copy()
         value[:, 0] *= times
         by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= times**2
-        chain = replace(chain, readings=replace(readings, value=value, by_camera=by_camera))
-        solved = solve_local_map(chain, noise_is_open=True)
+        segment = replace(segment, readings=replace(readings, value=value, by_camera=by_camera))
+        solved = solve_local_map(segment, noise_is_open=True)
         assert solved.is_noisy
         found += [value for parameter, value in solved.calibration.items() if parameter.name == EDGE_SHIFT]
     assert np.abs(found).max() < 0.6
@@ -167,16 +167,16 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Places of the others were once taken for theirs, beyond the end of arrays."""
-    chain = make_long_drive(5, 300.0, town=make_town(5, (0.6, 1.2))).chain
-    whole = solve_local_map(chain)
+    segment = make_long_drive(5, 300.0, town=make_town(5, (0.6, 1.2))).segment
+    whole = solve_local_map(segment)
     monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
-    check = local_map._Check(build_graph([chain]), Effort.of_log(chain.run.log_bytes, chain.run.inputs))
-    assert 0 < len(check._tags) < len(chain.tags)
+    check = local_map._Check(build_graph([segment]), Effort.of_log(segment.run.log_bytes, segment.run.inputs))
+    assert 0 < len(check._tags) < len(segment.tags)
     assert check.judge(whole.solution).fits
 
 
 def test_a_start_of_another_problem_is_refused() -> None:
-    short, long = (build_graph([make_long_drive(3, length_m).chain]) for length_m in (50.0, 100.0))
-    state = long.start(np.zeros((len(long.chains[0].stamps_ns), 3)), {}, {})
+    short, long = (build_graph([make_long_drive(3, length_m).segment]) for length_m in (50.0, 100.0))
+    state = long.start(np.zeros((len(long.segments[0].stamps_ns), 3)), {}, {})
     with pytest.raises(ValueError, match="another number of poses"):
         solve(short.problem, state)

@@ -52,7 +52,7 @@ def _root_about(online: OnlineLocalizer, calibration: FloatArray, places_m: Floa
 def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray, FloatArray, Graph, State]:
     """Information and gradient by the solver's own factors, of the same drive about the same points."""
     smoother, tags = online._smoother, online._index
-    graph = unheld(build_graph([smoother.drive.chain(tags)]))
+    graph = unheld(build_graph([smoother.drive.segment(tags)]))
     names = {tag: smoother.map_tags[i] for tag, i in tags.items() if i in smoother.map_tags}
     numbers = dict(zip(online._parameters, calibration.tolist(), strict=True))
     graph = online._known.constrain(graph, names)
@@ -149,10 +149,10 @@ def test_a_drive_turned_in_its_map_has_the_same_answer(online: OnlineLocalizer, 
 
 def test_what_is_read_after_a_turn_is_linearised_among_its_tags(scene: Scene) -> None:
     """Half way all points turn; where the robot is at the end, and where among the points, does not depend on it."""
-    taken = list(taken_one_by_one(scene.drive.chain))
+    taken = list(taken_one_by_one(scene.drive.segment))
 
     def went_on(T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        online = OnlineLocalizer(scene.known, scene.drive.chain.run.robot)
+        online = OnlineLocalizer(scene.known, scene.drive.segment.run.robot)
         _feed(online, taken[: len(taken) // 2])
         smoother = online._smoother
         smoother.drive.poses[:] = se2.compose(T, smoother.drive.poses)

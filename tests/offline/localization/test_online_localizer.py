@@ -11,7 +11,7 @@ from groundsbot.offline.localization.localization import localize_maps
 from groundsbot.offline.localization.online.drive import TagReading
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.result import LocatedRun
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from tests.benchmarks.accuracy.localize_study import (
     Scene,
     against,
@@ -50,11 +50,11 @@ def test_the_study_in_small(scene: Scene) -> None:
 
 
 def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None:
-    chain = scene.drive.chain
-    online = OnlineLocalizer(scene.known, chain.run.robot)
+    segment = scene.drive.segment
+    online = OnlineLocalizer(scene.known, segment.run.robot)
     assert online.reason == "no tag of the map was seen yet"
     reasons = []
-    for motion, readings in taken_one_by_one(chain):
+    for motion, readings in taken_one_by_one(segment):
         if motion is not None:
             online.add_motion(*motion)
         for reading in readings:
@@ -69,10 +69,10 @@ def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
     """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
     made = make_scene(47)
     assert made is not None
-    online = OnlineLocalizer(made.known, made.drive.chain.run.robot)
+    online = OnlineLocalizer(made.known, made.drive.segment.run.robot)
     seen, starts = set[int](), []
     doubted = set[int]()
-    for motion, readings in taken_one_by_one(made.drive.chain):
+    for motion, readings in taken_one_by_one(made.drive.segment):
         if motion is not None:
             online.add_motion(*motion)
         for reading in readings:
@@ -92,11 +92,11 @@ def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
 
 def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
     """All tags but the first three elsewhere, as one: they are more, and may be those that stayed."""
-    chain = scene.drive.chain
-    online = OnlineLocalizer(scene.known, chain.run.robot)
+    segment = scene.drive.segment
+    online = OnlineLocalizer(scene.known, segment.run.robot)
     first: list[int] = []
     located = 0
-    for motion, readings in taken_one_by_one(chain):
+    for motion, readings in taken_one_by_one(segment):
         if motion is not None:
             online.add_motion(*motion)
         for reading in readings:
@@ -111,16 +111,16 @@ def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
 
 def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
     """Ids that the map does not have: nothing is located, and nothing breaks."""
-    chain = scene.drive.chain
-    renamed = tuple(tag._replace(tag_id=tag.tag_id + 500) for tag in chain.tags)
-    online, _ = filter_online(replace(scene, drive=replace(scene.drive, chain=replace(chain, tags=renamed))))
+    segment = scene.drive.segment
+    renamed = tuple(tag._replace(tag_id=tag.tag_id + 500) for tag in segment.tags)
+    online, _ = filter_online(replace(scene, drive=replace(scene.drive, segment=replace(segment, tags=renamed))))
     assert online.pose is None
     assert online.reason == "no tag of the map was seen; two are needed"
     assert online.settle() is None
 
 
 def test_readings_that_are_no_numbers_and_components_that_are_not_there_are_refused(scene: Scene) -> None:
-    robot = scene.drive.chain.run.robot
+    robot = scene.drive.segment.run.robot
     online = OnlineLocalizer(scene.known, robot)
     with pytest.raises(OfflineError, match="holds no numbers"):
         online.add_reading(TagReading("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
@@ -130,10 +130,10 @@ def test_readings_that_are_no_numbers_and_components_that_are_not_there_are_refu
 
 def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene) -> None:
     """Settled half way, and at the end."""
-    chain: Chain = scene.drive.chain
-    online = OnlineLocalizer(scene.known, chain.run.robot)
-    half = len(chain.stamps_ns) // 2
-    for k, (motion, readings) in enumerate(taken_one_by_one(chain)):
+    segment: Segment = scene.drive.segment
+    online = OnlineLocalizer(scene.known, segment.run.robot)
+    half = len(segment.stamps_ns) // 2
+    for k, (motion, readings) in enumerate(taken_one_by_one(segment)):
         if motion is not None:
             online.add_motion(*motion)
         for reading in readings:

@@ -24,10 +24,10 @@ class _MadeRoot:
         self.step = np.zeros(23)
         self._held, self._together = held, together
 
-    def held_squares(self, tag: int) -> float:
+    def squared_distance(self, tag: int) -> float:
         return self._held.get(tag, FITS)
 
-    def lifted(self, tag: int) -> Lifted:
+    def leave_one_out(self, tag: int) -> Lifted:
         return Lifted(tag, np.zeros((23, 2)), np.zeros(2), np.eye(2))
 
     def free_squares(self, free: list[tuple[int, TagKey]], lifted: Lifted | None = None) -> float:

@@ -9,7 +9,7 @@ import pytest
 import groundsbot
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.maps.archive import arrays_of, chain_from
+from groundsbot.offline.maps.archive import arrays_of, segment_from
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
@@ -92,7 +92,7 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
     assert "does not hold what its runs measured" in told(extending=replace(known, kept=()))
     kept = arrays_of(known.kept[0], "")
     older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
-    assert (chain_from(kept, "") is None, chain_from(older, "")) == (False, None)
+    assert (segment_from(kept, "") is None, segment_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
     assert "does not hold corners" in told(corners=True)
 

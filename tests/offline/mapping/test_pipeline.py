@@ -21,8 +21,8 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import Component, MapResult
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.onboard.log.messages import TagDetections
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.benchmarks.accuracy.accuracy_study import medians, missed_bounds, run_study, study_seed
@@ -87,9 +87,11 @@ def test_a_calibration_that_is_off_is_found(tmp_path: Path) -> None:
     wrong = {"radius_left_m": 0.1003, "radius_right_m": 0.0999, "track_m": 0.503, "ticks_per_turn": 1e9}
     believed = make_robot("a", wheels=wrong, mount=true.mount.model_dump() | {"yaw_rad": 0.105})
     run = replace(load_run(log), robot=believed)
-    stretch = run.stretches[0]
-    run = replace(run, stretches=(replace(stretch, left_m=stretch.left_m * 1.003, right_m=stretch.right_m * 0.999),))
-    found = {p.name: value for p, value in solve_local_map(chains_of(run, map_of(log).noise)[0]).calibration.items()}
+    stretch = run.wheel_segments[0]
+    run = replace(
+        run, wheel_segments=(replace(stretch, left_m=stretch.left_m * 1.003, right_m=stretch.right_m * 0.999),)
+    )
+    found = {p.name: value for p, value in solve_local_map(segments_of(run, map_of(log).noise)[0]).calibration.items()}
     assert found["wheel_ratio"] == pytest.approx(0.004, abs=0.0015)
     assert found["track_scale"] == pytest.approx(0.5 / 0.503 - 1, abs=0.004)
     assert found["mount_yaw_rad"] == pytest.approx(-0.005, abs=0.003)
@@ -170,7 +172,7 @@ def test_one_log_alone_gives_its_local_map(room: Path) -> None:
     (log,) = find_logs([room / "b"])
     result = build_map(read_runs([log]), noise=NoiseParameters())
     (component,) = result.components
-    local = solve_local_map(chains_of(load_run(log), result.noise)[0])
+    local = solve_local_map(segments_of(load_run(log), result.noise)[0])
     np.testing.assert_array_equal(component.runs[0].T_map_base, local.T_start_base)
     assert {(tag.family, tag.tag_id): tuple(tag.position_m) for tag in component.tags} == {
         (key.family, key.tag_id): tuple(place) for key, place in local.tags_m.items()
@@ -255,8 +257,8 @@ def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
     ("one", "other", "told"),
     [
         (("a_b", "c"), ("a", "b_c"), "run b_c of robot a would be named a_b_c, as run c of robot a_b in"),
-        (("a", "c"), ("a", "c_stretch2"), "run c_stretch2 of robot a is named like a stretch of a_c"),
-        (("a", "c_stretch2"), ("a", "c"), "run c_stretch2 of robot a is named like a stretch of a_c"),
+        (("a", "c"), ("a", "c_stretch2"), "run c_stretch2 of robot a is named like a segment of a_c"),
+        (("a", "c_stretch2"), ("a", "c"), "run c_stretch2 of robot a is named like a segment of a_c"),
     ],
 )
 def test_runs_of_one_name_are_refused(one: tuple[str, str], other: tuple[str, str], told: str) -> None:

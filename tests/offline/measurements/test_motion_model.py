@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from tests.support.data.drives import START_NS, MadeDrive, S, make_drive
 
 TRACK_M = 0.5
@@ -21,7 +21,7 @@ def drive(step_ns: int = S // 100) -> MadeDrive:
     return make_drive([0.0, 0.0, 0.0], WINDING, TRACK_M, step_ns)
 
 
-def odometry(made: MadeDrive, stamps_ns: object, noise: NoiseParameters = NOISE) -> ChainOdometry:
+def odometry(made: MadeDrive, stamps_ns: object, noise: NoiseParameters = NOISE) -> SegmentOdometry:
     return compose_odometry(made.track, np.asarray(stamps_ns, dtype=np.int64), TRACK_M, noise)
 
 
@@ -89,7 +89,7 @@ def test_a_turn_on_the_spot_makes_the_heading_uncertain() -> None:
     assert (np.sqrt(np.diag(found.covariance[0])[:2]) < 1e-3).all()
 
 
-def test_covariance_of_a_chain_does_not_depend_on_where_it_is_cut() -> None:
+def test_covariance_of_a_segment_does_not_depend_on_where_it_is_cut() -> None:
     """Two steps composed are as uncertain as one, but for the ticks that each end is read to."""
     made = make_drive([0.0, 0.0, 0.0], [(0.3, 0.7, 3.0)])
     whole = odometry(made, made.stamps_ns[[0, 300]])
@@ -109,7 +109,7 @@ def test_jacobian_is_what_other_wheels_would_have_done() -> None:
     def driven(wheel_scale: float, wheel_ratio: float, track_scale: float) -> FloatArray:
         left_m = made.left_m * (1 + wheel_scale) * (1 - wheel_ratio / 2)
         right_m = made.right_m * (1 + wheel_scale) * (1 + wheel_ratio / 2)
-        track = WheelTrack(made.stamps_ns, left_m, right_m)
+        track = WheelSegment(made.stamps_ns, left_m, right_m)
         return compose_odometry(track, stamps, TRACK_M * (1 + track_scale), NOISE).motion
 
     h = 1e-6
@@ -134,7 +134,7 @@ def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
     """Counts bridge a gap: how far and how much turned is known, the path between is not."""
     made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.6, 6.0)])
     kept = np.r_[0:200, 300:601]  # a second without readings
-    with_gap = WheelTrack(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
+    with_gap = WheelSegment(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
     stamps = made.stamps_ns[[0, 150, 350, 600]]
     found, whole = compose_odometry(with_gap, stamps, TRACK_M, NOISE), odometry(made, stamps)
     np.testing.assert_allclose(found.motion, whole.motion, atol=1e-9)  # speeds were constant: nothing was missed
@@ -146,7 +146,7 @@ def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
 def test_half_a_second_without_readings_is_no_gap_yet() -> None:
     made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     kept = np.r_[0:200, 249:401]
-    track = WheelTrack(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
+    track = WheelSegment(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
     stamps = made.stamps_ns[[0, 400]]
     found, whole = compose_odometry(track, stamps, TRACK_M, NOISE), odometry(made, stamps)
     np.testing.assert_allclose(found.covariance, whole.covariance, rtol=0.05, atol=1e-7)
@@ -172,7 +172,7 @@ def test_ticks_that_jump_between_wheels_do_not_add_up_to_a_turn() -> None:
     made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
     tick_m = 0.02
     left_m, right_m = (np.floor((made.left_m + begin) / tick_m) * tick_m for begin in (0.0, 0.01))
-    coarse = WheelTrack(made.stamps_ns, left_m, right_m, tick_m)
+    coarse = WheelSegment(made.stamps_ns, left_m, right_m, tick_m)
     stamps = made.stamps_ns[[0, 200]]
     heading_sigma = np.sqrt(compose_odometry(coarse, stamps, TRACK_M, NOISE).covariance[0, 2, 2])
     ticks_sigma = np.sqrt(2 / 6) * tick_m / TRACK_M  # both ends of both wheels, evenly within a tick

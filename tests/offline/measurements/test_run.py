@@ -13,7 +13,7 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.calib.tags.edges import outward
-from groundsbot.offline.measurements.motion_model.stretches import wheel_distances
+from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_distances
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.onboard.log.head import log_head
@@ -89,7 +89,7 @@ TWO_READINGS = [wheels(0.0, 1000, -50), wheels(0.1, 1010, -30)]
 
 def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
     run = load_run(write_log(tmp_path, TWO_READINGS))
-    (track,) = run.stretches
+    (track,) = run.wheel_segments
     assert (run.name, run.robot_id, run.run_id) == ("carl_one", "carl", "one")
     assert track.stamps_ns.tolist() == [START_NS, START_NS + S // 10]
     np.testing.assert_allclose(track.left_m, [0.0, 10 * 2 * np.pi * 0.1 / 1000])
@@ -101,22 +101,22 @@ def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
 def test_a_controller_reset_begins_a_new_stretch(tmp_path: Path) -> None:
     readings = [*TWO_READINGS, wheels(0.2, 0, 0, boot=2), wheels(0.3, 5, 5, boot=2), wheels(0.9, 7, 7, boot=3)]
     run = load_run(write_log(tmp_path, readings))
-    assert [len(track.stamps_ns) for track in run.stretches] == [2, 2, 1]
+    assert [len(track.stamps_ns) for track in run.wheel_segments] == [2, 2, 1]
     (warning,) = run.warnings
     assert "restarted 2 times" in warning
-    assert "3 stretches" in warning
+    assert "3 segments" in warning
 
 
 def test_a_gap_within_one_boot_is_bridged_by_the_counts(tmp_path: Path) -> None:
     run = load_run(write_log(tmp_path, [*TWO_READINGS, wheels(9.0, 2000, 900)]))
-    (track,) = run.stretches
+    (track,) = run.wheel_segments
     assert track.left_m[-1] == pytest.approx(1000 * 2 * np.pi * 0.1 / 1000)
 
 
 def test_readings_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> None:
     readings = [wheels(0.0, 0, 0), wheels(0.1, 5, 5), wheels(0.1, 6, 6), wheels(0.05, 4, 4), wheels(0.2, 9, 9)]
     run = load_run(write_log(tmp_path, readings))
-    assert (run.stretches[0].stamps_ns - START_NS).tolist() == [0, S // 10, S // 5]
+    assert (run.wheel_segments[0].stamps_ns - START_NS).tolist() == [0, S // 10, S // 5]
     assert "2 wheel readings not later" in run.warnings[0]
 
 
@@ -152,7 +152,7 @@ def test_imported_positions_that_run_ahead_are_set_back(tmp_path: Path) -> None:
     head = log_head(robot, robot.model_dump_json(), CAMERA, "one", START_NS, 0)
     run = load_run(write_log(tmp_path, [wheel_odometry(0.0, 0.0, 0.0), *messages, wheel_odometry(0.1, 0.1, 0.1)], head))
     assert (run.positions.stamps_ns - START_NS).tolist() == [6_000_000, 16_000_000]
-    assert run.stretches[0].stamps_ns[0] == START_NS
+    assert run.wheel_segments[0].stamps_ns[0] == START_NS
 
 
 def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
     assert (other.picture_stamps_ns - run.picture_stamps_ns).tolist() == [3_000_000] * 2
     assert (other.detections.stamps_ns - run.detections.stamps_ns).tolist() == [3_000_000]
     assert (other.positions.stamps_ns - run.positions.stamps_ns).tolist() == [3_000_000]
-    np.testing.assert_array_equal(other.stretches[0].stamps_ns, run.stretches[0].stamps_ns)
+    np.testing.assert_array_equal(other.wheel_segments[0].stamps_ns, run.wheel_segments[0].stamps_ns)
 
 
 def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> None:
@@ -221,8 +221,8 @@ def test_wheel_distances_and_observations_of_an_imported_log(tmp_path: Path) -> 
         ("/tags/observations", TagObservations(stamp_ns=stamp_ns, frame="camera_planar", observations=[polar])),
     ]
     run = load_run(write_log(tmp_path, messages))
-    np.testing.assert_allclose(np.diff(run.stretches[0].left_m), [0.1])
-    np.testing.assert_allclose(np.diff(run.stretches[0].right_m), [0.2])
+    np.testing.assert_allclose(np.diff(run.wheel_segments[0].left_m), [0.1])
+    np.testing.assert_allclose(np.diff(run.wheel_segments[0].right_m), [0.2])
     assert [key.tag_id for key in run.tags] == [2, 4]
     assert run.positions.tag.tolist() == [1, 0]
     assert run.positions.polar.tolist() == [False, True]
@@ -236,8 +236,8 @@ def test_odometry_poses_become_the_wheels_that_drove_them(tmp_path: Path) -> Non
     drive = make_drive([1.0, 2.0, 3.0], [(0.5, 0.7, 1.0), (0.6, 0.2, 1.0)])
     messages = [pose_odometry(0.01 * i, *pose) for i, pose in enumerate(drive.T_world_base.tolist())]
     run = load_run(write_log(tmp_path, messages))
-    np.testing.assert_allclose(run.stretches[0].left_m, drive.left_m, atol=1e-9)
-    np.testing.assert_allclose(run.stretches[0].right_m, drive.right_m, atol=1e-9)
+    np.testing.assert_allclose(run.wheel_segments[0].left_m, drive.left_m, atol=1e-9)
+    np.testing.assert_allclose(run.wheel_segments[0].right_m, drive.right_m, atol=1e-9)
     assert run.warnings == ()
 
 
@@ -259,7 +259,7 @@ def test_a_given_robot_replaces_that_of_the_log(tmp_path: Path) -> None:
     assert run.robot == other
     assert run.camera is not None
     assert run.camera.fx_px == 500.0
-    assert run.stretches[0].left_m[-1] == pytest.approx(10 * 2 * np.pi * 0.2 / 1000)
+    assert run.wheel_segments[0].left_m[-1] == pytest.approx(10 * 2 * np.pi * 0.2 / 1000)
     assert load_run(log, {"dora": given["carl"]}).robot == ROBOT
 
 

@@ -93,7 +93,7 @@ def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
 
 
 def test_a_controller_reset_of_twenty_seconds_is_worth_two_runs(tmp_path: Path) -> None:
-    """Five metres of which nothing is known: a stretch joined by tags, and the map that two logs would have given."""
+    """Five metres of which nothing is known: a segment joined by tags, and the map that two logs would have given."""
     drive = make_drive([1.5, 1.5, 0.3], [*BEFORE, *MEANWHILE, *AFTER])
     n_before, n_meanwhile = (round(100 * sum(leg[2] for leg in legs)) for legs in (BEFORE, MEANWHILE))
     kept = np.r_[0:n_before, n_before + n_meanwhile : len(drive.stamps_ns)]
@@ -101,9 +101,9 @@ def test_a_controller_reset_of_twenty_seconds_is_worth_two_runs(tmp_path: Path) 
     boots = np.where(kept < n_before, 1, 2).tolist()
     log = write_drive(tmp_path, cut, HALL, make_robot("a"), boot_of=boots, corner_sigma_px=0.2)
     run = load_run(log)
-    assert len(run.stretches) == 2
+    assert len(run.wheel_segments) == 2
     one = build_map([run])
-    apart = [replace(run, name=f"a_{i}", run_id=str(i), stretches=(run.stretches[i],)) for i in (0, 1)]
+    apart = [replace(run, name=f"a_{i}", run_id=str(i), wheel_segments=(run.wheel_segments[i],)) for i in (0, 1)]
     (as_stretches,), (as_runs,) = one.components, build_map(apart).components
     assert [each.name for each in as_stretches.runs] == ["a_one", "a_one_stretch2"]
     assert any("restarted 1 time" in warning for warning in one.warnings)

@@ -8,7 +8,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment, compose_odometry
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances, growth
 from groundsbot.onboard.log.messages import PlanarOdometry
 from tests.support.data.drives import S, make_drive
@@ -87,7 +87,7 @@ def test_a_logs_covariances_are_checked_one_by_one() -> None:
 def covariance_over(covariance: FloatArray | None, at_s: list[float]) -> FloatArray:
     """Of the motion between times on a straight drive of 1 m/s with a reading each second."""
     stamps_ns = np.arange(4) * S
-    track = WheelTrack(stamps_ns, np.arange(4.0), np.arange(4.0), covariance=covariance)
+    track = WheelSegment(stamps_ns, np.arange(4.0), np.arange(4.0), covariance=covariance)
     return compose_odometry(track, (np.array(at_s) * S).astype(np.int64), 0.5, NoiseParameters()).covariance
 
 

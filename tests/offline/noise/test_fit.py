@@ -14,9 +14,9 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Workings
 from groundsbot.offline.maps.parameter_results import NOT_NEEDED
-from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.sensor_model.sensor_model import STAMP_NOISE
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.fit import fit_noise
@@ -32,7 +32,7 @@ HALL = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi), 
 
 @pytest.fixture(scope="module")
 def maps(room: Path) -> list[LocalMap]:
-    return [solve_local_map(chain) for log in find_logs([room]) for chain in chains_of(load_run(log), PRIOR)]
+    return [solve_local_map(segment) for log in find_logs([room]) for segment in segments_of(load_run(log), PRIOR)]
 
 
 def test_noise_is_found_from_ten_times_too_large_and_too_small() -> None:
@@ -83,13 +83,13 @@ def test_noise_that_is_given_is_fitted_no_more(room: Path) -> None:
 def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no_more(maps: list[LocalMap]) -> None:
     odd = replace(maps[0], goodness=replace(maps[0].goodness, chi_square=1e4))
     found = fit_and_weigh([odd, *maps[1:]], PRIOR)
-    assert found.fitted.runs == tuple(each.chain.name for each in maps[1:])
-    assert found.fitted.contradicting == (odd.chain.name,)
+    assert found.fitted.runs == tuple(each.segment.name for each in maps[1:])
+    assert found.fitted.contradicting == (odd.segment.name,)
     assert found.noise == fit_and_weigh(maps[1:], PRIOR).noise
     larger = {name: max(value, getattr(PRIOR, name)) for name, value in found.noise.model_dump().items()}
     assert larger != found.noise.model_dump()
-    expected = maps[0].chain.with_noise(NoiseParameters(**larger)).odometry.covariance
-    np.testing.assert_allclose(found.maps[0].chain.odometry.covariance, expected)
+    expected = maps[0].segment.with_noise(NoiseParameters(**larger)).odometry.covariance
+    np.testing.assert_allclose(found.maps[0].segment.odometry.covariance, expected)
     alone = fit_and_weigh([odd], PRIOR)
     assert alone.noise == PRIOR
     assert {each.kept for each in alone.fitted.parameters} == {"no run has tag readings that fit together"}
@@ -100,20 +100,20 @@ def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no
 def test_of_long_runs_beginnings_may_be_without_tags(
     maps: list[LocalMap], monkeypatch: pytest.MonkeyPatch, n_late: int
 ) -> None:
-    late = [_read_late(each.chain) for each in maps[:n_late]]
-    both = [*(solve_local_map(chain) for chain in late), *maps[n_late:2]]
-    monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.chain.stamps_ns) for each in both)))
+    late = [_read_late(each.segment) for each in maps[:n_late]]
+    both = [*(solve_local_map(segment) for segment in late), *maps[n_late:2]]
+    monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.segment.stamps_ns) for each in both)))
     found = fit_and_weigh(both, PRIOR)
     by_name = {each.name: each for each in found.fitted.parameters}
     assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
     assert max(found.fitted.shared_range, found.fitted.shared_bearing) < 1e-3 or n_late == 1
 
 
-def _read_late(chain: Chain) -> Chain:
+def _read_late(segment: Segment) -> Segment:
     """Without the readings of its first half."""
-    readings = chain.readings.where(chain.readings.keyframe >= len(chain.stamps_ns) // 2)
+    readings = segment.readings.where(segment.readings.keyframe >= len(segment.stamps_ns) // 2)
     seen, tag = np.unique(readings.tag, return_inverse=True)
-    return replace(chain, tags=tuple(chain.tags[i] for i in seen), readings=replace(readings, tag=tag))
+    return replace(segment, tags=tuple(segment.tags[i] for i in seen), readings=replace(readings, tag=tag))
 
 
 def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
@@ -131,9 +131,9 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
     """Wheels that err fifty times as much as they are taken to."""
     odd = []
     for each in maps:
-        odometry = each.chain.odometry
+        odometry = each.segment.odometry
         parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
-        odd.append(replace(each, chain=replace(each.chain, odometry=replace(odometry, parts=parts))))
+        odd.append(replace(each, segment=replace(each.segment, odometry=replace(odometry, parts=parts))))
     found = fit_and_weigh(odd, PRIOR)
     as_told = fit_and_weigh(maps, PRIOR)
     ratio = found.noise.sigma_distance_m_per_sqrt_m / as_told.noise.sigma_distance_m_per_sqrt_m
@@ -153,21 +153,21 @@ def test_stamps_that_jitter_are_told_from_what_all_tags_of_a_picture_show(
     rng = np.random.default_rng(2)
     late = []
     for each in maps:
-        readings = each.chain.readings
-        error_s = jitter_s * rng.standard_normal(len(each.chain.stamps_ns))[readings.keyframe, None]
+        readings = each.segment.readings
+        error_s = jitter_s * rng.standard_normal(len(each.segment.stamps_ns))[readings.keyframe, None]
         value = readings.value + error_s * readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
-        chain = replace(each.chain, readings=replace(readings, value=value)).with_position_noise((STAMP_NOISE,))
-        late.append(replace(solve_local_map(chain), is_noisy=True))
+        segment = replace(each.segment, readings=replace(readings, value=value)).with_position_noise((STAMP_NOISE,))
+        late.append(replace(solve_local_map(segment), is_noisy=True))
     (sigma,) = [each for each in fit_noise(late, PRIOR).sigmas if each.name == STAMP_NOISE]
     assert sigma.value == pytest.approx(jitter_s, abs=0.003)
 
 
 def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -> None:
     """Else what a good estimate leaves would look like sigmas that are far too small."""
-    chain = maps[0].chain.with_position_noise((STAMP_NOISE,))
+    segment = maps[0].segment.with_position_noise((STAMP_NOISE,))
     names = ("sigma_corner_px", STAMP_NOISE)
     sigma = np.array([0.2, 0.5])
-    looker = Looker(noise_fit._part(solve_local_map(chain), chain, PRIOR, names))
+    looker = Looker(noise_fit._part(solve_local_map(segment), segment, PRIOR, names))
     variances = np.append(sigma**2, np.full(4, 0.05))
     seen = looker.look(variances)
     assert (seen.traces @ variances < 1.02 * seen.at_most).all()
@@ -176,44 +176,44 @@ def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -
 def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
     """A bias that lasts for metres: corners look better than what they say of the tag's place."""
     simulate("nsh", 3, tmp_path / "nsh", ["hallway"], render=False)
-    maps = [solve_local_map(chain) for log in find_logs([tmp_path]) for chain in chains_of(load_run(log), PRIOR)]
+    maps = [solve_local_map(segment) for log in find_logs([tmp_path]) for segment in segments_of(load_run(log), PRIOR)]
     rng = np.random.default_rng(1)
     biased = []
     for each in maps:
-        readings = each.chain.readings
+        readings = each.segment.readings
         root = np.linalg.cholesky(readings.covariance)
-        part = (np.append(0.0, np.cumsum(each.chain.odometry.distance_m))[readings.keyframe] / 2.5).astype(int)
+        part = (np.append(0.0, np.cumsum(each.segment.odometry.distance_m))[readings.keyframe] / 2.5).astype(int)
         n_parts = int(part.max()) + 1
-        shared = rng.standard_normal((n_parts, len(each.chain.tags), 2))[part, readings.tag]
+        shared = rng.standard_normal((n_parts, len(each.segment.tags), 2))[part, readings.tag]
         value = readings.value + (root @ shared[..., None])[..., 0]
-        biased.append(solve_local_map(replace(each.chain, readings=replace(readings, value=value))))
+        biased.append(solve_local_map(replace(each.segment, readings=replace(readings, value=value))))
     good, bad = fit_and_weigh(maps, PRIOR), fit_and_weigh(biased, PRIOR)
     assert good.fitted.shared_range + good.fitted.pass_range < 0.03
     assert bad.fitted.shared_range + bad.fitted.pass_range > 0.1
     for before, after in zip(biased, bad.maps, strict=True):
-        spread = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
+        spread = after.segment.readings.covariance[:, 0, 0] / before.segment.readings.covariance[:, 0, 0]
         assert np.median(spread) > 2.0
-        np.testing.assert_allclose(after.chain.readings.parts.under(bad.noise), after.chain.readings.covariance)
+        np.testing.assert_allclose(after.segment.readings.parts.under(bad.noise), after.segment.readings.covariance)
 
 
 @pytest.mark.parametrize("prior", [PRIOR, NoiseParameters(sigma_corner_px=0.05)])
 def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap], prior: NoiseParameters) -> None:
     """Of m readings of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
-    plain = [solve_local_map(each.chain.with_noise(prior)) for each in maps]
+    plain = [solve_local_map(each.segment.with_noise(prior)) for each in maps]
     refined = []
     for each in plain:
-        bias_px = np.tile([0.1, 0.2], (len(each.chain.readings), 1))
-        chain = replace(each.chain, readings=replace(each.chain.readings, corner_bias_px=bias_px))
-        refined.append(replace(each, chain=chain))
+        bias_px = np.tile([0.1, 0.2], (len(each.segment.readings), 1))
+        segment = replace(each.segment, readings=replace(each.segment.readings, corner_bias_px=bias_px))
+        refined.append(replace(each, segment=segment))
     for before, after in zip(
         with_noise_of_map(plain, prior, None), with_noise_of_map(refined, prior, None), strict=True
     ):
-        assert (before.chain.readings.corner_sigmas == 1.0).all()
-        times = after.chain.readings.covariance[:, 0, 0] / before.chain.readings.covariance[:, 0, 0]
+        assert (before.segment.readings.corner_sigmas == 1.0).all()
+        times = after.segment.readings.covariance[:, 0, 0] / before.segment.readings.covariance[:, 0, 0]
         m = (times - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
         np.testing.assert_allclose(m, np.rint(m), rtol=1e-6)
         of_corners = m * 0.2**2 / (prior.sigma_corner_px**2 + 0.2**2)
-        np.testing.assert_allclose(after.chain.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
+        np.testing.assert_allclose(after.segment.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
         assert m.min() >= 1.0
         assert m.max() > 5.0
 
@@ -227,14 +227,14 @@ def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
     for refined in (False, True):
         workings = Workings()
         build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
-        chains = [each.chain for each in workings.maps]
-        times.append(np.concatenate([chain.readings.corner_sigmas for chain in chains]).max())
+        segments = [each.segment for each in workings.maps]
+        times.append(np.concatenate([segment.readings.corner_sigmas for segment in segments]).max())
     assert times[1] > 1.2 * times[0]
 
 
 def test_readings_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:
     """A few metres past a tag: the scatter of its corners says nothing of a bias in all of them."""
-    short = maps[0].chain.prefix(60)
+    short = maps[0].segment.prefix(60)
     better = replace(short, readings=replace(short.readings, value=short.readings.value))
     found = fit_and_weigh([solve_local_map(better)], PRIOR)
     for each in found.fitted.parameters:

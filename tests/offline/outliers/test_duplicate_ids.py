@@ -7,8 +7,8 @@ from groundsbot.calib.foundation.arrays import IntArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.offline.outliers.duplicate_ids import split_duplicates
 from groundsbot.offline.outliers.outliers import split_alone
@@ -69,13 +69,13 @@ def test_two_tags_in_one_picture_are_duplicated() -> None:
 
 
 def test_each_keeps_its_readings_however_they_are_ordered() -> None:
-    (chain,) = (split_duplicates(each) for each in chains_of(drive_past(TAGS), NoiseParameters()))
-    first, second = (chain.readings.tag == i for i in (0, 1))
-    assert [tag.tag_id for tag in chain.tags] == [0, 0, 1, 2, 3]
+    (segment,) = (split_duplicates(each) for each in segments_of(drive_past(TAGS), NoiseParameters()))
+    first, second = (segment.readings.tag == i for i in (0, 1))
+    assert [tag.tag_id for tag in segment.tags] == [0, 0, 1, 2, 3]
     assert first.sum() > 15 and second.sum() > 15  # noqa: PT018
-    bearing = chain.readings.value[:, 1]
+    bearing = segment.readings.value[:, 1]
     assert (bearing[first] > 0.0).all() != (bearing[second] > 0.0).all()
-    assert solve_local_map(chain).goodness.fits
+    assert solve_local_map(segment).goodness.fits
 
 
 def back_and_forth(tags: list[MadeTag], slip_rad: float) -> LocalMap:
@@ -88,8 +88,8 @@ def back_and_forth(tags: list[MadeTag], slip_rad: float) -> LocalMap:
     looks = np.minimum(stamps_ns - drive.stamps_ns[0], drive.stamps_ns[-1] - stamps_ns) < 2 * S
     run = observe(drive, tags, stamps_ns[looks], told)
     noise = NoiseParameters(sigma_heading_rad_per_sqrt_m=0.15)
-    (chain,) = (split_duplicates(each) for each in chains_of(run, noise))
-    return split_alone(solve_local_map(chain))
+    (segment,) = (split_duplicates(each) for each in segments_of(run, noise))
+    return split_alone(solve_local_map(segment))
 
 
 @pytest.mark.parametrize("slip_rad", [-0.55, 0.0, 0.55])
@@ -107,5 +107,5 @@ def test_three_with_one_id_stay_three() -> None:
 
 
 def test_a_drive_past_one_of_each_id_is_left_as_it_is() -> None:
-    (chain,) = chains_of(drive_past(TAGS[1:]), NoiseParameters())
-    assert split_duplicates(chain) is chain
+    (segment,) = segments_of(drive_past(TAGS[1:]), NoiseParameters())
+    assert split_duplicates(segment) is segment

@@ -8,7 +8,7 @@ import pytest
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements.chain import Chain, chains_of
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import grouping
 from groundsbot.offline.outliers.grouping import few_of_each_tag
@@ -24,7 +24,7 @@ SIGMA_M = 0.02
 
 
 @cache
-def laps() -> Chain:
+def laps() -> Segment:
     """Round and round, each tag read once a lap; the last one is moved by a metre while a lap goes on."""
     drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.6, N_LAPS * 5.0 * np.pi)], step_ns=S // 10)
     lap_ns = int((drive.stamps_ns[-1] - drive.stamps_ns[0]) / N_LAPS)
@@ -37,8 +37,8 @@ def laps() -> Chain:
     seen = seen + SIGMA_M * np.random.default_rng(4).standard_normal(seen.shape)
     positions = make_positions(stamps_ns, ids, seen, SIGMA_M)
     tags = [TagKey(FAMILY, i) for i in range(4)]
-    (chain,) = chains_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
-    return chain
+    (segment,) = segments_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
+    return segment
 
 
 @cache
@@ -72,7 +72,7 @@ def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.M
         own = np.unique(whole.of_reading[few.of_reading == s])
         assert (np.diff(own) == 1).all()
         assert (few.first_ns[s], few.last_ns[s]) == (whole.first_ns[own].min(), whole.last_ns[own].max())
-    assert (np.lexsort((few.first_ns, few.chain, few.id)) == np.arange(len(few))).all()
+    assert (np.lexsort((few.first_ns, few.segment, few.id)) == np.arange(len(few))).all()
 
 
 def test_few_tags_leave_room_to_those_that_are_seen_often() -> None:
@@ -87,11 +87,11 @@ def test_a_move_is_found_to_the_passing(most: int, monkeypatch: pytest.MonkeyPat
     """Gathered or not: two places, of the readings before and after."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     found = split_alone(solve_drives())
-    tags = found.chain.tags
+    tags = found.segment.tags
     assert [(tag.tag_id, bool(tag.instance)) for tag in tags] == [
         (0, False), (1, False), (2, False), (3, True), (3, True),
     ]  # fmt: skip
-    readings = found.chain.readings
+    readings = found.segment.readings
     moved = np.array([tags[i].instance for i in readings.tag])[readings.tag >= 3]
     assert (moved[:MOVED_AFTER] == moved[0]).all()
     assert (moved[MOVED_AFTER:] == moved[-1]).all()

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.left_out import read_as_another, without_tags
 from groundsbot.offline.sam.graph import Graph, build_graph
@@ -39,8 +39,8 @@ def _run(once_m: NDArray[np.float64]) -> Run:
 
 
 def _map(once_m: NDArray[np.float64], n_misread: int) -> LocalMap:
-    (chain,) = chains_of(_run(once_m), NoiseParameters())
-    return replace(solve_local_map(chain), n_misread=n_misread)
+    (segment,) = segments_of(_run(once_m), NoiseParameters())
+    return replace(solve_local_map(segment), n_misread=n_misread)
 
 
 def _misread(local_map: LocalMap, graph: Graph | None = None) -> set[TagKey]:
@@ -66,7 +66,7 @@ def test_other_tags_of_one_reading_are_placed(once_m: NDArray[np.float64], n_mis
 
 def test_a_tag_that_a_map_knows_is_there_however_seldom_it_is_read() -> None:
     local_map = _map(MISREAD_M, 1)
-    graph = build_graph([local_map.chain])
+    graph = build_graph([local_map.segment])
     measured = graph.problem.measured
     known = replace(measured.known, tags=np.array([graph.tags.index(ONCE)]))
     graph = replace(graph, problem=replace(graph.problem, measured=replace(measured, known=known)))

@@ -10,7 +10,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import Grown
 from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
@@ -23,7 +23,7 @@ from tests.support.data.long_drives import with_a_moved_tag
 @pytest.mark.parametrize(("kind", "moved_m", "turned_deg"), [("carried", 2.0, 0.0), ("slipped", 3.0, 0.0)])
 def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: float) -> None:
     broken = broken_drive(kind, 1)
-    found = find_break(solve_local_map(broken.drive.chain))
+    found = find_break(solve_local_map(broken.drive.segment))
     assert found is not None
     assert found.reach[0] <= broken.end - 1
     assert found.reach[1] >= broken.begin
@@ -34,7 +34,7 @@ def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: flo
 
 def test_a_slip_for_which_the_solve_gives_up_readings_is_found() -> None:
     broken = broken_drive("slipped", 11)
-    found = find_break(solve_local_map(broken.drive.chain))
+    found = find_break(solve_local_map(broken.drive.segment))
     assert found is not None
     assert found.reach[0] <= broken.end - 1
     assert found.reach[1] >= broken.begin
@@ -42,14 +42,14 @@ def test_a_slip_for_which_the_solve_gives_up_readings_is_found() -> None:
 
 def test_the_map_is_as_good_as_that_of_two_runs() -> None:
     outcome = outcome_of("turned", 1)
-    assert (outcome.can_be_told, outcome.n_stretches) == (True, 2)
+    assert (outcome.can_be_told, outcome.n_segments) == (True, 2)
     assert outcome.rms_m < 1.1 * outcome.two_runs_rms_m
     assert "1 of 1 drives split; of 1 that two tags tell of, 1 found" in summary([outcome])
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_split_where_nothing_broke(seed: int) -> None:
-    local_map = solve_local_map(make_clean_drive(seed).chain)
+    local_map = solve_local_map(make_clean_drive(seed).segment)
     mended = split_at_breaks([local_map])
     assert mended.maps == [local_map]
     assert not mended.warnings
@@ -62,13 +62,13 @@ def test_a_tag_that_was_moved_is_no_break() -> None:
 
 @pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
 def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
-    drive = make_clean_drive(0).chain
+    drive = make_clean_drive(0).segment
     readings = drive.readings.where(np.arange(len(where)))
-    chain = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
+    segment = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
     whole = Grown(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
-    places = _places(chain, whole, whole)
+    places = _places(segment, whole, whole)
     assert all(0 < place.end <= place.begin < 10 for place in places)
-    assert all(np.isfinite(_seconds_between(chain, place)) for place in places)
+    assert all(np.isfinite(_seconds_between(segment, place)) for place in places)
     assert (places == []) == (len(where) == 1)
 
 
@@ -91,7 +91,7 @@ def map_runs(T_moved: tuple[float, float, float]) -> MapResult:
     at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(stamps_ns) : 3, 0 : len(PLACES)])
     seen = se2.apply(se2.inverse(poses[at]), np.array(list(PLACES.values()))[tag])
     run = make_run(
-        [WheelTrack(stamps_ns, left_m, right_m)],
+        [WheelSegment(stamps_ns, left_m, right_m)],
         robot=make_robot("carl"),
         tags=[TagKey(FAMILY, key) for key in PLACES],
         positions=make_positions(stamps_ns[at], tag, seen),
@@ -126,6 +126,6 @@ def test_a_robot_that_was_not_moved_stays_one() -> None:
 
 def test_stretches_of_several_runs_keep_their_names() -> None:
     one, other = (
-        solve_local_map(replace(make_clean_drive(seed).chain.prefix(200), name=f"r{seed}")) for seed in (0, 1)
+        solve_local_map(replace(make_clean_drive(seed).segment.prefix(200), name=f"r{seed}")) for seed in (0, 1)
     )
-    assert [each.chain.name for each in split_at_breaks([one, other]).maps] == ["r0", "r1"]
+    assert [each.segment.name for each in split_at_breaks([one, other]).maps] == ["r0", "r1"]

@@ -20,8 +20,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.evidence import linearise_observations, marginalise, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
@@ -128,7 +128,7 @@ def test_a_run_that_has_most_of_its_tags_elsewhere_is_wrong_itself() -> None:
 
 @cache
 def local_maps() -> tuple[LocalMap, ...]:
-    return tuple(solve_local_map(drive.chain) for drive in make_scene(31).drives)
+    return tuple(solve_local_map(drive.segment) for drive in make_scene(31).drives)
 
 
 @cache
@@ -153,7 +153,7 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     place = seen.place.copy()
     place[own] = place.max() + 1
     tags = instances(seen.sightings, place)
-    apart = build_graph(with_instances(seen.graph.chains, seen.sightings, tags))
+    apart = build_graph(with_instances(seen.graph.segments, seen.sightings, tags))
     start = apart.start(joined.state.poses, {}, seen.graph.calibration_of(joined.state))
     split = solve(apart.problem, start, losses=PLAIN_SQUARES)
     assert gain == pytest.approx(2.0 * (joined.cost - split.cost), rel=0.02, abs=0.02)
@@ -202,7 +202,7 @@ def test_sightings_end_where_a_tag_is_out_of_sight() -> None:
     for s in range(len(seen.sightings)):
         readings = np.flatnonzero(seen.sightings.of_reading == s)
         assert len(readings) == seen.sightings.n_readings[s]
-    again = sightings_of(seen.graph.chains, np.ones(len(seen.sightings.of_reading), dtype=np.bool_))
+    again = sightings_of(seen.graph.segments, np.ones(len(seen.sightings.of_reading), dtype=np.bool_))
     assert (again.n_readings == 1).all()
 
 
@@ -223,7 +223,7 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
 def _search_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> Searched:
     """One run after the other, whose noise was fitted or not, solved together and searched."""
     runs = [observe_at(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
-    maps = [replace(solve_local_map(chain), is_noisy=is_noisy) for run in runs for chain in chains_of(run, NOISE)]
+    maps = [replace(solve_local_map(segment), is_noisy=is_noisy) for run in runs for segment in segments_of(run, NOISE)]
     merged = merge(maps)
     maps = with_outliers_apart(maps, merged)
     found = split_together(*solve_global_map(maps, merged.groups[0], Stages()), maps)
@@ -243,7 +243,7 @@ def test_places_within_sight_of_each_other_are_one_where_noise_was_fitted(
 
 
 def test_a_tag_that_two_alignments_doubt_and_others_join_keeps_its_name() -> None:
-    maps = [solve_local_map(chain) for hall in NAMES[:3] for chain in chains_of(observe_at(hall, HALL), NOISE)]
+    maps = [solve_local_map(segment) for hall in NAMES[:3] for segment in segments_of(observe_at(hall, HALL), NOISE)]
     merged = merge(maps)
     tag = TagKey(FAMILY, 3)
 
@@ -256,6 +256,6 @@ def test_a_tag_that_two_alignments_doubt_and_others_join_keeps_its_name() -> Non
     assert pairs[0].alignment is not None
     assert pairs[0].alignment.outliers == (tag,)
     one = with_outliers_apart(maps, replace(merged, pairs=tuple(pairs)))
-    assert [each.chain.tags for each in one] == [each.chain.tags for each in maps]
+    assert [each.segment.tags for each in one] == [each.segment.tags for each in maps]
     apart = with_outliers_apart(maps, replace(merged, pairs=tuple(doubted(each) for each in merged.pairs)))
-    assert [each.chain.tags[3].instance for each in apart] == ["a", "b", "c"]
+    assert [each.segment.tags[3].instance for each in apart] == ["a", "b", "c"]

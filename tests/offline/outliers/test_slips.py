@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.outliers.slips import sentence, without_slips
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
@@ -20,38 +20,38 @@ def _drive(seed: int) -> LongDrive:
     return make_long_drive(seed, 60.0, town=make_town(seed, (0.6, 1.2)))
 
 
-def _rotate(chain: Chain, keyframe: int) -> Chain:
+def _rotate(segment: Segment, keyframe: int) -> Segment:
     """The drive whose robot was turned after a keyframe, of which its wheels know nothing."""
-    motion = chain.odometry.motion.copy()
+    motion = segment.odometry.motion.copy()
     motion[keyframe] = se2.compose(motion[keyframe], np.array([0.0, 0.0, -TURNED_RAD]))
-    return replace(chain, odometry=replace(chain.odometry, motion=motion))
+    return replace(segment, odometry=replace(segment.odometry, motion=motion))
 
 
-def _solve(chain: Chain, drive: LongDrive) -> LocalMap:
+def _solve(segment: Segment, drive: LongDrive) -> LocalMap:
     """Near the truth, as a drive is found whose noise was fitted."""
-    graph = build_graph([chain])
-    found = solve_local_map(drive.chain)
-    return replace(found, chain=chain, graph=graph, solution=solve(graph.problem, drive.true_state(graph)))
+    graph = build_graph([segment])
+    found = solve_local_map(drive.segment)
+    return replace(found, segment=segment, graph=graph, solution=solve(graph.problem, drive.true_state(graph)))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_turn_that_the_wheels_do_not_know_is_freed(seed: int) -> None:
     drive = _drive(seed)
-    readings = np.unique(drive.chain.readings.keyframe)
+    readings = np.unique(drive.segment.readings.keyframe)
     keyframe = int(readings[len(readings) // 2])
-    whole = _solve(_rotate(drive.chain, keyframe), drive)
+    whole = _solve(_rotate(drive.segment, keyframe), drive)
     found, slips = without_slips(whole)
     (slip,) = [each for each in slips if each.first <= keyframe < each.end]
     assert np.degrees(slip.jump[2]) == pytest.approx(25.0, abs=3.0)
     assert len(slips) == 1
     assert found.solution.converged
-    assert found.solution.cost < 1.05 * _solve(drive.chain, drive).solution.cost < 0.9 * whole.solution.cost
+    assert found.solution.cost < 1.05 * _solve(drive.segment, drive).solution.cost < 0.9 * whole.solution.cost
     assert "in 1 place the robot moved as its wheels do not explain:" in sentence(found, slips)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nothing_is_freed_where_wheels_are_right(seed: int) -> None:
-    whole = _solve(_drive(seed).chain, _drive(seed))
+    whole = _solve(_drive(seed).segment, _drive(seed))
     found, slips = without_slips(whole)
     assert not slips
     assert found is whole
@@ -59,11 +59,11 @@ def test_nothing_is_freed_where_wheels_are_right(seed: int) -> None:
 
 def test_many_slips_are_counted_and_the_largest_named() -> None:
     drive = _drive(1)
-    chain = drive.chain
-    readings = np.unique(chain.readings.keyframe)
+    segment = drive.segment
+    readings = np.unique(segment.readings.keyframe)
     for share in (0.2, 0.4, 0.6, 0.8):
-        chain = _rotate(chain, int(readings[int(share * len(readings))]))
-    found, slips = without_slips(_solve(chain, drive))
+        segment = _rotate(segment, int(readings[int(share * len(readings))]))
+    found, slips = without_slips(_solve(segment, drive))
     assert len(slips) == 4
     said = sentence(found, slips)
     assert "in 4 places" in said

@@ -133,7 +133,7 @@ def test_stretches_look_alike_and_count_as_one_run() -> None:
     stretch = replace(component.runs[1], name="blue_two_stretch2", T_map_start=START_B + np.array([5.0, 0.0, 0.0]))
     figure = draw_map(make_map(replace(component, runs=(*component.runs, stretch))))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "blue_two: 3.8 m, 3 tags, 2 stretches" in labels
+    assert "blue_two: 3.8 m, 3 tags, 2 segments" in labels
     assert "2 runs" in figure.get_suptitle()
 
 

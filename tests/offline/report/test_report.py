@@ -158,13 +158,13 @@ def test_timelines_show_speed_tags_gaps_and_events(inside: Inside) -> None:
     assert first["t_s"][-1] == pytest.approx(5.5, abs=0.3)
     assert (first["gaps"], first["events"]) == ([], [])
     solved = workings.solved[0]
-    chain = solved.graph.chains[0]
-    track = chain.run.stretches[0]
+    segment = solved.graph.segments[0]
+    track = segment.run.wheel_segments[0]
     kept = (track.stamps_ns < START_NS + 2 * S) | (track.stamps_ns > START_NS + 3 * S)
     holed = replace(track, stamps_ns=track.stamps_ns[kept], left_m=track.left_m[kept], right_m=track.right_m[kept])
     events = (RunEvent(START_NS + S, True, HOSTILE), RunEvent(START_NS + 100 * S, False, "stopped"))
-    changed = replace(chain, run=replace(chain.run, stretches=(holed,), events=events))
-    graph = replace(solved.graph, chains=(changed, *solved.graph.chains[1:]))
+    changed = replace(segment, run=replace(segment.run, wheel_segments=(holed,), events=events))
+    graph = replace(solved.graph, segments=(changed, *solved.graph.segments[1:]))
     lame = Workings(workings.maps, [solved._replace(graph=graph)])
     first = figures(document, lame)["timelines"][0]
     assert first["gaps"] == [[1.99, 3.01]]
@@ -252,14 +252,14 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
     trace = _trace("a_one", {"a_one": "#000000"}, poses)
     assert len(trace["x"]) <= _MOST_POINTS + 1
     assert [trace["x"][0], trace["x"][-1]] == pytest.approx([poses[0, 0], poses[-1, 0]], abs=1e-3)
-    chain = inside[1].solved[0].graph.chains[0]
+    segment = inside[1].solved[0].graph.segments[0]
     rng = np.random.default_rng(0)
     n, m = 10_000, 30_000
     long = replace(
-        chain,
+        segment,
         stamps_ns=START_NS + np.arange(n) * (S // 10),
-        odometry=replace(chain.odometry, distance_m=rng.uniform(0.0, 0.1, n - 1)),
-        readings=replace(chain.readings, keyframe=np.sort(rng.integers(0, n, m))),
+        odometry=replace(segment.odometry, distance_m=rng.uniform(0.0, 0.1, n - 1)),
+        readings=replace(segment.readings, keyframe=np.sort(rng.integers(0, n, m))),
     )
     drawn = timeline(long, rng.uniform(0.0, 4.0, m), [])
     assert len(drawn["t_s"]) <= _MOST_TIMES

@@ -119,7 +119,7 @@ def test_steps_and_covariances_equal_dense_algebra(
         assert (np.abs(marginal - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
 
 
-def test_long_chains_pass_through_all_levels() -> None:
+def test_long_segments_pass_through_all_levels() -> None:
     problem, truth = make_graph(4, [700, 40], 30, reach=0.04)
     H, g = plain_normal_equations(problem, truth, DEFAULT_LOSSES)
     arrowhead = arrowhead_of(problem)
@@ -137,7 +137,7 @@ def test_long_chains_pass_through_all_levels() -> None:
     factorisation, condition = arrowhead.factorise(system), float(np.linalg.cond(H.toarray()))
     found = factorisation.covariance(wanted)
     assert (np.abs(found - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
-    # Of poses alone, all at once or some: in leaves, between them, at a cut of each level, in either chain.
+    # Of poses alone, all at once or some: in leaves, between them, at a cut of each level, in either segment.
     poses = np.r_[739:0:-7, 0]
     inverse = np.linalg.inv(H.toarray())
     some = factorisation.pose_covariances(poses)
@@ -207,9 +207,9 @@ def test_products_hold_what_was_measured(seed: int, lengths: list[int]) -> None:
     assert np.linalg.norm(product - H @ x) <= 1e-9 * np.linalg.norm(H @ x)
 
 
-def test_a_distance_from_the_middle_of_a_chain_is_refused() -> None:
+def test_a_distance_from_the_middle_of_a_segment_is_refused() -> None:
     problem, truth = make_graph(3, [20], 3)
     problem = with_measured(problem, truth, 3, 1)
     distances = replace(problem.measured.distances, pose_a=np.array([5]), tag_a=np.array([-1]))
-    with pytest.raises(ValueError, match="first pose of a chain"):
+    with pytest.raises(ValueError, match="first pose of a segment"):
         arrowhead_of(replace(problem, measured=replace(problem.measured, distances=distances)))

@@ -86,7 +86,7 @@ def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
     )
     loose = Problem(problem.odometry, readings, problem.prior, problem.columns, np.zeros(3, dtype=np.int64))
     found = solve(loose, truth)
-    assert found.unobservable.chains == (1,)
+    assert found.unobservable.segments == (1,)
     assert found.rank == problem.columns.n - 3
     assert np.isfinite(found.state.poses).all()
     sigma = np.sqrt(found.covariance(problem.columns.poses[60]).diagonal())

@@ -10,8 +10,8 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.sam.budget import Effort, efforts_of, size_of, step_work
 from groundsbot.offline.sam.graph import build_graph
@@ -57,7 +57,7 @@ def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_ref
     line = refusal(log)
     assert "made.mcap" in line
     assert f"restarted {most + 1} times, limit {most} for a log of {log.stat().st_size} bytes" in line
-    assert len(load_run(write_file(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).stretches) == most + 1
+    assert len(load_run(write_file(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).wheel_segments) == most + 1
 
 
 def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
@@ -105,7 +105,7 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     run = load_run(log)
     used_ns = [START_NS + index * 100 * MS for index in range(0, 2000, every)]
     assert run.positions.stamps_ns.tolist() == [each for each in used_ns for _ in range(2)]
-    assert len(run.stretches[0].stamps_ns) == 2000
+    assert len(run.wheel_segments[0].stamps_ns) == 2000
     (warning,) = [each for each in run.warnings if "look" in each]
     assert (
         warning == f"gb1_r: 4000 tag readings are more than a log of {size} bytes is worth; one look in {every} is used"
@@ -124,9 +124,9 @@ def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
 
 
 def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
-    (chain,) = chains_of(load_run(write_file(observe(80, 650, 100), tmp_path)), NoiseParameters())
+    (segment,) = segments_of(load_run(write_file(observe(80, 650, 100), tmp_path)), NoiseParameters())
     with pytest.raises(OfflineError) as refused:
-        solve_local_map(chain)
+        solve_local_map(segment)
     (line,) = str(refused.value).splitlines()
     for words in ("made.mcap: gb1_r: 8000 readings of 650 tags from 80 keyframes", "limit 1.0e9", "leave out some"):
         assert words in line
@@ -135,49 +135,49 @@ def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_pat
 def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
     effort = Effort.of_log(run.log_bytes)
-    first, second, third = chains_of(run, NoiseParameters())
-    for chain in (first, second):
-        effort.check(build_graph([chain]).problem, run.log, chain.name)
-    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's stretches see more tags"):
+    first, second, third = segments_of(run, NoiseParameters())
+    for segment in (first, second):
+        effort.check(build_graph([segment]).problem, run.log, segment.name)
+    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments see more tags"):
         effort.check(build_graph([third]).problem, run.log, third.name)
 
 
 def test_stretches_share_what_their_log_is_worth() -> None:
-    chain = make_long_drive(4, 100.0).chain
-    work = step_work(build_graph([chain]).problem)
+    segment = make_long_drive(4, 100.0).segment
+    work = step_work(build_graph([segment]).problem)
     effort = Effort.of_log(0)
     effort.allowed = 2.5 * 30 * work
-    solve_local_map(chain, effort)
-    solve_local_map(chain, effort)
+    solve_local_map(segment, effort)
+    solve_local_map(segment, effort)
     with pytest.raises(OfflineError, match="multiplications"):
-        solve_local_map(chain, effort)
+        solve_local_map(segment, effort)
 
 
 def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 10, 20), tmp_path))
-    chains = [chain.part(0, 5 * (i + 1)) for i, chain in enumerate(chains_of(run, NoiseParameters()))]
-    whole, efforts = Effort.of_log(run.log_bytes), efforts_of(chains)
+    segments = [segment.part(0, 5 * (i + 1)) for i, segment in enumerate(segments_of(run, NoiseParameters()))]
+    whole, efforts = Effort.of_log(run.log_bytes), efforts_of(segments)
     assert sum(each.allowed for each in efforts) == pytest.approx(whole.allowed)
     assert [each.allowed / efforts[0].allowed for each in efforts] == pytest.approx(
-        [size_of(chain) / size_of(chains[0]) for chain in chains]
+        [size_of(segment) / size_of(segments[0]) for segment in segments]
     )
     assert [each.left for each in efforts] == [each.allowed for each in efforts]
 
 
 def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
     """A step may take seven, and one that was begun is ended."""
-    (chain,) = chains_of(load_run(write_file(resets(1, 10, 60), tmp_path)), NoiseParameters())
-    graph = build_graph([chain])
-    start = graph.start(np.zeros((len(chain.stamps_ns), 3)), {}, {})
+    (segment,) = segments_of(load_run(write_file(resets(1, 10, 60), tmp_path)), NoiseParameters())
+    graph = build_graph([segment])
+    start = graph.start(np.zeros((len(segment.stamps_ns), 3)), {}, {})
     whole, some = solve(graph.problem, start), solve(graph.problem, start, most_tries=5)
     assert 5 < some.n_linearised <= 1 + 5 + 6 < whole.n_linearised
     assert some.reason.startswith("stopped after ")
 
 
 def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (chain,) = chains_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
+    (segment,) = segments_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
     effort = Effort(2e9, 2e9, 1e9)
-    found, taken = solve_local_map(chain, effort), list[float]()
+    found, taken = solve_local_map(segment, effort), list[float]()
 
     def counted(*args: object, **kwargs: object) -> Solution:
         solution = solve(*args, **kwargs)  # type: ignore[arg-type]  # as it was called
@@ -185,12 +185,12 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         return solution
 
     monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
-    information_of([found], {chain.run.name: chain.run.robot}, NoiseParameters(), [effort], corners=False)
+    information_of([found], {segment.run.name: segment.run.robot}, NoiseParameters(), [effort], corners=False)
     assert 0.0 < sum(taken) < 0.5 * effort.allowed
 
 
 def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
-    local_map = solve_local_map(broken_drive("carried", 1).drive.chain)
+    local_map = solve_local_map(broken_drive("carried", 1).drive.segment)
     maps, warnings = split_at_breaks([local_map], [Effort(1e8, 1e8, 1e9)])
     assert maps == [local_map]
     (warning,) = warnings
@@ -199,9 +199,9 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
 
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
-    (chain,) = chains_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
+    (segment,) = segments_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
     effort = Effort(6e9, 6e9, 1e9)
-    found = solve_local_map(chain, effort)
+    found = solve_local_map(segment, effort)
     assert not found.goodness.fits
     assert "contradict each other" in found.goodness.warnings("it")[0]
     assert effort.left > -0.5 * effort.allowed
@@ -210,13 +210,13 @@ def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_
 @pytest.mark.parametrize(("length_m", "picture_every"), [(250.0, 1), (500.0, 5)])
 def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every: int) -> None:
     """Even where its log is as small as it can be."""
-    chain = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).chain
-    log_bytes = BYTES_A_LOOK * len(chain.stamps_ns) + BYTES_A_READING * len(chain.readings.tag)
+    segment = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).segment
+    log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_READING * len(segment.readings.tag)
     effort = Effort.of_log(log_bytes)
-    found = solve_local_map(chain, effort)
+    found = solve_local_map(segment, effort)
     assert found.solution.converged
     assert found.goodness.fits
     assert effort.left > 0.5 * effort.allowed
     assert effort.tries(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
-    everything = solve_local_map(chain, Effort.of_log(1 << 30))
+    everything = solve_local_map(segment, Effort.of_log(1 << 30))
     np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)

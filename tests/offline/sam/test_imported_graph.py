@@ -18,8 +18,8 @@ from groundsbot.calib.robot.parameters import (
     TIME_OFFSET,
     WHEEL_PARAMETERS,
 )
-from groundsbot.offline.measurements.chain import Chain, chains_of
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph, build_graph
@@ -56,23 +56,23 @@ def imported_run(*, polar: bool, in_camera: bool, late_s: float = 0.0, too_long_
     return make_run([DRIVE.track], robot=ROBOT, camera=None, tags=keys, positions=positions)
 
 
-def chain_of(run: Run) -> Chain:
-    (chain,) = chains_of(run, NoiseParameters())
-    assert len(chain.readings) > 20
-    return chain
+def segment_of(run: Run) -> Segment:
+    (segment,) = segments_of(run, NoiseParameters())
+    assert len(segment.readings) > 20
+    return segment
 
 
-def misfit(graph: Graph, chain: Chain, **calibration: float) -> FloatArray:
+def misfit(graph: Graph, segment: Segment, **calibration: float) -> FloatArray:
     """(M, 2) readings less what they should be, in sigmas, at the true state."""
     numbers = np.array([calibration.get(parameter.name, 0.0) for parameter in graph.parameters])
     assert all(name in [parameter.name for parameter in graph.parameters] for name in calibration)
-    return graph.problem.readings.residual(State(DRIVE.at(chain.stamps_ns), TAGS_M, numbers))
+    return graph.problem.readings.residual(State(DRIVE.at(segment.stamps_ns), TAGS_M, numbers))
 
 
 @forms
 @frames
 def test_what_is_open_is_what_positions_depend_on(polar: bool, in_camera: bool) -> None:
-    graph = build_graph([chain_of(imported_run(polar=polar, in_camera=in_camera))])
+    graph = build_graph([segment_of(imported_run(polar=polar, in_camera=in_camera))])
     found = {parameter.name: parameter for parameter in graph.parameters if parameter.name}
     of_sensor = {TIME_OFFSET, RANGE_OFFSET}
     assert set(found) == {*WHEEL_PARAMETERS, TAG_SCALE, *of_sensor, *(MOUNT_PARAMETERS if in_camera else ())}
@@ -89,8 +89,8 @@ def test_what_is_open_is_what_positions_depend_on(polar: bool, in_camera: bool) 
 def test_a_robot_that_stands_tells_nothing_of_its_clock() -> None:
     run = imported_run(polar=True, in_camera=True)
     still = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 4.0)])
-    (chain,) = chains_of(replace(run, stretches=(still.track,)), NoiseParameters())
-    names = [parameter.name for parameter in build_graph([chain]).parameters]
+    (segment,) = segments_of(replace(run, wheel_segments=(still.track,)), NoiseParameters())
+    names = [parameter.name for parameter in build_graph([segment]).parameters]
     assert TIME_OFFSET not in names
     assert RANGE_OFFSET in names
 
@@ -100,19 +100,19 @@ def test_a_robot_that_stands_tells_nothing_of_its_clock() -> None:
 def test_the_time_offset_puts_late_stamps_right_as_retiming_does(polar: bool, in_camera: bool) -> None:
     late_s = 0.01
     late = imported_run(polar=polar, in_camera=in_camera, late_s=late_s)
-    chain = chain_of(late)
-    graph = build_graph([chain])
-    wrong = np.abs(misfit(graph, chain)).max()
+    segment = segment_of(late)
+    graph = build_graph([segment])
+    wrong = np.abs(misfit(graph, segment)).max()
     assert wrong > 0.1
-    assert np.abs(misfit(graph, chain, time_offset_s=late_s)).max() < 0.02 * wrong
-    on_time = chain_of(late.shift_stamps(late_s))
+    assert np.abs(misfit(graph, segment, time_offset_s=late_s)).max() < 0.02 * wrong
+    on_time = segment_of(late.shift_stamps(late_s))
     assert np.abs(misfit(build_graph([on_time]), on_time)).max() < 1e-6
 
 
 @forms
 @frames
 def test_the_range_offset_puts_ranges_right_that_are_too_long(polar: bool, in_camera: bool) -> None:
-    chain = chain_of(imported_run(polar=polar, in_camera=in_camera, too_long_m=0.05))
-    graph = build_graph([chain])
-    assert np.abs(misfit(graph, chain)).max() > 3.0
-    assert np.abs(misfit(graph, chain, range_offset_m=0.05)).max() < 1e-6
+    segment = segment_of(imported_run(polar=polar, in_camera=in_camera, too_long_m=0.05))
+    graph = build_graph([segment])
+    assert np.abs(misfit(graph, segment)).max() > 3.0
+    assert np.abs(misfit(graph, segment, range_offset_m=0.05)).max() < 1e-6

@@ -14,7 +14,7 @@ from tests.support.data.graphs import make_graph
 
 
 def make_skeleton(seed: int, *, calibrated: bool = True) -> tuple[Problem, State, Skeleton]:
-    """Chains of which most poses read nothing, one of them none at all, one of a single pose."""
+    """Segments of which most poses read nothing, one of them none at all, one of a single pose."""
     problem, truth = make_graph(seed, [60, 1, 25], 3, calibrated=calibrated, reach=0.1)
     return problem, truth, problem.skeleton
 
@@ -69,7 +69,7 @@ def test_what_is_kept_stays_where_it_is(calibrated: bool) -> None:
     kept = skeleton.index >= 0
     np.testing.assert_array_equal(same.poses[kept], truth.poses[kept])
     assert np.isfinite(same.poses).all()
-    assert kept[[0, 60, 61]].all()  # where chains begin
+    assert kept[[0, 60, 61]].all()  # where segments begin
     assert kept[problem.readings.pose].all()
     assert not kept.all()
 

@@ -10,15 +10,15 @@ from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements.chain import chains_of
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, State
 from groundsbot.offline.sam.factors.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.drives import FAMILY, START_NS, make_positions, make_robot, make_run
-from tests.support.data.problems import CHAINS, N_TAGS, make_problem, random_state
+from tests.support.data.problems import N_TAGS, SEGMENTS, make_problem, random_state
 
 SEEDS = range(3)
 ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
@@ -173,12 +173,12 @@ def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_neither_order_of_chains_nor_of_tags_matters(seed: int) -> None:
+def test_neither_order_of_segments_nor_of_tags_matters(seed: int) -> None:
     """The same factors and the same held pose, everything numbered anew."""
     made = make_problem(seed, n_outliers=2)
     problem, truth = made.problem, made.truth
     rng = np.random.default_rng(seed)
-    n_first, n_poses = CHAINS[0], sum(CHAINS)
+    n_first, n_poses = SEGMENTS[0], sum(SEGMENTS)
     new_pose = np.concatenate([np.arange(n_first) + n_poses - n_first, np.arange(n_poses - n_first)])
     new_tag = rng.permutation(N_TAGS)
     old_pose, old_tag = np.argsort(new_pose), np.argsort(new_tag)
@@ -221,7 +221,7 @@ def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> Loca
     true = chain_motions(se2.compose(wheels.advance(left_m, right_m, 0.5), disturbance), np.zeros(3))
     stamps_ns = START_NS + 50_000_000 * np.arange(n_steps + 1, dtype=np.int64)
     counted_left_m, counted_right_m = (np.concatenate([[0.0], np.cumsum(each)]) for each in (left_m, right_m))
-    track = WheelTrack(stamps_ns, counted_left_m, counted_right_m)
+    track = WheelSegment(stamps_ns, counted_left_m, counted_right_m)
     pose, tag = (index.reshape(-1) for index in np.mgrid[0 : n_steps + 1, 0 : len(TAGS_M)])
     place = se2.apply(se2.inverse(true[pose]), TAGS_M[tag])
     near = np.linalg.norm(place, axis=1) < 4.0
@@ -233,8 +233,8 @@ def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> Loca
         tags=keys,
         positions=make_positions(stamps_ns[pose[near]], tag[near], read, READING_SIGMA_M),
     )
-    (chain,) = chains_of(run, noise)
-    return solve_local_map(chain)
+    (segment,) = segments_of(run, noise)
+    return solve_local_map(segment)
 
 
 def test_true_calibration_is_found_without_bias() -> None:

@@ -43,10 +43,10 @@ def test_both_ways_agree_to_first_order() -> None:
 
 
 def test_motion_by_motion_each_motion_takes_its_own_part_of_the_step_alone() -> None:
-    """However far the chain as a whole is carried, what a motion changes by is what its two ends disagree in."""
+    """However far the segment as a whole is carried, what a motion changes by is what its two ends disagree in."""
     arrowhead, before, _, after, step = both_ways(0.5)
     poses = step[: 3 * len(before.poses)].reshape(-1, 3)
-    for first, last in zip(arrowhead.tree.chain_start[:-1], arrowhead.tree.chain_start[1:], strict=True):
+    for first, last in zip(arrowhead.tree.segment_start[:-1], arrowhead.tree.segment_start[1:], strict=True):
         motion = se2.between(before.poses[first : last - 1], before.poses[first + 1 : last])
         carried = np.einsum("nij,nj->ni", se2.adjoint(se2.inverse(motion)), poses[first : last - 1])
         own = poses[first + 1 : last] - carried
@@ -79,7 +79,7 @@ def test_a_step_too_long_is_taken_in_part() -> None:
 
 def test_a_long_drive_past_few_tags_arrives_in_few_steps() -> None:
     drive = make_long_drive(25, 500.0)
-    graph = build_graph([drive.chain])
+    graph = build_graph([drive.segment])
     solution = solve(graph.problem, drive.true_state(graph))
     assert solution.converged
     assert solution.n_linearised < 40

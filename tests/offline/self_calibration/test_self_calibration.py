@@ -22,8 +22,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.parameter_results import CalibrationChoice
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.chain import chains_of
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
+from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.sam.budget import Effort
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
 from groundsbot.offline.self_calibration.information import information_of
@@ -71,12 +71,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("corners", [False, True])
 def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners: bool) -> None:
-    (chain,) = chains_of(load_run(log), NOISE)
-    found = solve_local_map(chain)
+    (segment,) = segments_of(load_run(log), NOISE)
+    found = solve_local_map(segment)
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
-    readings = replace(chain.readings, corner_bias_px=np.tile(bias_px, (len(chain.readings), 1)))
-    biased = replace(found, chain=replace(chain, readings=readings))
-    robots, efforts = {chain.run.name: chain.run.robot}, [Effort(1e11, 1e11, 1e9)]
+    readings = replace(segment.readings, corner_bias_px=np.tile(bias_px, (len(segment.readings), 1)))
+    biased = replace(found, segment=replace(segment, readings=readings))
+    robots, efforts = {segment.run.name: segment.run.robot}, [Effort(1e11, 1e11, 1e9)]
     plain, less = (information_of([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
@@ -186,7 +186,7 @@ def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> No
 
 
 def stack_information(values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]) -> Told:
-    """Stretches that each tell of each number on its own."""
+    """Segments that each tell of each number on its own."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
     return Told(tuple(Parameter("r", name, (), sigma) for name, sigma in priors.items()), information, vector)
@@ -208,7 +208,7 @@ def choice(
         ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "foretell the others"),
         ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "foretell the others"),
         ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "no error of calibration"),
-        ([0.05, 0.0], [0.001, 9.0], "track_scale", "single stretch"),
+        ([0.05, 0.0], [0.001, 9.0], "track_scale", "single segment"),
         ([0.05, 0.051, 0.049], [0.001] * 3, "time_offset_s", ""),
     ],
 )
@@ -355,7 +355,7 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
 
 
 def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_too() -> None:
-    """Stretches tell the sum of track and mount, and next to nothing of the one without the other."""
+    """Segments tell the sum of track and mount, and next to nothing of the one without the other."""
     together, mount = np.array([1.0, 0.5]), np.array([0.0, 1.0])
     ahead = [1.2, -0.9, 1.1, -1.0]
     information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))

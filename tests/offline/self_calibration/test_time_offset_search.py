@@ -119,14 +119,14 @@ def test_some_ids_may_be_wrong(share: float) -> None:
 
 def test_stretches_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
     run = position_run(0.3)
-    (track,) = run.stretches
+    (track,) = run.wheel_segments
     half = len(track.stamps_ns) // 2
     first, second = (
         replace(track, stamps_ns=track.stamps_ns[part], left_m=track.left_m[part], right_m=track.right_m[part])
         for part in (slice(None, half), slice(half, None))
     )
-    cut = replace(run, stretches=(first, second))
-    apart = [replace(run, stretches=(each,)) for each in (first, second)]
+    cut = replace(run, wheel_segments=(first, second))
+    apart = [replace(run, wheel_segments=(each,)) for each in (first, second)]
     for found in (tags_by_picture(cut), tags_by_picture(*apart)):
         assert found.offset_s == pytest.approx(0.3, abs=3.0 * found.sigma_s)
     assert tags_by_picture(run, position_run(0.3, seed=1)).sigma_s < tags_by_picture(run).sigma_s + 1e-3
@@ -143,7 +143,7 @@ NO_READINGS = position_run(legs=[(0.0, 0.0, 1.0)])
         pytest.param(position_run(legs=75 * [(0.6, 0.3, 0.4), (0.3, 0.6, 0.4)]), id="as good 0.8 s earlier and later"),
         pytest.param(position_run(legs=ROUND[:2]), id="short"),
         pytest.param(position_run(1.4), id="later than a second"),
-        pytest.param(replace(NO_READINGS, stretches=()), id="no wheels"),
+        pytest.param(replace(NO_READINGS, wheel_segments=()), id="no wheels"),
         pytest.param(NO_READINGS, id="no readings"),
     ],
 )
@@ -159,9 +159,9 @@ def test_what_is_no_number_is_no_reading() -> None:
     assert tags_by_picture(some).offset_s == pytest.approx(0.3, abs=0.02)
     none = replace(run.positions, value=np.full_like(value, np.nan))
     assert search_time_offset([replace(run, positions=none)]) is None
-    (track,) = run.stretches
+    (track,) = run.wheel_segments
     unknown = replace(track, left_m=np.full_like(track.left_m, np.nan))
-    assert search_time_offset([replace(run, stretches=(unknown,))]) is None
+    assert search_time_offset([replace(run, wheel_segments=(unknown,))]) is None
     assert search_time_offset([]) is None
 
 

@@ -74,7 +74,7 @@ def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
     (told,) = events_of(log, EventKind.WHEEL_RESET)
     assert "unknown" in told.text
     loaded = load_run(log)
-    first, second = (stretch.stamps_ns for stretch in loaded.stretches)
+    first, second = (stretch.stamps_ns for stretch in loaded.wheel_segments)
     assert AWAY_S - 0.1 < (second[0] - first[-1]) / _NS_PER_S < AWAY_S + 1.0
     (true,) = truth.runs.values()
     away = true.at(np.linspace(first[-1], second[0], 200).astype(np.int64))

@@ -23,7 +23,7 @@ from groundsbot.calib.geometry import wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.robot_yaml import Mount
 from groundsbot.offline.importing.bags.reader import DEFINITIONS
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.onboard.log.messages import TagDetections, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log
@@ -151,8 +151,8 @@ class BagOfLog:
         )
 
     @property
-    def track(self) -> WheelTrack:
-        (track,) = self.run.stretches
+    def track(self) -> WheelSegment:
+        (track,) = self.run.wheel_segments
         return track
 
     def add(self, topic: str, msgtype: str, stamp_ns: int, fields: dict[str, Any]) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import IntArray
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.chain import Chain
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
-from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
+from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry
+from groundsbot.offline.measurements.segment import Segment
 from tests.support.data.long_drives import LongDrive, Town, make_long_drive, make_town
 
 NOISE = NoiseParameters()
@@ -35,35 +35,35 @@ def make_clean_drive(seed: int, spacing_m: tuple[float, float] = (3.0, 8.0), tow
 
 def carry(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     """After a share of the way the robot is lifted and set down where it would have been some metres on."""
-    along_m = np.append(0.0, np.cumsum(drive.chain.odometry.distance_m))
+    along_m = np.append(0.0, np.cumsum(drive.segment.odometry.distance_m))
     first = int(np.searchsorted(along_m, share * along_m[-1]))
     begin = int(np.searchsorted(along_m, along_m[first] + length_m))
-    chain = drive.chain
-    before, after = chain.part(0, first + 1), chain.part(begin, len(chain.stamps_ns))
-    still = _motionless(chain.odometry, first)
-    return _join(drive, before, after, still, np.r_[0 : first + 1, begin : len(chain.stamps_ns)], PAUSE_S)
+    segment = drive.segment
+    before, after = segment.part(0, first + 1), segment.part(begin, len(segment.stamps_ns))
+    still = _motionless(segment.odometry, first)
+    return _join(drive, before, after, still, np.r_[0 : first + 1, begin : len(segment.stamps_ns)], PAUSE_S)
 
 
 def slip(drive: LongDrive, share: float, length_m: float) -> BrokenDrive:
     """After a share of the way the wheels turn on the spot for some metres; nothing is read meanwhile."""
-    chain = drive.chain
-    first = int(share * len(chain.stamps_ns))
-    before, after = chain.part(0, first + 1), chain.part(first, len(chain.stamps_ns))
+    segment = drive.segment
+    first = int(share * len(segment.stamps_ns))
+    before, after = segment.part(0, first + 1), segment.part(first, len(segment.stamps_ns))
     # The wheels roll on as they did before.
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))
+    along_m = np.append(0.0, np.cumsum(segment.odometry.distance_m))
     begin = int(np.searchsorted(along_m, along_m[first] - length_m))
-    spun = chain.odometry.part(begin, first)
+    spun = segment.odometry.part(begin, first)
     return _join(
         drive,
         before,
         after,
         spun,
-        np.r_[0 : first + 1, np.full(len(spun) - 1, first), first : len(chain.stamps_ns)],
+        np.r_[0 : first + 1, np.full(len(spun) - 1, first), first : len(segment.stamps_ns)],
         0.25 * len(spun),
     )
 
 
-def _motionless(odometry: ChainOdometry, step: int) -> ChainOdometry:
+def _motionless(odometry: SegmentOdometry, step: int) -> SegmentOdometry:
     """A step in which the wheels stand, known to a tick."""
     one = odometry.part(step, step + 1)
     return replace(
@@ -77,7 +77,7 @@ def _motionless(odometry: ChainOdometry, step: int) -> ChainOdometry:
 
 
 def _join(
-    drive: LongDrive, before: Chain, after: Chain, between: ChainOdometry, pose: IntArray, pause_s: float
+    drive: LongDrive, before: Segment, after: Segment, between: SegmentOdometry, pose: IntArray, pause_s: float
 ) -> BrokenDrive:
     """Two parts with other motions between them, which take a while: len(between) - 1 keyframes without readings."""
     n = len(before.stamps_ns) + len(between) - 1
@@ -101,7 +101,7 @@ def _join(
         parts=_parts([first.parts, second.parts]),
     )
     steps = [before.odometry, between, after.odometry]
-    odometry = ChainOdometry(
+    odometry = SegmentOdometry(
         motion=np.concatenate([step.motion for step in steps]),
         covariance=np.concatenate([step.covariance for step in steps]),
         parts=_parts([step.parts for step in steps]),
@@ -111,9 +111,9 @@ def _join(
     n_steps = len(odometry)
     seconds = np.full(n_steps, 0.25)
     seconds[n - len(between) : n] *= pause_s / (0.25 * len(between))
-    stamps_ns = drive.chain.stamps_ns[0] + np.rint(np.append(0.0, np.cumsum(seconds)) * 1e9).astype(np.int64)
-    chain = replace(drive.chain, stamps_ns=stamps_ns, odometry=odometry, tags=tags, readings=together)
-    return BrokenDrive(replace(drive, chain=chain, T_start_base=drive.T_start_base[pose]), len(before.stamps_ns), n)
+    stamps_ns = drive.segment.stamps_ns[0] + np.rint(np.append(0.0, np.cumsum(seconds)) * 1e9).astype(np.int64)
+    segment = replace(drive.segment, stamps_ns=stamps_ns, odometry=odometry, tags=tags, readings=together)
+    return BrokenDrive(replace(drive, segment=segment, T_start_base=drive.T_start_base[pose]), len(before.stamps_ns), n)
 
 
 def _parts(parts: Sequence[CovarianceParts]) -> CovarianceParts:

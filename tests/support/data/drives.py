@@ -13,7 +13,7 @@ from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.robot_yaml import Robot
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log.head import log_head
@@ -96,9 +96,9 @@ class MadeDrive:
         return se2.interpolate(self.T_world_base[after - 1], self.T_world_base[after], fraction)
 
     @property
-    def track(self) -> WheelTrack:
+    def track(self) -> WheelSegment:
         """As the estimate has it."""
-        return WheelTrack(self.stamps_ns, self.left_m, self.right_m)
+        return WheelSegment(self.stamps_ns, self.left_m, self.right_m)
 
 
 def make_drive(
@@ -191,7 +191,7 @@ def write_drive(
 
 
 def make_run(
-    tracks: Sequence[WheelTrack],
+    tracks: Sequence[WheelSegment],
     *,
     robot: Robot | None = None,
     camera: CameraModel | None = CAMERA,
@@ -210,7 +210,7 @@ def make_run(
         log=Path("logs/one"),
         robot=robot,
         camera=camera,
-        stretches=tuple(tracks),
+        wheel_segments=tuple(tracks),
         picture_stamps_ns=none if pictures_ns is None else pictures_ns,
         tags=tuple(tags),
         detections=detections or Detections(none, none, np.zeros((0, 4, 2))),

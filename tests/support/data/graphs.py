@@ -33,19 +33,19 @@ def make_graph(
 
     Args:
         seed: of everything.
-        lengths: poses of each chain; chains of even and of odd number share a robot.
-        n_tags: each read along some part of the first chain, and of others.
+        lengths: poses of each segment; segments of even and of odd number share a robot.
+        n_tags: each read along some part of the first segment, and of others.
         calibrated: calibration is free, else it is held.
-        reach: the longest share of a chain along which a tag is read.
+        reach: the longest share of a segment along which a tag is read.
         held: share of the other poses' directions, and of the tags, that are held like the first pose.
     """
     rng = np.random.default_rng(seed)
     sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
-    poses, first, chain_of = _drive(rng, lengths)
+    poses, first, segment_of = _drive(rng, lengths)
     truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _draw(rng))
-    readings = _readings(rng, truth, lengths, chain_of, reach)
+    readings = _readings(rng, truth, lengths, segment_of, reach)
     problem = Problem(
-        odometry=_odometry(rng, truth, first, chain_of),
+        odometry=_odometry(rng, truth, first, segment_of),
         readings=readings,
         prior=CalibrationPrior(sigma),
         columns=_columns(rng, len(poses), n_tags, sigma > 0.0, held),
@@ -73,7 +73,7 @@ def reorder(problem: Problem, rng: np.random.Generator) -> Problem:
 
 
 def with_measured(problem: Problem, truth: State, seed: int, n: int) -> Problem:
-    """The same with up to n measured starts and n distances, of any two ends: first poses of chains, or tags."""
+    """The same with up to n measured starts and n distances, of any two ends: first poses of segments, or tags."""
     rng = np.random.default_rng(seed)
     n_poses, n_tags = len(truth.poses), len(truth.tags)
     firsts = np.setdiff1d(np.arange(n_poses), problem.odometry.first + 1)
@@ -103,18 +103,18 @@ def _drive(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, In
     return np.array(poses), np.array(first, dtype=np.int64), np.repeat(np.arange(len(lengths)), lengths)
 
 
-def _odometry(rng: np.random.Generator, truth: State, first: IntArray, chain_of: IntArray) -> OdometryFactors:
-    parameters = (1 + _OF_ROBOT * (chain_of[first] % N_ROBOTS))[:, None] + np.arange(3)
+def _odometry(rng: np.random.Generator, truth: State, first: IntArray, segment_of: IntArray) -> OdometryFactors:
+    parameters = (1 + _OF_ROBOT * (segment_of[first] % N_ROBOTS))[:, None] + np.arange(3)
     return odometry_of(truth, first, parameters, rng, by_wheels=0.2)
 
 
 def _readings(
-    rng: np.random.Generator, truth: State, lengths: list[int], chain_of: IntArray, reach: float
+    rng: np.random.Generator, truth: State, lengths: list[int], segment_of: IntArray, reach: float
 ) -> ReadingFactors:
     pose, tag = _who_reads_what(rng, lengths, len(truth.tags), reach)
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
-    mount = (4 + _OF_ROBOT * (chain_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
+    mount = (4 + _OF_ROBOT * (segment_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
     scale = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
     camera = mount[:, :1] + 3 + np.arange(len(CAMERA_PARAMETERS))
 
@@ -127,17 +127,17 @@ def _readings(
 def _who_reads_what(
     rng: np.random.Generator, lengths: list[int], n_tags: int, reach: float
 ) -> tuple[IntArray, IntArray]:
-    """Each chain reads the tags of two, and each tag is read along a part of some chain; some poses read one twice."""
+    """Pose and tag of each observation: a tag is seen along a part of two segments, from some poses twice."""
     starts = np.concatenate([[0], np.cumsum(lengths)])
     pose, tag = [], []
     for t in range(n_tags):
-        for chain, length in enumerate(lengths):
-            if t >= 2 and t % len(lengths) != chain and rng.random() < 0.5:
+        for segment, length in enumerate(lengths):
+            if t >= 2 and t % len(lengths) != segment and rng.random() < 0.5:
                 continue
             n = max(2, int(reach * rng.random() * length))
             first = int(rng.integers(0, max(1, length - n)))
             at = first + rng.integers(0, min(n, length), max(3, n // 3))
-            pose.append(starts[chain] + np.minimum(at, length - 1))
+            pose.append(starts[segment] + np.minimum(at, length - 1))
             tag.append(np.full(len(at), t))
     return np.concatenate(pose), np.concatenate(tag)
 

@@ -1,6 +1,6 @@
 """Long drives past few tags: a town of long roads, driven at random, whose dead reckoning ends somewhere else.
 
-No logs and no pictures: a chain as `map` makes it from a run, with the truth beside it.
+No logs and no pictures: a segment as `map` makes it from a run, with the truth beside it.
 """
 
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import Robot
-from groundsbot.offline.measurements.chain import Chain, chains_of
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
+from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import Positions, TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import Graph
@@ -60,16 +60,16 @@ class Town:
 
 @dataclass(frozen=True)
 class LongDrive:
-    """A chain, and what its measurements are of, in the frame of its start."""
+    """A segment, and what its measurements are of, in the frame of its start."""
 
-    chain: Chain
+    segment: Segment
     T_start_base: FloatArray  # (K, 3)
     tags_m: dict[TagKey, FloatArray]
     calibration: dict[str, float]
     T_town_start: FloatArray  # (3,)
 
     def true_state(self, graph: Graph) -> State:
-        """As variables of the chain's own graph."""
+        """As variables of the segment's own graph."""
         return State(
             self.T_start_base,
             np.array([self.tags_m[tag] for tag in graph.tags]).reshape(-1, 2),
@@ -129,23 +129,23 @@ def make_long_drive(
     )  # fmt: skip
     track = _wheel_track(stamps_ns, poses, robot, calibration)
     run = make_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
-    (chain,) = chains_of(replace(run, log_bytes=MESSAGE_BYTES * (len(stamps_ns) + len(pictures))), noise)
+    (segment,) = segments_of(replace(run, log_bytes=MESSAGE_BYTES * (len(stamps_ns) + len(pictures))), noise)
     return LongDrive(
-        _with_noise(rng, chain, odometry_factor),
-        poses[np.searchsorted(stamps_ns, chain.stamps_ns)],
+        _with_noise(rng, segment, odometry_factor),
+        poses[np.searchsorted(stamps_ns, segment.stamps_ns)],
         dict(zip(keys, tags_m[row_of[first]], strict=True)),
         calibration,
         driven[0],
     )
 
 
-def with_drifting_readings(chain: Chain, sigmas: float, length_m: float, seed: int) -> Chain:
+def with_drifting_readings(segment: Segment, sigmas: float, length_m: float, seed: int) -> Segment:
     """Ranges of each tag err besides by so many sigmas that neighbours share: correlated as exp(-way / length)."""
-    readings = chain.readings
-    along_m = np.append(0.0, np.cumsum(chain.odometry.distance_m))[readings.keyframe]
+    readings = segment.readings
+    along_m = np.append(0.0, np.cumsum(segment.odometry.distance_m))[readings.keyframe]
     drawn = np.random.default_rng(seed).standard_normal(len(along_m))
     drift = np.zeros(len(along_m))
-    for tag in range(len(chain.tags)):
+    for tag in range(len(segment.tags)):
         of_tag = np.flatnonzero(readings.tag == tag)
         kept = np.exp(-np.diff(along_m[of_tag], prepend=-np.inf) / length_m)
         last = 0.0
@@ -153,21 +153,21 @@ def with_drifting_readings(chain: Chain, sigmas: float, length_m: float, seed: i
             drift[i] = last = share * last + np.sqrt(1.0 - share**2) * drawn[i]
     value = readings.value.copy()
     value[:, 0] += sigmas * np.sqrt(readings.covariance[:, 0, 0]) * drift
-    return replace(chain, readings=replace(readings, value=value))
+    return replace(segment, readings=replace(readings, value=value))
 
 
-def with_a_moved_tag(drive: LongDrive, chain: Chain | None = None) -> Chain:
-    """The tag read most hangs 2.8 m farther on when it is seen again; in the drive's chain, or in one made of it."""
-    chain = drive.chain if chain is None else chain
-    readings = chain.readings
+def with_a_moved_tag(drive: LongDrive, segment: Segment | None = None) -> Segment:
+    """The tag read most hangs 2.8 m farther on when it is seen again; in the drive's segment, or in one made of it."""
+    segment = drive.segment if segment is None else segment
+    readings = segment.readings
     tag = int(np.argmax(np.bincount(readings.tag)))
     sightings = readings.keyframe[readings.tag == tag]
     later = (readings.tag == tag) & (readings.keyframe > sightings[np.argmax(np.diff(sightings))])
-    camera = se2.compose(drive.T_start_base[readings.keyframe[later]], chain.T_base_camera)
-    place = se2.apply(se2.inverse(camera), drive.tags_m[chain.tags[tag]] + 2.0)
+    camera = se2.compose(drive.T_start_base[readings.keyframe[later]], segment.T_base_camera)
+    place = se2.apply(se2.inverse(camera), drive.tags_m[segment.tags[tag]] + 2.0)
     value = readings.value.copy()
     value[later] = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
-    return replace(chain, readings=replace(readings, value=value))
+    return replace(segment, readings=replace(readings, value=value))
 
 
 def make_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_crossings: int = N_CROSSINGS) -> Town:
@@ -253,14 +253,14 @@ def _drawn_calibration(rng: np.random.Generator, robot: Robot) -> dict[str, floa
     }
 
 
-def _wheel_track(stamps_ns: IntArray, poses: FloatArray, robot: Robot, calibration: dict[str, float]) -> WheelTrack:
+def _wheel_track(stamps_ns: IntArray, poses: FloatArray, robot: Robot, calibration: dict[str, float]) -> WheelSegment:
     """What the wheels count by their nominal radii."""
     moved = se2.log(se2.between(poses[:-1], poses[1:]))
     half_turn_m = 0.5 * robot.wheels.track_m * (1.0 + calibration["track_scale"]) * moved[:, 2]
     scale, half_ratio = 1.0 + calibration["wheel_scale"], 0.5 * calibration["wheel_ratio"]
     left_m = np.cumsum(moved[:, 0] - half_turn_m) / (scale * (1.0 - half_ratio))
     right_m = np.cumsum(moved[:, 0] + half_turn_m) / (scale * (1.0 + half_ratio))
-    return WheelTrack(stamps_ns, np.r_[0.0, left_m], np.r_[0.0, right_m])
+    return WheelSegment(stamps_ns, np.r_[0.0, left_m], np.r_[0.0, right_m])
 
 
 def _readings(
@@ -283,8 +283,8 @@ def _readings(
     return pose, tag, value + factor * SIGMA_READING * rng.standard_normal(value.shape)
 
 
-def _with_noise(rng: np.random.Generator, chain: Chain, factor: float) -> Chain:
-    odometry = chain.odometry
+def _with_noise(rng: np.random.Generator, segment: Segment, factor: float) -> Segment:
+    odometry = segment.odometry
     root = factor * np.linalg.cholesky(odometry.covariance)
     error = np.einsum("nij,nj->ni", root, rng.standard_normal((len(root), 3)))
-    return replace(chain, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error))))
+    return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error))))

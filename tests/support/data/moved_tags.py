@@ -12,7 +12,7 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.measurements.chain import Chain
+from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.places import NOWHERE, Places
 from tests.support.data.drives import FAMILY, S
@@ -53,9 +53,9 @@ class Scene:
     def is_other(self, run: int, tag_id: int) -> BoolArray:
         """(M,) of the readings of an id in a run: which are of its other place, by where they were truly taken."""
         drive = self.drives[run]
-        own = drive.chain.readings.tag == drive.chain.tags.index(TagKey(FAMILY, tag_id))
-        poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.chain.readings.keyframe[own]]
-        seen = se2.apply(se2.compose(poses, drive.chain.T_base_camera), _places(drive.chain, own))
+        own = drive.segment.readings.tag == drive.segment.tags.index(TagKey(FAMILY, tag_id))
+        poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.segment.readings.keyframe[own]]
+        seen = se2.apply(se2.compose(poses, drive.segment.T_base_camera), _places(drive.segment, own))
         far = np.linalg.norm(seen - self.first_m[tag_id], axis=1)
         return np.asarray(np.linalg.norm(seen - self.other_m[tag_id], axis=1) < far)
 
@@ -102,13 +102,13 @@ def make_scene(seed: int, kind: str = CLEAN, n_tags: int = 0, shift_m: float = 0
     return Scene(drives, kind, tuple(own.tolist()), town.tags_m, other_m)
 
 
-def without(chain: Chain, ids: Sequence[int]) -> Chain:
+def without(segment: Segment, ids: Sequence[int]) -> Segment:
     """The same drive past a town that does not have these tags."""
-    kept = np.array([tag.tag_id not in ids for tag in chain.tags], dtype=np.bool_)
-    readings = chain.readings.where(kept[chain.readings.tag])
+    kept = np.array([tag.tag_id not in ids for tag in segment.tags], dtype=np.bool_)
+    readings = segment.readings.where(kept[segment.readings.tag])
     number = np.cumsum(kept) - 1
-    tags = tuple(tag for tag, keep in zip(chain.tags, kept.tolist(), strict=True) if keep)
-    return replace(chain, tags=tags, readings=replace(readings, tag=number[readings.tag]))
+    tags = tuple(tag for tag, keep in zip(segment.tags, kept.tolist(), strict=True) if keep)
+    return replace(segment, tags=tags, readings=replace(readings, tag=number[readings.tag]))
 
 
 def _town(seed: int) -> Town:
@@ -139,12 +139,12 @@ def _during(town: Town, ids: IntArray, places_m: FloatArray) -> Town:
 def _later(drive: LongDrive, hours: int) -> LongDrive:
     """Driven some hours later: so the order of drives is known."""
     late_ns = hours * _AN_HOUR_NS
-    return replace(drive, chain=replace(drive.chain, stamps_ns=drive.chain.stamps_ns + late_ns))
+    return replace(drive, segment=replace(drive.segment, stamps_ns=drive.segment.stamps_ns + late_ns))
 
 
-def _places(chain: Chain, own: BoolArray) -> FloatArray:
+def _places(segment: Segment, own: BoolArray) -> FloatArray:
     """(M, 2) in the camera's axes; all readings of long drives are polar."""
-    range_m, bearing_rad = chain.readings.value[own].T
+    range_m, bearing_rad = segment.readings.value[own].T
     return np.stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)], axis=-1)
 
 

@@ -17,7 +17,7 @@ CALIBRATION_SIGMA = np.array(
 )
 N_CALIBRATION = len(CALIBRATION_SIGMA)
 WHEELS, MOUNT, BATCHES, CAMERA = np.array([1, 2, 3]), np.array([4, 5, 6]), np.array([7, 8]), np.arange(9, N_CALIBRATION)
-CHAINS = (9, 7)  # poses in each
+SEGMENTS = (9, 7)  # poses in each
 N_TAGS = 6
 
 
@@ -30,7 +30,7 @@ class MadeProblem:
 
 
 def make_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_calibration: bool = False) -> MadeProblem:
-    """Two chains past six tags; readings polar and cartesian, about a mounted camera and about base.
+    """Two segments past six tags; readings polar and cartesian, about a mounted camera and about base.
 
     Args:
         seed: of everything.
@@ -39,11 +39,11 @@ def make_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
         true_calibration: robots and tags are what their files say.
     """
     rng = np.random.default_rng(seed)
-    n_poses = sum(CHAINS)
+    n_poses = sum(SEGMENTS)
     poses = [np.zeros(3)]
     first = []
-    for chain, length in enumerate(CHAINS):
-        if chain:
+    for segment, length in enumerate(SEGMENTS):
+        if segment:
             poses.append(np.array([2.0, -1.0, 2.5]))
         for _ in range(length - 1):
             first.append(len(poses) - 1)
@@ -73,7 +73,7 @@ def make_columns(n_poses: int) -> Columns:
 def random_state(seed: int, near: State | None = None, spread: float = 0.0) -> State:
     """A state near another one, or just anywhere: headings round the circle, calibration of several percent."""
     rng = np.random.default_rng(seed)
-    n_poses = sum(CHAINS)
+    n_poses = sum(SEGMENTS)
     if near is None:
         poses = np.column_stack([rng.uniform(-5, 5, (n_poses, 2)), rng.uniform(-np.pi, np.pi, n_poses)])
         return State(poses, rng.uniform(-5, 5, (N_TAGS, 2)), np.r_[0.0, 0.05 * rng.standard_normal(N_CALIBRATION - 1)])

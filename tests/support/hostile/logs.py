@@ -230,14 +230,14 @@ def observe(
     return of_messages(*contents, run_id=run_id, size_bytes=size_bytes)
 
 
-def resets(stretches: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
+def resets(wheel_segments: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
     """A controller that restarts, and some looks at all tags in between; padded to `size_bytes`."""
     corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
     lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
     camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
     contents: list[Content] = [("/camera/calibration", camera, START_NS)]
     tags = [TagDetection(family="tag36h11", tag_id=k, corners_px=corners) for k in range(n_tags)]
-    for index in range(stretches * looks):
+    for index in range(wheel_segments * looks):
         at_ns = START_NS + index * 100 * MS
         rolled = 100 * (index % looks)
         wheels = WheelEncoders(
@@ -364,10 +364,10 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "a reset each look": lambda: resets(25, 400, size_bytes=1_010_000),
     "resets": lambda: resets(25, 10, 80, size_bytes=1_010_000),
     "resets, much seen": lambda: resets(25, 10, 530, size_bytes=1_010_000),
-    "two stretches past 400 tags": lambda: resets(2, 400),
-    "three stretches past 400 tags": lambda: resets(3, 400),
-    "twelve stretches past 400 tags": lambda: resets(12, 400),
-    "stretches past 100 tags": lambda: resets(13, 100, size_bytes=1_010_000),
+    "two segments past 400 tags": lambda: resets(2, 400),
+    "three segments past 400 tags": lambda: resets(3, 400),
+    "twelve segments past 400 tags": lambda: resets(12, 400),
+    "segments past 100 tags": lambda: resets(13, 100, size_bytes=1_010_000),
     "one tag, much read in one picture": lambda: readings_in_one_picture(150_000),
     "keyframes": lambda: full(drive),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),

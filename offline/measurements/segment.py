@@ -1,4 +1,4 @@
-"""One stretch of a run as the estimate sees it: keyframes, the motions between them, and tag readings from them."""
+"""One segment of a run as the estimate sees it: keyframes, the motions between them, and tag readings from them."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ from groundsbot.offline.measurements.keyframes import (
     keyframe_at,
     tags_at_candidates,
 )
-from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry, WheelTrack, compose_odometry
+from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, concatenate_observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import (
@@ -24,13 +24,13 @@ from groundsbot.offline.measurements.tags import TagKey
 
 
 @dataclass(frozen=True)
-class Chain:
+class Segment:
     """Keyframes with unbroken odometry.
 
     Attributes:
-        name: the run's, with the stretch where there are several.
+        name: the run's, with the segment where there are several.
         run: whose measurements these are.
-        stamps_ns: (K,) of the keyframes; the first is the chain's first wheel reading.
+        stamps_ns: (K,) of the keyframes; the first is the segment's first wheel reading.
         odometry: the K-1 motions.
         tags: what was read, sorted; `readings.tag` points here.
         readings: tag readings, ordered by keyframe.
@@ -40,7 +40,7 @@ class Chain:
     name: str
     run: Run
     stamps_ns: IntArray
-    odometry: ChainOdometry
+    odometry: SegmentOdometry
     tags: tuple[TagKey, ...]
     readings: Readings
     warnings: tuple[str, ...] = ()
@@ -56,12 +56,12 @@ class Chain:
         """(K,) the way driven until each keyframe."""
         return np.append(0.0, np.cumsum(self.odometry.distance_m))
 
-    def prefix(self, n_keyframes: int) -> "Chain":
-        """The same chain as far as its first keyframes, with the tags read until then."""
+    def prefix(self, n_keyframes: int) -> "Segment":
+        """The same segment as far as its first keyframes, with the tags read until then."""
         return self.part(0, n_keyframes)
 
-    def part(self, first: int, end: int) -> "Chain":
-        """Keyframes first to end - 1 of the same chain, with the tags read there."""
+    def part(self, first: int, end: int) -> "Segment":
+        """Keyframes first to end - 1 of the same segment, with the tags read there."""
         inside = (self.readings.keyframe >= first) & (self.readings.keyframe < end)
         readings = self.readings.where(inside)
         seen, tag = np.unique(readings.tag, return_inverse=True)
@@ -73,52 +73,52 @@ class Chain:
             readings=replace(readings, tag=tag, keyframe=readings.keyframe - first),
         )
 
-    def with_readings(self, which: BoolArray) -> "Chain":
-        """The same chain with some of its readings, (M,), and their tags only."""
+    def with_readings(self, which: BoolArray) -> "Segment":
+        """The same segment with some of its readings, (M,), and their tags only."""
         if which.all():
             return self
         readings = self.readings.where(which)
         seen, tag = np.unique(readings.tag, return_inverse=True)
         return replace(self, tags=tuple(self.tags[i] for i in seen), readings=replace(readings, tag=tag))
 
-    def with_noise(self, noise: NoiseParameters) -> "Chain":
+    def with_noise(self, noise: NoiseParameters) -> "Segment":
         """The same measurements under other noise."""
         return replace(self, odometry=self.odometry.with_noise(noise), readings=self.readings.with_noise(noise))
 
-    def with_position_noise(self, names: tuple[str, ...]) -> "Chain":
+    def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
         """The same measurements with readings of corners that err besides by some of `POSITION_NOISE`."""
         return replace(self, readings=with_position_noise(self.readings, names))
 
 
-def chains_of(run: Run, noise: NoiseParameters) -> list[Chain]:
-    """A run's stretches as chains."""
-    several = len(run.stretches) > 1
-    chains = []
-    for i, track in enumerate(run.stretches):
+def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
+    """A run's segments as segments."""
+    several = len(run.wheel_segments) > 1
+    segments = []
+    for i, wheel_segment in enumerate(run.wheel_segments):
         name = run.name if i == 0 else f"{run.name}_stretch{i + 1}"
-        chain = _chain(name, run, track, noise)
+        segment = _segment(name, run, wheel_segment, noise)
         where = f"{name}: " if several else f"{run.name}: "
-        chains.append(replace(chain, warnings=tuple(where + warning for warning in chain.warnings)))
-    lost = sorted(set(run.tags) - {tag for chain in chains for tag in chain.tags})
+        segments.append(replace(segment, warnings=tuple(where + warning for warning in segment.warnings)))
+    lost = sorted(set(run.tags) - {tag for segment in segments for tag in segment.tags})
     if lost:
         names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
         warning = f"{run.name}: tag {names} was detected, but no reading of it can be used; this run does not place it"
-        chains[0] = replace(chains[0], warnings=(*chains[0].warnings, warning))
-    return chains
+        segments[0] = replace(segments[0], warnings=(*segments[0].warnings, warning))
+    return segments
 
 
-def _chain(name: str, run: Run, track: WheelTrack, noise: NoiseParameters) -> Chain:
-    stamps_ns = candidate_stamps(run, track)
+def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParameters) -> Segment:
+    stamps_ns = candidate_stamps(run, wheel_segment)
     tags_at = tags_at_candidates(run, stamps_ns)
-    keyframe_stamps_ns, keyframe_of = choose_keyframes(track, stamps_ns, tags_at, run.robot.wheels.track_m)
-    twist = track.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
+    keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
+    twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
     readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
     seen, tag = np.unique(readings.tag, return_inverse=True)
-    return Chain(
+    return Segment(
         name=name,
         run=run,
         stamps_ns=keyframe_stamps_ns,
-        odometry=compose_odometry(track, keyframe_stamps_ns, run.robot.wheels.track_m, noise),
+        odometry=compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise),
         tags=tuple(run.tags[i] for i in seen),
         readings=replace(readings, tag=tag),
         warnings=tuple(warnings),
@@ -128,7 +128,7 @@ def _chain(name: str, run: Run, track: WheelTrack, noise: NoiseParameters) -> Ch
 def _readings(
     run: Run, stamps_ns: IntArray, keyframe_of: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Readings, list[str]]:
-    """Readings of one stretch with the keyframe of each; what fell between keyframes is passed over."""
+    """Readings of one segment with the keyframe of each; what fell between keyframes is passed over."""
     detections, positions = run.detections, run.positions
     keyframe = keyframe_at(detections.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0

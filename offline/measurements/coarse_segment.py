@@ -1,4 +1,4 @@
-"""A chain with fewer keyframes: enough to find the right valley, in a fraction of the time."""
+"""A segment with fewer keyframes: enough to find the right valley, in a fraction of the time."""
 
 from dataclasses import replace
 from typing import Final
@@ -7,8 +7,8 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
-from groundsbot.offline.measurements.chain import Chain
-from groundsbot.offline.measurements.motion_model.motion_model import ChainOdometry
+from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry
+from groundsbot.offline.measurements.segment import Segment
 
 # Keyframes at least this far apart where tags are read, and where none is. Turns count like arcs of half a metre.
 _READING_SPACING_M: Final = 0.25
@@ -19,11 +19,11 @@ _TURN_RADIUS_M: Final = 0.5
 _COMPOSED_M: Final = 0.5
 
 
-def coarse_keyframes(chain: Chain, share: float = 1.0) -> IntArray:
-    """(k,) the first and the last keyframe of a chain and some in between, rising; at this share of the spacings."""
-    n_keyframes = len(chain.stamps_ns)
-    along_m = _along_m(chain)
-    reads = np.bincount(chain.readings.keyframe, minlength=n_keyframes) > 0
+def coarse_keyframes(segment: Segment, share: float = 1.0) -> IntArray:
+    """(k,) the first and the last keyframe of a segment and some in between, rising; at this share of the spacings."""
+    n_keyframes = len(segment.stamps_ns)
+    along_m = _along_m(segment)
+    reads = np.bincount(segment.readings.keyframe, minlength=n_keyframes) > 0
     chosen, last_m = [0], 0.0
     for keyframe, (here_m, has_readings) in enumerate(zip(along_m.tolist(), reads.tolist(), strict=True)):
         if here_m - last_m >= share * (_READING_SPACING_M if has_readings else _EMPTY_SPACING_M):
@@ -34,47 +34,47 @@ def coarse_keyframes(chain: Chain, share: float = 1.0) -> IntArray:
     return np.array(chosen, dtype=np.int64)
 
 
-def telling_keyframes(chain: Chain) -> IntArray:
-    """(k,) keyframes that say all that a chain does, rising: those that read tags, and one each half metre."""
-    cell = (_along_m(chain) / _COMPOSED_M).astype(np.int64)
+def telling_keyframes(segment: Segment) -> IntArray:
+    """(k,) keyframes that say all that a segment does, rising: those that read tags, and one each half metre."""
+    cell = (_along_m(segment) / _COMPOSED_M).astype(np.int64)
     enters = np.flatnonzero(np.diff(cell, prepend=-1))
-    return np.union1d(chain.readings.keyframe, np.append(enters, len(chain.stamps_ns) - 1))
+    return np.union1d(segment.readings.keyframe, np.append(enters, len(segment.stamps_ns) - 1))
 
 
-def coarsen(chain: Chain, keyframes: IntArray) -> Chain:
-    """The chain at some of its keyframes, the first one and the last among them; other readings are passed over.
+def coarsen(segment: Segment, keyframes: IntArray) -> Segment:
+    """The segment at some of its keyframes, the first one and the last among them; other readings are passed over.
 
     Args:
-        chain: as driven.
+        segment: as driven.
         keyframes: (k,) rising.
     """
-    new_index = np.full(len(chain.stamps_ns), -1)
+    new_index = np.full(len(segment.stamps_ns), -1)
     new_index[keyframes] = np.arange(len(keyframes))
-    kept = chain.readings.where(new_index[chain.readings.keyframe] >= 0)
+    kept = segment.readings.where(new_index[segment.readings.keyframe] >= 0)
     seen, tag = np.unique(kept.tag, return_inverse=True)
     return replace(
-        chain,
-        stamps_ns=chain.stamps_ns[keyframes],
-        odometry=_compose(chain.odometry, keyframes),
-        tags=tuple(chain.tags[i] for i in seen),
+        segment,
+        stamps_ns=segment.stamps_ns[keyframes],
+        odometry=_compose(segment.odometry, keyframes),
+        tags=tuple(segment.tags[i] for i in seen),
         readings=replace(kept, keyframe=new_index[kept.keyframe], tag=tag),
     )
 
 
-def _along_m(chain: Chain) -> FloatArray:
+def _along_m(segment: Segment) -> FloatArray:
     """(K,) the way to each keyframe."""
-    turned_m = _TURN_RADIUS_M * np.abs(chain.odometry.motion[:, 2])
-    return np.concatenate([[0.0], np.cumsum(np.maximum(chain.odometry.distance_m, turned_m))])
+    turned_m = _TURN_RADIUS_M * np.abs(segment.odometry.motion[:, 2])
+    return np.concatenate([[0.0], np.cumsum(np.maximum(segment.odometry.distance_m, turned_m))])
 
 
-def refine_poses(chain: Chain, keyframes: IntArray, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+def refine_poses(segment: Segment, keyframes: IntArray, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
     """(K, 3) poses of all keyframes from those of some (k, 3): dead reckoning on from each to the next."""
-    driven = chain.odometry.dead_reckon(wheel_calibration)
+    driven = segment.odometry.dead_reckon(wheel_calibration)
     before = np.searchsorted(keyframes, np.arange(len(driven)), side="right") - 1
     return se2.compose(poses[before], se2.between(driven[keyframes[before]], driven))
 
 
-def _compose(odometry: ChainOdometry, keyframes: IntArray) -> ChainOdometry:
+def _compose(odometry: SegmentOdometry, keyframes: IntArray) -> SegmentOdometry:
     """Motions from each of some keyframes to the next; covariances and Jacobians carried to the step's end."""
     if len(keyframes) < 2:
         return odometry.part(0, 0)
@@ -87,7 +87,7 @@ def _compose(odometry: ChainOdometry, keyframes: IntArray) -> ChainOdometry:
         total: FloatArray = np.add.reduceat(to_end @ covariance @ to_end.swapaxes(-1, -2), first, axis=-3)
         return total
 
-    return ChainOdometry(
+    return SegmentOdometry(
         motion=se2.between(poses[first], poses[keyframes[1:]]),
         covariance=carried(odometry.covariance),
         parts=replace(odometry.parts, unit=carried(odometry.parts.unit), rest=carried(odometry.parts.rest)),

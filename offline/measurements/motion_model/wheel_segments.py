@@ -1,4 +1,4 @@
-"""Wheel readings of a log -> stretches of unbroken odometry."""
+"""Wheel readings of a log -> segments of unbroken odometry."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,23 +9,23 @@ from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.motion_model.motion_model import WheelTrack
+from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances
 from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps
 from groundsbot.onboard.log import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
-# Each begins a chain of its own that only tags can join. Pairs of them grow with the square, so that with the root of a
-# log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
+# Each begins a segment of its own that only tags can join. Pairs of them grow with the square, so that with the root of
+# a log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
 _FREE_RESETS = 10
 _RESETS_AT_A_MIB = 15
 
 
-def stretches_of(
+def wheel_segments_of(
     wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path, log_bytes: int
-) -> tuple[list[WheelTrack], list[str]]:
-    """The stretches of one log, and what a person should know of them.
+) -> tuple[list[WheelSegment], list[str]]:
+    """The segments of one log, and what a person should know of them.
 
     Args:
         wheels: of `/wheels`, in order.
@@ -39,7 +39,7 @@ def stretches_of(
             many restarts of the controller.
     """
     if wheels:
-        return _encoder_stretches(wheels, robot, log, log_bytes)
+        return _encoder_segments(wheels, robot, log, log_bytes)
     if odometry:
         return _imported_segment(odometry, robot, log)
     raise OfflineError(
@@ -48,9 +48,9 @@ def stretches_of(
     )
 
 
-def _encoder_stretches(
+def _encoder_segments(
     readings: Sequence[WheelRow], robot: Robot, log: Path, log_bytes: int
-) -> tuple[list[WheelTrack], list[str]]:
+) -> tuple[list[WheelSegment], list[str]]:
     """Cuts where the controller was reset: what was driven in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     check_stamps(table[:, 0], f"{log}: /wheels")
@@ -62,7 +62,7 @@ def _encoder_stretches(
             "see to its power supply"
         )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
-    stretches: list[WheelTrack] = []
+    wheel_segments: list[WheelSegment] = []
     warnings: list[str] = []
     for part in np.split(table, cuts):
         ordered, dropped = _strictly_later(part)
@@ -73,18 +73,18 @@ def _encoder_stretches(
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
         left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
         quantum_m = max(m_per_tick_left, m_per_tick_right)
-        stretches.append(WheelTrack(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
-    if len(stretches) > 1:
+        wheel_segments.append(WheelSegment(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
+    if len(wheel_segments) > 1:
         warnings.append(
-            f"the wheel controller restarted {plural(len(stretches) - 1, 'time')}; the motion in between is unknown, "
-            f"so the run has {len(stretches)} stretches that only tags can join"
+            f"the wheel controller restarted {plural(len(wheel_segments) - 1, 'time')}; the motion in between is "
+            f"unknown, so the run has {len(wheel_segments)} segments that only tags can join"
         )
-    return stretches, warnings
+    return wheel_segments, warnings
 
 
 def _imported_segment(
     readings: Sequence[PlanarOdometry], robot: Robot, log: Path
-) -> tuple[list[WheelTrack], list[str]]:
+) -> tuple[list[WheelSegment], list[str]]:
     warnings: list[str] = []
     where = f"{log}: /odometry"
     stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
@@ -110,7 +110,7 @@ def _imported_segment(
     if n_bad:
         warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
     given = covariance[keep] if covariance is not None else None
-    return [WheelTrack(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
+    return [WheelSegment(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
 
 
 def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:
