@@ -1,8 +1,8 @@
 from .board import DEFAULT_BOARD, DEFAULT_VIEWS, MARKER_SHARE, Board, parse_board
-from .finder import BoardFinder, View
+from .finder import BoardFinder, BoardView
 from .missing import why_no_board
 from .picture_source import GreyPicture, grey_pictures
-from .view_spread import SeenBoard, Spread, describe_board, region_shares
+from .view_spread import Coverage, SeenBoard, describe_board, region_shares
 
 __all__ = [
     "DEFAULT_BOARD",
@@ -10,10 +10,10 @@ __all__ = [
     "MARKER_SHARE",
     "Board",
     "BoardFinder",
+    "BoardView",
+    "Coverage",
     "GreyPicture",
     "SeenBoard",
-    "Spread",
-    "View",
     "describe_board",
     "grey_pictures",
     "parse_board",

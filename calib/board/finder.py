@@ -18,7 +18,7 @@ _STEP: Final = 0.25  # of a square
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """A picture in which the board was found."""
 
     name: str
@@ -39,7 +39,7 @@ class BoardFinder:
         self._white_diagonal: BoolArray = (column + row) % 2 == 1
         self._clear = 0.5 * (1.0 - board.marker_mm / board.square_mm)
 
-    def find(self, picture: NDArray[np.uint8], name: str = "") -> View | None:
+    def find(self, picture: NDArray[np.uint8], name: str = "") -> BoardView | None:
         """The board in a grey picture `[H, W]`; None where fewer than six corners of it are seen clearly."""
         found, ids, _, _ = self._detector.detectBoard(picture)
         if np.size(ids) < _LEAST_CORNERS:  # None where there are none at all
@@ -49,9 +49,9 @@ class BoardFinder:
         growth, blur_px = np.zeros((len(numbers), 2, 3)), np.full(len(numbers), FIRST_BLUR_PX)
         around = self._surroundings(numbers, pixels, squares, growth, straight, blur_px, FIRST_RADIUS_PX)
         corners = fit_corners(picture, numbers, around)
-        return View(name, picture, corners) if len(corners.ids) >= _LEAST_CORNERS else None
+        return BoardView(name, picture, corners) if len(corners.ids) >= _LEAST_CORNERS else None
 
-    def find_again(self, view: View, projected_px: FloatArray) -> View:
+    def find_again(self, view: BoardView, projected_px: FloatArray) -> BoardView:
         """The same view where a camera tells which corners are in the picture and how the edges bend.
 
         Args:
@@ -68,7 +68,7 @@ class BoardFinder:
         blur_px = np.full(len(at), np.median(view.corners.blur_px) if len(view.corners.ids) else FIRST_BLUR_PX)
         ids = np.arange(len(at))
         around = self._surroundings(ids, at, squares, growth, bend, blur_px, RADIUS_PX)
-        return View(view.name, view.picture, fit_corners(view.picture, ids, around))
+        return BoardView(view.name, view.picture, fit_corners(view.picture, ids, around))
 
     def places_around_m(self) -> FloatArray:
         """(K, 13, 3) in the board's frame, around each corner.

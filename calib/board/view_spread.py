@@ -79,7 +79,7 @@ def region_shares(row: int, column: int) -> tuple[FloatArray, FloatArray]:
     return edges[[column, row]], edges[[column + 1, row + 1]]
 
 
-class Spread:
+class Coverage:
     """What the views so far cover."""
 
     def __init__(self, views: Iterable[SeenBoard] = ()) -> None:

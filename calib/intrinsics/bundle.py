@@ -123,7 +123,7 @@ def adjust_bundle(
         whitening: (N, 2, 2), zero for a corner that is to be left out.
         hold_intrinsics: only the poses are looked for.
     """
-    system = _System(seen, whitening)
+    system = _LeastSquares(seen, whitening)
     model, damping = start, 1e-4
     blocks = system.linearise(model, poses)
     for _ in range(_ROUNDS):
@@ -193,7 +193,7 @@ class _Blocks:
         return np.asarray(by_view.sum(axis=0)), np.asarray(by_view)
 
 
-class _System:
+class _LeastSquares:
     """Corners and their weights."""
 
     def __init__(self, seen: Observations, whitening: FloatArray) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.board import Board, BoardFinder, GreyPicture, Spread, View, describe_board, why_no_board
+from groundsbot.calib.board import Board, BoardFinder, BoardView, Coverage, GreyPicture, describe_board, why_no_board
 from groundsbot.calib.camera import CameraEstimate, parameter_names
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, plural
@@ -37,7 +37,7 @@ class Search:
         some_without: a few of these pictures.
     """
 
-    views: list[View]
+    views: list[BoardView]
     without: list[str]
     some_without: list[GreyPicture]
 
@@ -166,7 +166,7 @@ def verdict(result: Calibration, board: Board) -> list[str]:
     size_px = model.width_px, model.height_px
     used = (view for view, kept in zip(result.views, result.lens.views, strict=True) if kept)
     boards = (describe_board(view.corners.ids, view.corners.pixels, board, size_px) for view in used)
-    missing = Spread(each for each in boards if each is not None).missing()
+    missing = Coverage(each for each in boards if each is not None).missing()
     lines += [f"to make it surer still, {each}" for each in missing] if enough else missing
     sigma = np.hypot(estimate.sigmas[0] / model.fx_px, estimate.sigmas[1] / model.fy_px)
     unequal = model.fx_px / model.fy_px - 1.0
@@ -186,7 +186,7 @@ def _kinds(model: str) -> Sequence[str]:
     return (model,)
 
 
-def refuse_few(views: Sequence[View]) -> None:
+def refuse_few(views: Sequence[BoardView]) -> None:
     """Refuses too few views, and views that are all alike.
 
     Raises:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2, f
 
-from groundsbot.calib.board import BoardFinder, View
+from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import CameraEstimate, CameraModel, parameters_of
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
@@ -45,7 +45,9 @@ class Check:
     lines: list[str]
 
 
-def compare(model: CameraModel, estimate: CameraEstimate | None, views: Sequence[View], finder: BoardFinder) -> Check:
+def compare(
+    model: CameraModel, estimate: CameraEstimate | None, views: Sequence[BoardView], finder: BoardFinder
+) -> Check:
     """Compares a camera with pictures.
 
     Raises:

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.board import BoardFinder, View
+from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import COEFFICIENTS, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
@@ -39,7 +39,7 @@ class Calibration:
     """
 
     lens: LensFit
-    views: Sequence[View]
+    views: Sequence[BoardView]
     poses: Poses
     blurred: BoolArray
     scores: dict[str, float]
@@ -56,7 +56,7 @@ class Calibration:
 
 
 def calibrate_camera(
-    views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS
+    views: Sequence[BoardView], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS
 ) -> Calibration:
     """The camera that took the views, of the kind that predicts best what it was not fitted to.
 
@@ -65,7 +65,7 @@ def calibrate_camera(
     """
     lens = first_fit(views, finder, name, kinds)
     found = _refine_corners(
-        _Look(views, lens, every_pose(lens, collect_observations(views, finder), len(views))), finder
+        _RefinedViews(views, lens, every_pose(lens, collect_observations(views, finder), len(views))), finder
     )
     scores = {found.lens.fit.model.distortion_model: 0.0}
     if len(kinds) > 1:
@@ -76,16 +76,16 @@ def calibrate_camera(
 
 
 @dataclass(frozen=True)
-class _Look:
+class _RefinedViews:
     """Views as seen last, camera and poses that follow, and the (V, K, 13, 2) places by which they were looked at."""
 
-    views: Sequence[View]
+    views: Sequence[BoardView]
     lens: LensFit
     poses: Poses
     expected: FloatArray | None = None
 
 
-def _refine_corners(look: _Look, finder: BoardFinder) -> _Look:
+def _refine_corners(look: _RefinedViews, finder: BoardFinder) -> _RefinedViews:
     """Looks for corners where the camera says that they are, as bent as it says, until it says the same afterwards."""
     for _ in range(_LOOKS):
         expected = _expected_places(look, finder)
@@ -96,13 +96,13 @@ def _refine_corners(look: _Look, finder: BoardFinder) -> _Look:
     return look
 
 
-def _expected_places(look: _Look, finder: BoardFinder) -> FloatArray:
+def _expected_places(look: _RefinedViews, finder: BoardFinder) -> FloatArray:
     """(V, K, 13, 2) where the camera has the places around each corner."""
     places = np.einsum("vij,kmj->vkmi", look.poses.rotation, finder.places_around_m())
     return look.lens.fit.model.project(places + look.poses.place_m[:, None, None])
 
 
-def _has_converged(look: _Look, moved_px: FloatArray) -> bool:
+def _has_converged(look: _RefinedViews, moved_px: FloatArray) -> bool:
     """Whether corners that move by (V, K) move no camera: all together, no more than noise moves its parameters."""
     corners = [view.corners for view in look.views]
     moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
@@ -110,14 +110,14 @@ def _has_converged(look: _Look, moved_px: FloatArray) -> bool:
     return bool((moved**2 / variance).sum() < len(look.lens.fit.information))
 
 
-def _refit(look: _Look, start: CameraModel, finder: BoardFinder) -> _Look:
+def _refit(look: _RefinedViews, start: CameraModel, finder: BoardFinder) -> _RefinedViews:
     """With the camera and the poses that follow from its views, the camera from a start."""
     seen = collect_observations(look.views, finder)
     lens = _fit_without(find_blurred(look.views), seen, start)
     return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
 
 
-def collect_observations(views: Sequence[View], finder: BoardFinder) -> Observations:
+def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Observations:
     """The corners of all views."""
     corners = [view.corners for view in views]
     return Observations(
@@ -128,7 +128,7 @@ def collect_observations(views: Sequence[View], finder: BoardFinder) -> Observat
     )
 
 
-def first_fit(views: Sequence[View], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
+def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
     """The camera as the first look at the corners has it, of the simplest kind that fits as well as the best.
 
     A kind with more freedom always fits a little better, and may bend beyond the corners as no lens does: where corners
@@ -176,7 +176,7 @@ def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
     return poses
 
 
-def find_blurred(views: Sequence[View]) -> BoolArray:
+def find_blurred(views: Sequence[BoardView]) -> BoolArray:
     """(V,) views more blurred than the scatter among them allows, or without corners."""
     blur_px = np.array([np.median(view.corners.blur_px) if len(view.corners.ids) else np.inf for view in views])
     logarithm = np.log(blur_px)

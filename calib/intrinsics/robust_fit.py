@@ -147,7 +147,7 @@ def _errors_by_view(model: CameraModel, poses: Poses, seen: Observations) -> Flo
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Inliers:
     """What counts so far, and the camera that follows from it."""
 
     views: BoolArray  # (V,)
@@ -164,14 +164,14 @@ class _Kept:
 
 
 def _without_outliers(seen: Observations, views: BoolArray, model: CameraModel, poses: Poses) -> LensFit:
-    kept = _Kept(views, np.asarray(views[seen.view]), model, poses)
+    kept = _Inliers(views, np.asarray(views[seen.view]), model, poses)
     misfit = np.full(len(views), np.nan)
     for _ in range(_REJECTING_ROUNDS):
         corners, stay, misfit, extra_px = _agreeing(seen, kept, misfit)
         own = select_views(seen.where(corners), stay)
         fit = adjust_bundle(kept.model, kept.poses.where(stay[kept.views]), own, own.whitening(extra_px))
         unchanged = np.array_equal(corners, kept.corners) and np.array_equal(stay, kept.views)
-        kept = _Kept(stay, corners, fit.model, fit.poses)
+        kept = _Inliers(stay, corners, fit.model, fit.poses)
         if unchanged:
             break
     own = select_views(seen.where(kept.corners), kept.views)
@@ -182,7 +182,7 @@ def _without_outliers(seen: Observations, views: BoolArray, model: CameraModel, 
     return LensFit(fit, own, kept.views, kept.corners, extra_px, misfit)
 
 
-def _agreeing(seen: Observations, kept: _Kept, before: FloatArray) -> tuple[BoolArray, BoolArray, FloatArray, float]:
+def _agreeing(seen: Observations, kept: _Inliers, before: FloatArray) -> tuple[BoolArray, BoolArray, FloatArray, float]:
     """(N,) corners and (V,) views that agree with the camera so far, each view's misfit, and the extra sigma."""
     count = len(kept.views)
     residual = kept.model.project(kept.every_pose().points(seen.view, seen.points_m)[0]) - seen.pixels

@@ -13,9 +13,17 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.advice.information_gain import Gain, Known
-from groundsbot.offline.advice.new_tags import Drives, Place, View, drives_of, gain_of_place, places_of, view_of
-from groundsbot.offline.advice.passes import Pass, Sighting, gain_of_pass, passes_of, sightings_of, ways_m
+from groundsbot.offline.advice.information_gain import InformationGain, JointCovariance
+from groundsbot.offline.advice.new_tags import (
+    DrivePaths,
+    TagSite,
+    TagViews,
+    drives_of,
+    gain_of_place,
+    places_of,
+    view_of,
+)
+from groundsbot.offline.advice.passes import Pass, TagPassage, gain_of_pass, passages_of, passes_of, ways_m
 from groundsbot.offline.advice.visibility import expected_sigmas_m
 from groundsbot.offline.maps import AdviceResult
 from groundsbot.offline.measurements import TagKey
@@ -28,18 +36,18 @@ _MOST_POINTS: Final = 40
 class Candidates(NamedTuple):
     """What could be done, and what that is judged by."""
 
-    sightings: list[Sighting]
-    drives: Drives
-    view: View
+    passages: list[TagPassage]
+    drives: DrivePaths
+    view: TagViews
     passes: list[Pass]
-    places: list[Place]
+    places: list[TagSite]
 
 
-class Judged(NamedTuple):
+class RatedCandidate(NamedTuple):
     """A candidate and (T,) the tags' sigmas, now and then."""
 
     kind: str
-    candidate: Pass | Place
+    candidate: Pass | TagSite
     now_m: FloatArray
     then_m: FloatArray
 
@@ -58,10 +66,10 @@ def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResul
     return [_result(graph, solution, each, component) for each in best_candidates(graph, solution)]
 
 
-def best_candidates(graph: Graph, solution: Solution) -> list[Judged]:
+def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
     """The best pass and the best tag, as far as there are any, the better one first."""
     _, drives, view, passes, places = candidates_of(graph, solution.state)
-    gains: list[tuple[str, Pass | Place, Gain]] = []
+    gains: list[tuple[str, Pass | TagSite, InformationGain]] = []
     for each in passes:
         with suppress(LinAlgError):  # a pass that rounding leaves untied tells nothing
             gains.append(("pass", each, gain_of_pass(graph, solution.state, each)))
@@ -70,11 +78,11 @@ def best_candidates(graph: Graph, solution: Solution) -> list[Judged]:
     now_m = known.sigmas_m()
     then = []
     for kind, candidate, gain in gains:
-        if isinstance(candidate, Place):
+        if isinstance(candidate, TagSite):
             then_m = expected_sigmas_m(drives, view, candidate, known)
         else:
             then_m = known.sigmas_with_m(gain)
-        then.append(Judged(kind, candidate, now_m, then_m))
+        then.append(RatedCandidate(kind, candidate, now_m, then_m))
     then.sort(key=lambda each: float(each.then_m.max()))
     return [next(each for each in then if each.kind == kind) for kind in dict.fromkeys(each.kind for each in then)]
 
@@ -82,21 +90,21 @@ def best_candidates(graph: Graph, solution: Solution) -> list[Judged]:
 def candidates_of(graph: Graph, state: State) -> Candidates:
     """For a component with readings."""
     ways = ways_m(graph)
-    sightings = sightings_of(graph, ways)
+    sightings = passages_of(graph, ways)
     drives = drives_of(graph, state, ways)
     view = view_of(drives, len(sightings))
     return Candidates(sightings, drives, view, passes_of(ways, sightings), places_of(drives, view))
 
 
-def joint_covariance_of(solution: Solution, gains: Sequence[Gain]) -> Known:
+def joint_covariance_of(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:
     """The joint covariance of all tags and of whatever else the gains are about."""
     tags = solution.problem.columns.tags.reshape(-1)
     others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
     columns: IntArray = np.concatenate([tags, others])
-    return Known(columns, solution.covariance(columns), len(tags) // 2)
+    return JointCovariance(columns, solution.covariance(columns), len(tags) // 2)
 
 
-def _result(graph: Graph, solution: Solution, best: Judged, component: int) -> AdviceResult:
+def _result(graph: Graph, solution: Solution, best: RatedCandidate, component: int) -> AdviceResult:
     wanted, tags = best.candidate, solution.state.tags
     length_m: float | None = None
     if isinstance(wanted, Pass):

@@ -24,14 +24,14 @@ _LEAST_SHARE: Final = 1e-10
 _BAND: Final = 5
 
 
-class Gain(NamedTuple):
+class InformationGain(NamedTuple):
     """What measurements not yet made would tell: information W W^T about some columns of the tangent space."""
 
     columns: IntArray  # (k,)
     root: FloatArray  # (k, r) W
 
 
-class Known(NamedTuple):
+class JointCovariance(NamedTuple):
     """What a map knows: the joint covariance of some columns of its tangent space, those of its tags first."""
 
     columns: IntArray  # (n,) of the T tags first
@@ -51,7 +51,7 @@ class Known(NamedTuple):
         diagonal = self._blocks(np.zeros((0, 2 * self.n_tags)))
         return _largest_sigmas(*diagonal)
 
-    def sigmas_with_m(self, gain: Gain) -> FloatArray:
+    def sigmas_with_m(self, gain: InformationGain) -> FloatArray:
         """(T,) as `sigmas_m`, were these measurements made too."""
         own = self._rows(gain.columns)
         told = self.covariance[:, own] @ gain.root
@@ -73,7 +73,7 @@ class Known(NamedTuple):
         return diagonal[::2], mixed, diagonal[1::2]
 
 
-def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> Gain:
+def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> InformationGain:
     """What measurements tell of the map's columns when their own variables have given way.
 
     Own variables must be tied down where the map's are known; nothing may be added here to help that, which would hold
@@ -98,7 +98,7 @@ def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: Int
     solved = linalg.cho_solve_banded((linalg.cholesky_banded(band, lower=True), True), across)
     values, vectors = np.linalg.eigh(own - across.T @ solved)
     kept = values > _LEAST_SHARE * values[-1]
-    return Gain(columns, vectors[:, kept] * np.sqrt(values[kept]))
+    return InformationGain(columns, vectors[:, kept] * np.sqrt(values[kept]))
 
 
 def _largest_sigmas(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:

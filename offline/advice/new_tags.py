@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.advice.information_gain import Gain, marginal_information
+from groundsbot.offline.advice.information_gain import InformationGain, marginal_information
 from groundsbot.offline.advice.passes import SIGHTING_GAP_M
 from groundsbot.offline.sam import Columns, Graph, ReadingFactors, State
 
@@ -31,7 +31,7 @@ _MOST_SIGHTINGS: Final = 3
 _NEAREST_IN_RANGE: Final = 9
 
 
-class View(NamedTuple):
+class TagViews(NamedTuple):
     """How the tags of a map were seen, about the sensor."""
 
     near_m: float
@@ -39,22 +39,22 @@ class View(NamedTuple):
     half_angle_rad: float
     typical_m: float
     typical_rad: float
-    n_a_sighting: float  # readings
+    n_a_passage: float  # readings
     range_m: FloatArray  # (M,) of all readings, rising
     variance: FloatArray  # (M, 2) of range and bearing
 
 
-class Place(NamedTuple):
+class TagSite(NamedTuple):
     """Where a tag could hang, and the poses that would read it: some for each passing by."""
 
     segment: int
     keyframe: int  # beside which it lies
     position_m: FloatArray  # (2,)
     viewers: IntArray  # (k,) poses
-    n_sightings: int
+    n_passages: int
 
 
-class Drives(NamedTuple):
+class DrivePaths(NamedTuple):
     """What the places are laid along and seen from."""
 
     graph: Graph
@@ -64,17 +64,17 @@ class Drives(NamedTuple):
     example: IntArray  # (P,) a reading of the same segment; -1 where it has none
 
 
-def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> Drives:
+def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
     """Of a solved component."""
     mounts = [segment.T_base_camera if segment.readings.in_camera.any() else np.zeros(3) for segment in graph.segments]
     lengths = [len(segment.stamps_ns) for segment in graph.segments]
     sensors = se2.compose(state.poses, np.repeat(np.array(mounts), lengths, axis=0))
     example = np.searchsorted(graph.problem.readings.pose, graph.first_pose)
     example = np.where([len(segment.readings) > 0 for segment in graph.segments], example, -1)
-    return Drives(graph, state, ways, sensors, np.repeat(example, lengths))
+    return DrivePaths(graph, state, ways, sensors, np.repeat(example, lengths))
 
 
-def view_of(drives: Drives, n_sightings: int) -> View:
+def view_of(drives: DrivePaths, n_sightings: int) -> TagViews:
     """How the readings of a map came about; there must be some."""
     readings = drives.graph.problem.readings
     sight = se2.apply(se2.inverse(drives.sensors[readings.pose]), drives.state.tags[readings.tag])
@@ -89,10 +89,10 @@ def view_of(drives: Drives, n_sightings: int) -> View:
     near_m, typical_m, far_m = np.quantile(range_m, [0.05, 0.5, 0.95]).tolist()
     typical_rad, widest_rad = np.quantile(np.abs(bearing_rad), [0.5, 0.95]).tolist()
     n = len(range_m) / max(n_sightings, 1)
-    return View(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
+    return TagViews(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
 
 
-def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
+def places_of(drives: DrivePaths, view: TagViews, most: int = MOST_TAGS) -> list[TagSite]:
     """Places beside the ways, at most so many, of which a part lies about the first start and the rest far from tags.
 
     Everything is seen from the first start, so that where no tag holds its heading all of the map turns about it. Of
@@ -108,11 +108,11 @@ def places_of(drives: Drives, view: View, most: int = MOST_TAGS) -> list[Place]:
     at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.ways[0][:-1], start_m)}
     first = list(islice(_places_with_two_views(drives, view, at_start), most // 3))
     others = list(_places_with_two_views(drives, view, beside - at_start))
-    again = [place for place in others if place.n_sightings > 1]
-    return first + _spread(again or others, drives.state.tags, most - len(first))
+    again = [place for place in others if place.n_passages > 1]
+    return first + _spread_over(again or others, drives.state.tags, most - len(first))
 
 
-def _places_with_two_views(drives: Drives, view: View, where: set[tuple[int, int]]) -> Iterator[Place]:
+def _places_with_two_views(drives: DrivePaths, view: TagViews, where: set[tuple[int, int]]) -> Iterator[TagSite]:
     """Of places beside some segments and keyframes those that more than one pose views."""
     for segment, keyframe in sorted(where):
         for side in (1.0, -1.0):
@@ -121,7 +121,7 @@ def _places_with_two_views(drives: Drives, view: View, where: set[tuple[int, int
                 yield place
 
 
-def place_beside(drives: Drives, view: View, segment: int, keyframe: int, side: float) -> Place:
+def place_beside(drives: DrivePaths, view: TagViews, segment: int, keyframe: int, side: float) -> TagSite:
     """The place ahead of a keyframe, to its left (+1) or right (-1).
 
     Nobody views it where the keyframe's segment has no readings: how its robot would read it, nothing tells.
@@ -129,20 +129,20 @@ def place_beside(drives: Drives, view: View, segment: int, keyframe: int, side: 
     pose = int(drives.graph.first_pose[segment]) + keyframe
     sensor = drives.sensors[pose]
     if drives.example[pose] < 0:
-        return Place(segment, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
+        return TagSite(segment, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
     angle = side * view.typical_rad
     position_m = se2.apply(sensor, view.typical_m * np.array([np.cos(angle), np.sin(angle)]))
     step = -(-len(drives.sensors) // _MOST_VIEWERS)
     away_m = np.abs(drives.sensors[::step, :2] - position_m).max(axis=1)
     near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example[::step] >= 0))
     seen = near[is_in_view(drives.sensors[near], position_m, sensor[:2] - position_m, view)]
-    sightings = _sightings(drives, seen, least=view.n_a_sighting / step)
+    sightings = _passages(drives, seen, least=view.n_a_passage / step)
     beside = np.array([pose], dtype=np.int64)
     viewers = [part[(_WITHIN_SIGHTING * (len(part) - 1)).round().astype(int)] for part in sightings]
-    return Place(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
+    return TagSite(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
 
 
-def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: View) -> BoolArray:
+def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: TagViews) -> BoolArray:
     """(P,) which sensors have a tag at a place in view that faces along a vector."""
     sight = se2.apply(se2.inverse(sensors), position_m)
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
@@ -152,7 +152,7 @@ def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, vi
     return np.asarray(near_enough & (np.abs(bearing_rad) <= view.half_angle_rad) & (slant >= np.cos(MOST_SLANT_RAD)))
 
 
-def gain_of_place(drives: Drives, view: View, place: Place, seen: BoolArray | None = None) -> Gain:
+def gain_of_place(drives: DrivePaths, view: TagViews, place: TagSite, seen: BoolArray | None = None) -> InformationGain:
     """What a tag there would have told of the poses that read it, and of the calibration.
 
     Args:
@@ -184,7 +184,7 @@ def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
     return Columns(by_pose, by_tag, by_calibration, 2 + len(columns)), columns
 
 
-def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> ReadingFactors:
+def _readings(drives: DrivePaths, view: TagViews, place: TagSite, poses: IntArray) -> ReadingFactors:
     """As their like were read: so many of each passing by, with the sigmas of readings at that range."""
     readings, like = drives.graph.problem.readings, drives.example[poses]
     sight = se2.apply(se2.inverse(drives.sensors[poses]), place.position_m)
@@ -192,7 +192,7 @@ def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> Read
     at = np.searchsorted(view.range_m, value[:, 0])
     first = np.clip(at - _NEAREST_IN_RANGE // 2, 0, max(len(view.range_m) - _NEAREST_IN_RANGE, 0))
     variance = np.array([view.variance[i : i + _NEAREST_IN_RANGE].mean(axis=0) for i in first])
-    n_each = view.n_a_sighting * place.n_sightings / len(place.viewers)
+    n_each = view.n_a_passage * place.n_passages / len(place.viewers)
     tag = np.full(len(poses), len(drives.state.tags))
     return ReadingFactors(
         pose=poses,
@@ -208,7 +208,7 @@ def _readings(drives: Drives, view: View, place: Place, poses: IntArray) -> Read
     )
 
 
-def _sightings(drives: Drives, poses: IntArray, least: float) -> list[IntArray]:
+def _passages(drives: DrivePaths, poses: IntArray, least: float) -> list[IntArray]:
     """Rising poses, parted where a segment ends or drives on before it comes back; not more than a few, from all over.
 
     A glimpse is not counted on: a passing by has the tag in view from as many poses as read a tag on average.
@@ -224,7 +224,7 @@ def _sightings(drives: Drives, poses: IntArray, least: float) -> list[IntArray]:
     return [parts[i] for i in np.linspace(0, len(parts) - 1, _MOST_SIGHTINGS).round().astype(int)]
 
 
-def _spread(places: list[Place], tags_m: FloatArray, most: int) -> list[Place]:
+def _spread_over(places: list[TagSite], tags_m: FloatArray, most: int) -> list[TagSite]:
     """Each as far as can be from the tags and from those chosen before."""
     if len(places) <= most:
         return places

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.advice.information_gain import Gain, marginal_information
+from groundsbot.offline.advice.information_gain import InformationGain, marginal_information
 from groundsbot.offline.sam import Columns, Graph, State
 
 # A pass is a trip, not the whole drive again: at most this share of the longest run, and so far.
@@ -27,7 +27,7 @@ _MOST_SIGHTINGS: Final = 60
 SIGHTING_GAP_M: Final = 2.5
 
 
-class Sighting(NamedTuple):
+class TagPassage(NamedTuple):
     """A run passes a tag."""
 
     segment: int
@@ -51,9 +51,9 @@ def ways_m(graph: Graph) -> list[FloatArray]:
     return [segment.along_m for segment in graph.segments]
 
 
-def sightings_of(graph: Graph, ways: list[FloatArray]) -> list[Sighting]:
+def passages_of(graph: Graph, ways: list[FloatArray]) -> list[TagPassage]:
     """All of them, segment by segment in the order in which they begin."""
-    found: list[Sighting] = []
+    found: list[TagPassage] = []
     number = {tag: i for i, tag in enumerate(graph.tags)}
     for c, segment in enumerate(graph.segments):
         order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
@@ -62,7 +62,7 @@ def sightings_of(graph: Graph, ways: list[FloatArray]) -> list[Sighting]:
             continue
         begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > SIGHTING_GAP_M)) + 1
         own = [
-            Sighting(c, number[segment.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
+            TagPassage(c, number[segment.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
             for part in np.split(np.arange(len(order)), begins)
         ]
         found += sorted(own, key=lambda each: (each.first, each.last, each.tag))
@@ -74,12 +74,12 @@ def most_length_m(ways: list[FloatArray]) -> float:
     return min(_LENGTH_SHARE * max(float(way[-1]) for way in ways), _MOST_LENGTH_M)
 
 
-def passes_of(ways: list[FloatArray], sightings: list[Sighting], most: int = MOST_PASSES) -> list[Pass]:
+def passes_of(ways: list[FloatArray], sightings: list[TagPassage], most: int = MOST_PASSES) -> list[Pass]:
     """From a sighting as far as a pass goes, for each of them or so many evenly chosen.
 
     Args:
         ways: of `ways_m`.
-        sightings: of `sightings_of`.
+        sightings: of `passages_of`.
         most: how many.
     """
     length_m = most_length_m(ways)
@@ -107,7 +107,7 @@ def _evenly(passes: list[Pass], most: int) -> list[Pass]:
     return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
 
 
-def _tags_along(wanted: Pass, sightings: list[Sighting]) -> set[int]:
+def _tags_along(wanted: Pass, sightings: list[TagPassage]) -> set[int]:
     """The tags seen on the way."""
     return {
         each.tag
@@ -116,7 +116,7 @@ def _tags_along(wanted: Pass, sightings: list[Sighting]) -> set[int]:
     }
 
 
-def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> Gain:
+def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> InformationGain:
     """What one more pass would tell of the map's tags and calibration."""
     problem, offset = graph.problem, int(graph.first_pose[wanted.segment])
     first, last = offset + wanted.first, offset + wanted.last

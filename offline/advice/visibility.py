@@ -10,15 +10,15 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.advice.information_gain import Known
-from groundsbot.offline.advice.new_tags import Drives, Place, View, gain_of_place, is_in_view
+from groundsbot.offline.advice.information_gain import JointCovariance
+from groundsbot.offline.advice.new_tags import DrivePaths, TagSite, TagViews, gain_of_place, is_in_view
 
 # Points of equal weight on circles that hold 1/6, 1/2 and 5/6 of a normal distribution in the plane.
 _RADII: Final = np.sqrt(-2.0 * np.log1p(-np.array([1.0, 3.0, 5.0]) / 6.0))
 _ANGLES: Final = np.arange(8) * np.pi / 4.0
 
 
-def visibility_probabilities(drives: Drives, view: View, place: Place, known: Known) -> FloatArray:
+def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
     """(k,) with which probability each viewer of a place has a tag in view that hangs by the pose beside it.
 
     Args:
@@ -43,7 +43,7 @@ def visibility_probabilities(drives: Drives, view: View, place: Place, known: Kn
     return np.array(shares)
 
 
-def expected_sigmas_m(drives: Drives, view: View, place: Place, known: Known) -> FloatArray:
+def expected_sigmas_m(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
     """(T,) the tags' largest sigmas with a tag at the place, the mean over which of its viewers have it in view.
 
     A single reading from a drive that nothing held is worth the most, so what counts is whether there is one: readings
@@ -59,7 +59,7 @@ def expected_sigmas_m(drives: Drives, view: View, place: Place, known: Known) ->
     return expected
 
 
-def _place_jacobian(drives: Drives, pose: int, place: Place) -> FloatArray:
+def _place_jacobian(drives: DrivePaths, pose: int, place: TagSite) -> FloatArray:
     """(2, 3) how the place moves in map with a pose that it hangs by, perturbed on the right."""
     theta = drives.state.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)

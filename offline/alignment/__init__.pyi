@@ -1,10 +1,10 @@
 from .condensed_map import CondensedMap, condense, rotate_quarter
-from .joint_fit import Bend, Linear, hold
+from .joint_fit import FitState, LinearisedFit, hold
 from .merging import Group, Merge, PairAlignment, merge, size_rank, variance_factor
-from .model_selection import CHANCE_NATS, GROUP_MARGIN, MARGIN_NATS, Rivalry
+from .model_selection import CHANCE_NATS, GROUP_MARGIN, MARGIN_NATS, HypothesisTest
 from .pairwise import Alignment, align
 from .ransac import Explanation, distances, is_same_distance, through
-from .tag_gate import FALSE_ALARM, TAG_GATE, ill_fitting, squared_sigmas
+from .tag_gate import FALSE_ALARM, TAG_GATE, gate_ratio, squared_sigmas
 from .words import reason_not_joined
 
 __all__ = [
@@ -14,19 +14,19 @@ __all__ = [
     "MARGIN_NATS",
     "TAG_GATE",
     "Alignment",
-    "Bend",
     "CondensedMap",
     "Explanation",
+    "FitState",
     "Group",
-    "Linear",
+    "HypothesisTest",
+    "LinearisedFit",
     "Merge",
     "PairAlignment",
-    "Rivalry",
     "align",
     "condense",
     "distances",
+    "gate_ratio",
     "hold",
-    "ill_fitting",
     "is_same_distance",
     "merge",
     "reason_not_joined",

@@ -29,7 +29,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
 from groundsbot.offline.alignment.condensed_map import AnchorTree, rotate_quarter
-from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, ill_fitting, worth_nats
+from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, gate_ratio, log_likelihood_ratio
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
 
 _STEPS: Final = 8
@@ -37,7 +37,7 @@ _CONVERGED_SIGMAS: Final = 1e-3
 
 
 @dataclass(frozen=True)
-class Bend:
+class FitState:
     """T_a_b and how both maps bend to meet."""
 
     T_a_b: FloatArray  # (3,)
@@ -46,7 +46,7 @@ class Bend:
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedFit:
     """The differences of all shared tags around a bend: f_a - T f_b = apart + by_transform dT + noise.
 
     Attributes:
@@ -57,7 +57,7 @@ class Linear:
         effort: that least squares over its tags are taken off.
     """
 
-    at: Bend
+    at: FitState
     centre: FloatArray
     apart: FloatArray
     covariance: FloatArray
@@ -94,7 +94,7 @@ class JointFit:
     def _unbent(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
         self._effort.linearise(self.n)
         none = np.zeros(5 * self.n)
-        return _spread(self.a, none), _spread(self.b, none)
+        return _inflate(self.a, none), _inflate(self.b, none)
 
     @property
     def places_a(self) -> FloatArray:
@@ -116,17 +116,17 @@ class JointFit:
         """(2 n, 2 n) of map b's."""
         return self._unbent[1][2]
 
-    def unbent(self, T_a_b: FloatArray) -> Bend:
+    def unbent(self, T_a_b: FloatArray) -> FitState:
         """Both maps as they are."""
-        return Bend(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
+        return FitState(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
 
-    def linearise(self, bend: Bend) -> Linear:
+    def linearise(self, bend: FitState) -> LinearisedFit:
         """The differences around a bend."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
         if bent:
             self._effort.linearise(self.n)
         (f_a, J_a, S_a), (f_b, J_b, S_b) = (
-            (_spread(self.a, bend.xi_a), _spread(self.b, bend.xi_b)) if bent else self._unbent
+            (_inflate(self.a, bend.xi_a), _inflate(self.b, bend.xi_b)) if bent else self._unbent
         )
         cos, sin = np.cos(bend.T_a_b[2]), np.sin(bend.T_a_b[2])
         R = np.array([[cos, -sin], [sin, cos]])
@@ -141,19 +141,19 @@ class JointFit:
         apart = (f_a - in_a).reshape(-1) - J_a @ bend.xi_a - by_b @ bend.xi_b
         covariance = S_a + turned
         covariance[np.diag_indices(2 * self.n)] += self.unmodelled_m2
-        return Linear(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
+        return LinearisedFit(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
 
-    def retract(self, linear: Linear, held: "Held") -> Bend:
+    def retract(self, linear: LinearisedFit, held: "SubsetFit") -> FitState:
         """The bend that the tags held ask for."""
         pull = np.zeros(2 * self.n)
         pull[held.rows] = held.pull
-        return Bend(
+        return FitState(
             held.T_a_b,
             -self.a.covariance @ (linear.by_a.T @ pull),
             -self.b.covariance @ (linear.by_b.T @ pull),
         )
 
-    def solve(self, bend: Bend, members: BoolArray) -> tuple[Linear, "Held"]:
+    def solve(self, bend: FitState, members: BoolArray) -> tuple[LinearisedFit, "SubsetFit"]:
         """Where the steps end that these tags (n,) ask for, from a bend nearby."""
         linear = self.linearise(bend)
         held = hold(linear, members)
@@ -161,14 +161,16 @@ class JointFit:
             linear = self.linearise(self.retract(linear, held))
             before, held = held, hold(linear, members)
             left = float(held.motion @ held.information @ held.motion)
-            if left < _CONVERGED_SIGMAS**2 and abs(before.rise - held.rise) < _CONVERGED_SIGMAS * (1.0 + held.rise):
+            if left < _CONVERGED_SIGMAS**2 and abs(before.cost_increase - held.cost_increase) < _CONVERGED_SIGMAS * (
+                1.0 + held.cost_increase
+            ):
                 break
         return linear, held
 
 
 @dataclass(frozen=True)
-class Held:
-    """The least squares over some tags of a `Linear`.
+class SubsetFit:
+    """The least squares over some tags of a `LinearisedFit`.
 
     Attributes:
         rows: (2 m,) of theirs.
@@ -180,7 +182,7 @@ class Held:
         log_determinant: of their covariance.
     """
 
-    linear: Linear
+    linear: LinearisedFit
     rows: IntArray
     whitened: FloatArray  # (2 m, 3) by_transform
     motion: FloatArray
@@ -197,14 +199,14 @@ class Held:
         return se2.compose([about[0] + dx, about[1] + dy, turn], self.linear.at.T_a_b)
 
     @property
-    def rise(self) -> float:
+    def cost_increase(self) -> float:
         """In squared sigmas."""
         return float(self.left @ self.left)
 
     @property
     def closes(self) -> bool:
         """Whether chance explains the rise."""
-        return self.rise <= _most_rise(len(self.rows) - 3)
+        return self.cost_increase <= _cost_increase_bound(len(self.rows) - 3)
 
     @cached_property
     def root(self) -> FloatArray:
@@ -253,12 +255,12 @@ class Held:
         return (covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance
 
     def misfits(self) -> FloatArray:
-        """(m,) how ill each tag held fits where the others want it, see `ill_fitting`; three tags at least."""
-        return ill_fitting(*self.without_each())
+        """(m,) how ill each tag held fits where the others want it, see `gate_ratio`; three tags at least."""
+        return gate_ratio(*self.without_each())
 
-    def worth_nats(self) -> FloatArray:
+    def log_likelihood_ratio(self) -> FloatArray:
         """(m,) log of how much better each tag held fits than as a wrong one; three tags at least."""
-        return worth_nats(*self.without_each())
+        return log_likelihood_ratio(*self.without_each())
 
     def motion_covariance(self) -> FloatArray:
         """(3, 3) of the motion."""
@@ -266,11 +268,11 @@ class Held:
 
 
 @lru_cache
-def _most_rise(freedom: int) -> float:
+def _cost_increase_bound(freedom: int) -> float:
     return float(chi2.isf(FALSE_ALARM, freedom))
 
 
-def hold(linear: Linear, members: BoolArray) -> Held:
+def hold(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
     """Least squares over some tags (n,), two at least."""
     rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
     linear.effort.hold(len(rows) // 2)
@@ -282,18 +284,18 @@ def hold(linear: Linear, members: BoolArray) -> Held:
     motion = -np.linalg.solve(information, whitened.T @ apart)
     left = apart + whitened @ motion
     pull = linalg.solve_triangular(root, left, lower=True, trans=1, check_finite=False)
-    held = Held(linear, rows, whitened, motion, information, pull, left)
+    held = SubsetFit(linear, rows, whitened, motion, information, pull, left)
     vars(held)["root"] = root  # where the property has it
     return held
 
 
-def _root(linear: Linear, rows: IntArray) -> FloatArray:
+def _root(linear: LinearisedFit, rows: IntArray) -> FloatArray:
     S = linear.covariance[np.ix_(rows, rows)]
     # Readings without noise leave rounding only; far below any true sigma.
     S[np.diag_indices(len(rows))] += 1e-12 * float(np.trace(S)) / len(rows) + 1e-18
     return np.asarray(linalg.cholesky(S, lower=True, check_finite=False), dtype=np.float64)
 
 
-def _spread(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _inflate(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     places, jacobian = tree.jacobian(xi)
     return places, jacobian, jacobian @ tree.covariance @ jacobian.T

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment.condensed_map import rotate_quarter
-from groundsbot.offline.alignment.joint_fit import Held, Linear, hold
+from groundsbot.offline.alignment.joint_fit import LinearisedFit, SubsetFit, hold
 from groundsbot.offline.alignment.ransac import Explanation, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, log_wrong
 
@@ -36,7 +36,7 @@ GROUP_MARGIN: Final = 2.0
 _GROUP_PRIOR_NATS: Final = log(100.0)
 
 
-class Rivalry:
+class HypothesisTest:
     """Weighs explanations of some shared tags against each other."""
 
     def __init__(self, places_a: FloatArray, places_b: FloatArray) -> None:
@@ -52,7 +52,7 @@ class Rivalry:
         log_choices = _log_choices(self.n_shared, explanation.n)
         return _fits_nats(explanation.held) + log_wrong_ones - log_choices - self._chance_nats
 
-    def rivals(
+    def alternatives(
         self, best: Explanation, found: Sequence[tuple[float, Explanation]], groups: Sequence[Explanation]
     ) -> list[Explanation]:
         """What leaves it open that the best is true.
@@ -63,30 +63,30 @@ class Rivalry:
             groups: tags of these may have moved as one.
         """
         evidence = self.evidence(best)
-        best_worth = self._worth(best, groups)
+        best_worth = self._log_likelihood_ratio(best, groups)
         rivals = []
         for its, other in found:
             is_alike = its > evidence - MARGIN_NATS
             # Outnumbered, it may explain them as well: then the tags of the best would have moved as one.
             if not is_alike and best.n >= GROUP_MARGIN * other.n:
                 continue
-            if self.is_same_place(other, best) and not self._has_group_of_its_own(other, best):
+            if self.is_same_place(other, best) and not self._has_separate_group(other, best):
                 continue
-            worth = self._worth(other, groups)
+            worth = self._log_likelihood_ratio(other, groups)
             # What fits both may be of either group, unless the rest is outnumbered: then those did not stay.
             n_own = int((other.members & ~best.members).sum())
             if n_own > 1 and best.n < GROUP_MARGIN * n_own:
                 own = without(other, np.flatnonzero(other.members & best.members))
-                worth = max(worth, self._worth(own, groups))
+                worth = max(worth, self._log_likelihood_ratio(own, groups))
             if is_alike or worth > best_worth - MARGIN_NATS:
                 rivals.append(other)
         return rivals
 
-    def _worth(self, explanation: Explanation, groups: Sequence[Explanation]) -> float:
+    def _log_likelihood_ratio(self, explanation: Explanation, groups: Sequence[Explanation]) -> float:
         """Its evidence, with that of groups among the rest where this is more than such a group is rare."""
         return self.evidence(explanation) + self.of_groups(explanation, groups, _GROUP_PRIOR_NATS)
 
-    def _has_group_of_its_own(self, other: Explanation, best: Explanation) -> bool:
+    def _has_separate_group(self, other: Explanation, best: Explanation) -> bool:
         """Whether tags that do not fit the best rather moved as one than each alone: they may be what stayed."""
         own = other.members & ~best.members
         if (own & ~best.fits).sum() < 2:
@@ -113,7 +113,7 @@ class Rivalry:
             evidence += most - rare_nats
             rest = rest & ~moved[i][1]
 
-    def _as_group(self, explanation: Explanation, linear: Linear, tags: BoolArray, n: int) -> float:
+    def _as_group(self, explanation: Explanation, linear: LinearisedFit, tags: BoolArray, n: int) -> float:
         """Evidence that these tags, of n that may have moved, did so as one, over that each did alone.
 
         Any of them went somewhere as a tag alone does, and turned anyhow; the others went along.
@@ -140,9 +140,9 @@ class Rivalry:
         return covariance
 
 
-def _fits_nats(held: Held) -> float:
+def _fits_nats(held: SubsetFit) -> float:
     """Log likelihood of the tags held, over all transforms: the integral by m, m and rad."""
-    log_likelihood = -0.5 * (held.rise + held.log_determinant + len(held.rows) * log(2.0 * pi))
+    log_likelihood = -0.5 * (held.cost_increase + held.log_determinant + len(held.rows) * log(2.0 * pi))
     return log_likelihood + 0.5 * (3.0 * log(2.0 * pi) - float(np.linalg.slogdet(held.information)[1]))
 
 

@@ -18,7 +18,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.joint_fit import JointFit
-from groundsbot.offline.alignment.model_selection import CHANCE_NATS, Rivalry
+from groundsbot.offline.alignment.model_selection import CHANCE_NATS, HypothesisTest
 from groundsbot.offline.alignment.ransac import Explanation, explanations, halves, refine_inliers, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM
 from groundsbot.offline.measurements import REACH_M, Placement, TagKey
@@ -100,10 +100,10 @@ def align(
     if len(shared) < 2:
         return None
     effort.begin()
-    return _Judge(a, b, shared, placement, effort).verdict()
+    return _AlignmentChoice(a, b, shared, placement, effort).verdict()
 
 
-class _Judge(Rivalry):
+class _AlignmentChoice(HypothesisTest):
     """Weighs what the shared tags of two maps say."""
 
     def __init__(
@@ -136,7 +136,7 @@ class _Judge(Rivalry):
         each_once = {each.members.tobytes(): (its, each) for its, each in found}
         found = sorted(each_once.values(), key=lambda f: -f[0])
         rivals: list[Explanation] = []
-        for each in self.rivals(best, found, groups):
+        for each in self.alternatives(best, found, groups):
             if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
         told = tuple(self._alignment(rival, found, groups, (), is_sure=False) for rival in rivals)
@@ -160,7 +160,7 @@ class _Judge(Rivalry):
                 if each.n == len(self.shared) and self.placement is None:
                     # Nothing can join instead, and of what is left there are so many choices more.
                     most_nats -= log(each.n) - _ROUNDING_NATS
-                for tag in held[each.held.worth_nats() < most_nats]:
+                for tag in held[each.held.log_likelihood_ratio() < most_nats]:
                     less = without(each, tag)
                     instead = less.joining & ~each.members
                     for other in (less, less.with_more(instead)) if instead.any() else (less,):
@@ -267,7 +267,7 @@ class _Judge(Rivalry):
             off_m=np.where(inlier, 0.0, np.linalg.norm(off_m, axis=1)),
             off_sigmas=np.where(inlier, 0.0, np.sqrt(squares)),
             rmse_m=float(np.sqrt((apart**2).sum(axis=1).mean())),
-            rise=explanation.held.rise,
+            rise=explanation.held.cost_increase,
             evidence_nats=self.evidence(explanation),
             is_sure=is_sure,
             rivals=rivals,

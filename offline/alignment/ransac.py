@@ -18,12 +18,12 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.joint_fit import Bend, Held, JointFit, Linear, hold
+from groundsbot.offline.alignment.joint_fit import FitState, JointFit, LinearisedFit, SubsetFit, hold
 from groundsbot.offline.alignment.tag_gate import (
     FALSE_ALARM,
     TAG_GATE,
     WRONG_FROM_M,
-    ill_fitting,
+    gate_ratio,
     log_wrong_there,
     squared_sigmas,
 )
@@ -48,8 +48,8 @@ class Explanation:
     """Shared tags that fit together, and the joint fit over them."""
 
     members: BoolArray  # (n,)
-    linear: Linear
-    held: Held
+    linear: LinearisedFit
+    held: SubsetFit
 
     @property
     def T_a_b(self) -> FloatArray:
@@ -74,7 +74,7 @@ class Explanation:
     @cached_property
     def joining(self) -> BoolArray:
         """(n,) which tags it does not count that fit it and rather stayed than are wrong."""
-        return ~self.members & (ill_fitting(*self._others) < 1.0)
+        return ~self.members & (gate_ratio(*self._others) < 1.0)
 
     def with_more(self, tags: BoolArray) -> "Explanation":
         """The same tags and these (n,)."""
@@ -196,11 +196,11 @@ def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
         size = np.where(tried, np.inf, np.trace(spread, axis1=1, axis2=2))
         following = size <= _NEXT_VARIANCE * size.min()
         tried |= following
-        members |= following & (ill_fitting(off, spread) < 1.0)
+        members |= following & (gate_ratio(off, spread) < 1.0)
     return refine_inliers(fit, bend, members)
 
 
-def refine_inliers(fit: JointFit, bend: Bend, members: BoolArray) -> Explanation | None:
+def refine_inliers(fit: JointFit, bend: FitState, members: BoolArray) -> Explanation | None:
     """Takes in all that fits and drops what does not; what was dropped does not come back."""
     banned = np.zeros_like(members)
     for _ in range(_MOST_CHANGES):
@@ -216,14 +216,14 @@ def refine_inliers(fit: JointFit, bend: Bend, members: BoolArray) -> Explanation
                 return None
             continue
         off, spread = held.others()
-        joining = ~members & ~banned & (ill_fitting(off, spread) < 1.0)
+        joining = ~members & ~banned & (gate_ratio(off, spread) < 1.0)
         if not joining.any():
             return Explanation(members, linear, held)
         members |= joining
     return None
 
 
-def _worst(held: Held, members: BoolArray) -> int | None:
+def _worst(held: SubsetFit, members: BoolArray) -> int | None:
     """The tag that the others contradict most, if they do."""
     which = np.flatnonzero(members)
     if len(which) == 2:

@@ -37,18 +37,18 @@ def log_wrong_there(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
     return log_wrong((off_m**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2))
 
 
-def ill_fitting(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
+def gate_ratio(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
     """(m,) squared sigmas of differences (m, 2) with covariances (m, 2, 2), over what a tag may have that fits.
 
     It fits if chance explains the difference, chi-square with 2 degrees, and explains it better than a wrong tag would.
     So a tag whose place is foretold to a few metres only proves little.
     """
     squares = squared_sigmas(off_m, covariance)
-    ratio: FloatArray = squares / np.clip(squares + 2.0 * worth_nats(off_m, covariance), 1e-6, TAG_GATE)
+    ratio: FloatArray = squares / np.clip(squares + 2.0 * log_likelihood_ratio(off_m, covariance), 1e-6, TAG_GATE)
     return ratio
 
 
-def worth_nats(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
+def log_likelihood_ratio(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
     """(m,) log of how much better differences (m, 2) with covariances (m, 2, 2) explain tags than being wrong does."""
     log_fits = -0.5 * (squared_sigmas(off_m, covariance) + np.log(_determinants(covariance))) - log(2.0 * pi)
     worth: FloatArray = log_fits - log_wrong_there(off_m, covariance)

@@ -8,16 +8,16 @@ from typing import Any, Final
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import metre_line, read_robot_files, say
+from groundsbot.offline.commands.shared import echo_line, metre_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, announce_compilation
-from groundsbot.offline.mapping import Workings, build_map, read_runs
+from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
 from groundsbot.offline.maps import CalibrationResult, MapResult
 from groundsbot.offline.measurements import Run, TapeOptions
 from groundsbot.offline.self_calibration import (
     AUTO,
-    Learnt,
-    Owned,
+    Correction,
+    OwnedParameter,
     choice_words,
     correct_robot,
     learnt_lines,
@@ -60,12 +60,12 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
     calibrate = parse_calibrate(options.calibrate)
     if not calibrate.is_on:
         raise OfflineError("--calibrate off: then there is nothing to learn; say auto, or name what is to be freed")
-    workings = Workings()
+    workings = Diagnostics()
     noise = read_noise_yaml(options.noise) if options.noise else None
     logs, robot_files = find_logs(list(options.logs)), read_robot_files(options.robots)
     if options.output.exists():
         raise OfflineError(f"-o {options.output}: is there already; name a new file or folder, nothing is written over")
-    with announce_compilation(say), progress_bar() as show:
+    with announce_compilation(echo_line), progress_bar() as show:
         stages = Stages(show)
         result = build_map(
             read_runs(logs, robot_files, stages),
@@ -79,7 +79,7 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
     robots = _robots(workings.runs)
     paths = _paths(options.output, [*robots])
     learnt = _most_certain(result.calibration)
-    corrections = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in learnt}
+    corrections = {OwnedParameter(each.owner, each.name): Correction(each.value, each.sigma) for each in learnt}
     written = []
     for robot_id, run in robots.items():
         written += _write(correct_robot(run.robot, corrections), _camera(run, corrections), paths[robot_id])
@@ -133,9 +133,9 @@ def _numbers(run: Run) -> tuple[object, ...]:
 
 def _most_certain(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:
     """Each number once: from the component that tells it best."""
-    best: dict[Owned, CalibrationResult] = {}
+    best: dict[OwnedParameter, CalibrationResult] = {}
     for each in calibration:
-        key = Owned(each.owner, each.name)
+        key = OwnedParameter(each.owner, each.name)
         if key not in best or each.sigma < best[key].sigma:
             best[key] = each
     return list(best.values())
@@ -153,8 +153,8 @@ def _paths(output: Path, robot_ids: Sequence[str]) -> dict[str, Path]:
     return {robot_ids[0]: output}
 
 
-def _camera(run: Run, learnt: dict[Owned, Learnt]) -> CameraModel | None:
-    return with_focal_lengths(run.camera, learnt.get(Owned(run.robot_id, FOCAL_SCALE)))
+def _camera(run: Run, learnt: dict[OwnedParameter, Correction]) -> CameraModel | None:
+    return with_focal_lengths(run.camera, learnt.get(OwnedParameter(run.robot_id, FOCAL_SCALE)))
 
 
 def _write(robot: Robot, camera: CameraModel | None, path: Path) -> list[Path]:

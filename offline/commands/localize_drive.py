@@ -14,7 +14,7 @@ import numpy as np
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, atomic_write, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, read_robot_files, say
+from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.localization import Candidate, Localization, LocatedRun, NotLocated, localize
@@ -67,7 +67,7 @@ def localize_log(options: LocalizeOptions) -> Localization:
         check_output(options.output, [*logs, options.map], JSON_FILE, overwrite=options.overwrite)
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
-    with announce_compilation(say), progress_bar() as show:
+    with announce_compilation(echo_line), progress_bar() as show:
         run = load_run(logs[0], robot_files)
         check_robots([run], robot_files)
         found = localize(run, known, options.map, noise=noise, component=options.component, stages=Stages(show))

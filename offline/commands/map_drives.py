@@ -11,10 +11,10 @@ from typing import Final
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, metre_line, read_robot_files, say
+from groundsbot.offline.commands.shared import check_output, echo_line, metre_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
-from groundsbot.offline.mapping import Workings, build_map, read_runs
+from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
     MAP_FILE,
@@ -78,8 +78,8 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
-    with announce_compilation(say), progress_bar() as show:
-        stages, workings = Stages(show), Workings()
+    with announce_compilation(echo_line), progress_bar() as show:
+        stages, workings = Stages(show), Diagnostics()
         result = build_map(
             read_runs(logs, robot_files, stages),
             noise,
@@ -97,7 +97,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     return result, stages.costs
 
 
-def _write_files(result: MapResult, workings: Workings, folder: Path, output: Path, stages: Stages) -> None:
+def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output: Path, stages: Stages) -> None:
     try:
         with stages.stage("writing files"):
             write_map(result, folder)

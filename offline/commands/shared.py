@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.maps import MetreResult
+from groundsbot.offline.maps import ScaleBudget
 from groundsbot.offline.measurements import RobotFile, read_robot_file
 
 
@@ -20,12 +20,12 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
     return robot_files
 
 
-def say(text: str) -> None:
+def echo_line(text: str) -> None:
     """To a person, beside what the command prints."""
     sys.stderr.write(text + "\n")
 
 
-def metre_line(metre: MetreResult, *, several: bool) -> str:
+def metre_line(metre: ScaleBudget, *, several: bool) -> str:
     """What the length of a metre rests on."""
     of = f" of component {metre.component}" if several else ""
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)

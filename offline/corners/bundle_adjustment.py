@@ -8,7 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.robot import Mount
-from groundsbot.offline.corners.floor_noise import LEVEL, fit_attitude_sigmas, initial_attitude_sigmas, with_wobble
+from groundsbot.offline.corners.floor_noise import (
+    LEVEL,
+    fit_attitude_sigmas,
+    initial_attitude_sigmas,
+    with_attitude_sigmas,
+)
 from groundsbot.offline.corners.floor_slope_test import stretches_off_level
 from groundsbot.offline.corners.graph import CornerGraph, corner_graph
 from groundsbot.offline.corners.initial_tag_poses import tags_rehung
@@ -45,7 +50,7 @@ class Refined:
     @property
     def floor(self) -> FloorSigmas:
         """How uneven the floor is; a floor rolls and pitches alike."""
-        tilt_rad, _, height_m = self.solution.problem.wobble_sigma.tolist()
+        tilt_rad, _, height_m = self.solution.problem.attitude_sigmas.tolist()
         return FloorSigmas(tilt_rad, height_m)
 
     @property
@@ -55,7 +60,7 @@ class Refined:
         six = np.column_stack([columns.tags, columns.heights, columns.turns])
         quaternions = Rotation.from_matrix(state.turns).as_quat(canonical=True)
         found: list[TagPose | None] = []
-        for t, is_hung in enumerate(self.corners.is_hung.tolist()):
+        for t, is_hung in enumerate(self.corners.has_pose.tolist()):
             to_map = np.eye(6)
             to_map[3:, 3:] = state.turns[t]  # R exp(d) = exp(R d) R
             pose = TagPose(
@@ -96,10 +101,10 @@ def refine(
     too_many = _reason_for_level_floor(graph, found)
     sigma = LEVEL if too_many else initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
-        found = solve_corners(with_wobble(found.problem, sigma), found.state)
+        found = solve_corners(with_attitude_sigmas(found.problem, sigma), found.state)
         found = solve_corners(found.problem, tags_rehung(found.problem, found.state))
         sigma = fit_attitude_sigmas(found.problem, found.state)
-        found = solve_corners(with_wobble(found.problem, sigma), found.state)
+        found = solve_corners(with_attitude_sigmas(found.problem, sigma), found.state)
     off_level = [*too_many, *stretches_off_level(graph, found)]
     reason = "" if found.converged else found.reason
     if not reason and (share := found.pictures.outliers) > _MOST_OUTLIERS:

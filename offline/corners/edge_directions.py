@@ -15,26 +15,26 @@ from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.initial_tag_poses import eyes_of
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
-from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues
 from groundsbot.offline.foundation import borrowed, njit
 
 
 def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> CornerFactors:
     """The factors with sides that face as the state has them; as they were where a lens has no image of a corner."""
-    looks = factors.looks
+    looks = factors.observations
     predicted_px = np.empty_like(looks.corners_px)
     project(factors.arrays, factors.lenses, spatial_values(state), predicted_px)
     found = outward(predicted_px)
     is_seen = np.isfinite(found).all((-1, -2), keepdims=True)
-    return replace(factors, looks=replace(looks, outward=np.where(is_seen, found, looks.outward)))
+    return replace(factors, observations=replace(looks, outward=np.where(is_seen, found, looks.outward)))
 
 
 @njit
-def project(looks: LookArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
+def project(looks: CornerArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
     """Sets the pixels (M, 4, 2) of all corners, before sides are seen too far out; NaN where a lens has no image."""
     looks, values = borrowed(looks), borrowed(values)
     axes, places = np.empty((4, 3, 3)), np.empty((4, 3))
-    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for m in range(len(looks.pose)):
         eyes_of(looks, values, m, eye, axes, places)
         tag, lens = looks.tag[m], lenses[looks.camera[m]]

@@ -7,8 +7,8 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.corners.factors import SpatialColumns
-from groundsbot.offline.corners.multifrontal.fronts import Fronts, build_fronts, common_ancestor
-from groundsbot.offline.sam import Measured, OdometryFactors
+from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, build_fronts, common_ancestor
+from groundsbot.offline.sam import OdometryFactors, Priors
 
 # Poses that one leaf eliminates, between two separators, and leaves or branches that meet in a branch.
 _LEAF: Final = 12
@@ -21,10 +21,10 @@ def corner_order(
     columns: SpatialColumns,
     kinds: Sequence[IntArray],
     odometry: OdometryFactors,
-    measured: Measured,
+    measured: Priors,
     pose: IntArray,
     tag: IntArray,
-) -> Fronts:
+) -> EliminationFronts:
     """Poses in leaves and separators, tags where all who saw them meet, calibration and starts at the root.
 
     Args:

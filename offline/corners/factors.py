@@ -20,7 +20,7 @@ from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.corners.kernels.lens import lenses_of
-from groundsbot.offline.corners.kernels.view import LookArrays, SpatialValues
+from groundsbot.offline.corners.kernels.view import CornerArrays, SpatialValues
 from groundsbot.offline.measurements import UNIT_CORNERS
 from groundsbot.offline.sam import Columns, Linearised, State
 
@@ -60,7 +60,7 @@ class SpatialColumns(Columns):
 
 
 @dataclass(frozen=True)
-class Looks:
+class CornerObservations:
     """M tags seen in pictures.
 
     Attributes:
@@ -98,12 +98,12 @@ class Looks:
         """Number of looks."""
         return len(self.pose)
 
-    def where(self, which: BoolArray | IntArray) -> "Looks":
+    def where(self, which: BoolArray | IntArray) -> "CornerObservations":
         """Those of a mask, or of indices."""
-        return Looks(*(getattr(self, field.name)[which] for field in fields(self)))
+        return CornerObservations(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
-class Seen(NamedTuple):
+class PredictedCorners(NamedTuple):
     """Predicted corners.
 
     Attributes:
@@ -125,7 +125,7 @@ class Seen(NamedTuple):
 class CornerFactors:
     """r = (predicted - seen) / sigma, eight numbers a look."""
 
-    looks: Looks
+    observations: CornerObservations
     cameras: tuple[CameraModel, ...]
 
     @cached_property
@@ -134,9 +134,11 @@ class CornerFactors:
         return []
 
     @cached_property
-    def arrays(self) -> LookArrays:
+    def arrays(self) -> CornerArrays:
         """The looks for compiled functions."""
-        return LookArrays(*(np.ascontiguousarray(getattr(self.looks, field.name)) for field in fields(Looks)))
+        return CornerArrays(
+            *(np.ascontiguousarray(getattr(self.observations, field.name)) for field in fields(CornerObservations))
+        )
 
     @cached_property
     def lenses(self) -> FloatArray:
@@ -159,12 +161,12 @@ class CornerFactors:
     def _linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
         seen = self._predict(state)
         wobble = np.concatenate([_by_turning(seen.by_base, seen.in_base)[..., :2], -seen.by_base[..., 2:]], axis=-1)
-        whitened = wobble.reshape(len(self.looks), 8, 3) / self.looks.sigma_px[:, None, None]
+        whitened = wobble.reshape(len(self.observations), 8, 3) / self.observations.sigma_px[:, None, None]
         block = self.columns(columns), self._jacobian(state, seen)
         return Linearised(self._residual(state, seen), (block,)), whitened
 
-    def _jacobian(self, state: SpatialState, seen: Seen) -> FloatArray:
-        looks = self.looks
+    def _jacobian(self, state: SpatialState, seen: PredictedCorners) -> FloatArray:
+        looks = self.observations
         turned_rows = _about_up(looks.moved[..., 2] - (self._late(state) * looks.twist[:, 2])[:, None])
         by_keyframe = seen.by_base @ turned_rows.swapaxes(-1, -2)
         by_map = by_keyframe @ _about_up(state.poses[looks.pose, 2])[:, None].swapaxes(-1, -2)
@@ -192,7 +194,7 @@ class CornerFactors:
 
     def columns(self, columns: SpatialColumns) -> IntArray:
         """(M, 19) of pose, tag's place, its turn, mount, time, scale, focal length and sides."""
-        looks = self.looks
+        looks = self.observations
         return np.concatenate(
             [
                 columns.poses[looks.pose],
@@ -208,29 +210,29 @@ class CornerFactors:
             axis=-1,
         )
 
-    def _residual(self, state: SpatialState, seen: Seen) -> FloatArray:
-        looks = self.looks
+    def _residual(self, state: SpatialState, seen: PredictedCorners) -> FloatArray:
+        looks = self.observations
         shifted = seen.pixels + state.calibration[looks.edge_parameter][:, None, None] * looks.outward
         off: FloatArray = (shifted - looks.corners_px) / looks.sigma_px[:, None, None]
         return off.reshape(len(looks), 8)
 
     def _corners(self, state: SpatialState) -> FloatArray:
         """(M, 4, 2) in the tag's own axes."""
-        side_m = self.looks.side_m * (1.0 + state.calibration[self.looks.scale_parameter])
+        side_m = self.observations.side_m * (1.0 + state.calibration[self.observations.scale_parameter])
         return UNIT_CORNERS * side_m[:, None, None]
 
     def _late(self, state: SpatialState) -> FloatArray:
         """(M,) seconds by which each stamp is late: the picture shows where base was so long before it."""
-        return state.calibration[self.looks.time_parameter]
+        return state.calibration[self.observations.time_parameter]
 
     def _mount(self, state: SpatialState) -> tuple[FloatArray, FloatArray]:
         """(M, 6) as corrected, and R_base_camera (M, 3, 3)."""
-        mount = self.looks.mount + state.calibration[self.looks.mount_parameters]
+        mount = self.observations.mount + state.calibration[self.observations.mount_parameters]
         roll, pitch, yaw = mount[:, 3], mount[:, 4], mount[:, 5]
         return mount, _about_up(yaw) @ _rotation_about_left(pitch) @ _about_forward(roll) @ _LEVEL_OPTICAL
 
-    def _predict(self, state: SpatialState) -> Seen:
-        looks = self.looks
+    def _predict(self, state: SpatialState) -> PredictedCorners:
+        looks = self.observations
         flat = self._corners(state)
         in_map = flat @ state.turns[looks.tag][..., :2].swapaxes(-1, -2)
         in_map[..., :2] += state.tags[looks.tag][:, None]
@@ -244,26 +246,26 @@ class CornerFactors:
         pixels, by_camera = self._project(in_camera)
         focal, centres = self._focal(state)[:, None, None], self._centres()
         pixels, by_camera = centres + focal * (pixels - centres), focal[..., None] * by_camera
-        return Seen(in_base, pixels, by_camera @ rotation[:, None].swapaxes(-1, -2), in_keyframe, rotation)
+        return PredictedCorners(in_base, pixels, by_camera @ rotation[:, None].swapaxes(-1, -2), in_keyframe, rotation)
 
     def _focal(self, state: SpatialState) -> FloatArray:
         """(M,) true focal length over that of the camera's file."""
-        return np.asarray(1.0 + state.calibration[self.looks.focal_parameter], dtype=np.float64)
+        return np.asarray(1.0 + state.calibration[self.observations.focal_parameter], dtype=np.float64)
 
     def _centres(self) -> FloatArray:
         """(M, 1, 2) principal points."""
-        return np.array([[each.cx_px, each.cy_px] for each in self.cameras])[self.looks.camera][:, None]
+        return np.array([[each.cx_px, each.cy_px] for each in self.cameras])[self.observations.camera][:, None]
 
     def _project(self, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         if len(self.cameras) == 1:
             return self.cameras[0].project_with_jacobian(in_camera)
         pixels, by_camera = np.empty((*in_camera.shape[:-1], 2)), np.empty((*in_camera.shape[:-1], 2, 3))
         for i, camera in enumerate(self.cameras):
-            own = self.looks.camera == i
+            own = self.observations.camera == i
             pixels[own], by_camera[own] = camera.project_with_jacobian(in_camera[own])
         return pixels, by_camera
 
-    def _by_mount(self, state: SpatialState, seen: Seen) -> FloatArray:
+    def _by_mount(self, state: SpatialState, seen: PredictedCorners) -> FloatArray:
         """(M, 4, 2, 6) by CORNER_MOUNT: a camera that turns about an axis of base sees all else turn back."""
         mount, _ = self._mount(state)
         pitch, yaw = mount[:, 4], mount[:, 5]

@@ -51,7 +51,7 @@ def initial_attitude_sigmas(
     if not shows:
         return LEVEL
     guesses = [scale * _USUAL for scale in (1.0, _NEARER)]
-    unlikely = [_unlikeliness(with_wobble(problem, sigma), state) for sigma in (LEVEL, *guesses)]
+    unlikely = [_unlikeliness(with_attitude_sigmas(problem, sigma), state) for sigma in (LEVEL, *guesses)]
     best = int(np.argmin(unlikely[1:]))
     return guesses[best] if unlikely[1 + best] < unlikely[0] - _BETTER else LEVEL
 
@@ -88,19 +88,19 @@ def fit_attitude_sigmas(problem: CornerProblem, state: SpatialState) -> FloatArr
     """
 
     def unlikely(logarithm: FloatArray) -> float:
-        return _unlikeliness(with_wobble(problem, np.exp(logarithm)[[0, 0, 1]]), state)
+        return _unlikeliness(with_attitude_sigmas(problem, np.exp(logarithm)[[0, 0, 1]]), state)
 
-    start: FloatArray = np.log(problem.wobble_sigma[1:])
+    start: FloatArray = np.log(problem.attitude_sigmas[1:])
     options: Any = {"xatol": _TOLERANCE, "fatol": _UNLIKELINESS_TOLERANCE, "maxfev": _MOST_LOOKS}  # typed without fatol
     found = minimize(unlikely, start, method="Nelder-Mead", options=options)
     best: FloatArray = np.exp(found.x)[[0, 0, 1]]
     return best
 
 
-def with_wobble(problem: CornerProblem, sigma: FloatArray) -> CornerProblem:
+def with_attitude_sigmas(problem: CornerProblem, sigma: FloatArray) -> CornerProblem:
     """The problem with pictures that stand off level by other sigmas."""
-    other = replace(problem, wobble_sigma=sigma)
-    if problem.wobble_sigma.any() == sigma.any():
+    other = replace(problem, attitude_sigmas=sigma)
+    if problem.attitude_sigmas.any() == sigma.any():
         # Settled once for all sigmas but zero, which couple the same columns.
         vars(other).update(
             {name: value for name, value in vars(problem).items() if name in ("order", "motions", "pictures", "pairs")}
@@ -115,4 +115,4 @@ def _unlikeliness(problem: CornerProblem, state: SpatialState) -> float:
         factor = problem.order.factorise(system)
     except NotPositiveError:
         return np.inf
-    return cost + 0.5 * (problem.log_spread(state) + factor.log_determinant())
+    return cost + 0.5 * (problem.log_determinant(state) + factor.log_determinant())

@@ -46,7 +46,7 @@ class _Pictures(NamedTuple):
     pose: IntArray
     slope: FloatArray
     information: FloatArray
-    look_picture: IntArray
+    picture_of: IntArray
     coupled: FloatArray
     columns: IntArray
     range_m: FloatArray
@@ -102,16 +102,16 @@ def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
 
 def _pictures(solution: CornerSolution) -> _Pictures:
     problem, state, found = solution.problem, solution.state, solution.pictures
-    picture, looks = found.picture, problem.corners.looks
+    picture, looks = found.picture, problem.corners.observations
     n = len(found.own)
     pose = np.zeros(n, dtype=np.int64)
     pose[picture] = looks.pose
     off_m = state.tags[looks.tag] - state.poses[looks.pose, :2]
     range_m = np.bincount(picture, np.hypot(off_m[:, 0], off_m[:, 1]), n) / np.bincount(picture, minlength=n)
     columns = problem.order.kinds[LOOKS].columns
-    if not problem.wobble_sigma.any():  # quicker than by what follows
+    if not problem.attitude_sigmas.any():  # quicker than by what follows
         return _Pictures(pose, found.force, found.own, picture, found.coupled, columns, range_m)
-    spread = np.linalg.inv(np.eye(3) + found.own * problem.wobble_sigma**2)
+    spread = np.linalg.inv(np.eye(3) + found.own * problem.attitude_sigmas**2)
     slope = np.asarray((spread @ found.force[..., None])[..., 0], dtype=np.float64)
     return _Pictures(pose, slope, spread @ found.own, picture, spread[picture] @ found.coupled, columns, range_m)
 
@@ -136,7 +136,7 @@ def _show(pictures: _Pictures, cut: Sequence[slice]) -> list[slice]:
 
 def _coupling(pictures: _Pictures, which: slice, n: int) -> FloatArray:
     """C (3, n) of a segment."""
-    looks = np.flatnonzero((pictures.look_picture >= which.start) & (pictures.look_picture < which.stop))
+    looks = np.flatnonzero((pictures.picture_of >= which.start) & (pictures.picture_of < which.stop))
     coupled = np.zeros((3, n + 1))  # the last takes what is held
     for k in range(3):
         np.add.at(coupled[k], pictures.columns[looks], pictures.coupled[looks, k])
@@ -161,7 +161,7 @@ def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel
 
 def _counts(part: _OffLevel, solution: CornerSolution, n: int) -> bool:
     """Whether chance does not explain it, and it is more than the floor is uneven by from picture to picture."""
-    beyond = bool((np.abs(part.off) > solution.problem.wobble_sigma).any())
+    beyond = bool((np.abs(part.off) > solution.problem.attitude_sigmas).any())
     return beyond and part.square > _by_chance(n, part.freedom)
 
 

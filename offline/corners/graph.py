@@ -12,7 +12,7 @@ from groundsbot.calib.geometry import wheels
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, FOCAL_SCALE, MOUNT_PARAMETERS, TIME_OFFSET
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
-from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, Looks, SpatialState
+from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
@@ -38,7 +38,7 @@ class CornerGraph:
     parameters: tuple[Parameter, ...]
 
     @property
-    def is_hung(self) -> BoolArray:
+    def has_pose(self) -> BoolArray:
         """(T,) which tags have a height and an orientation."""
         return np.asarray(self.problem.columns.heights >= 0)
 
@@ -65,7 +65,7 @@ def corner_graph(
         {each for segment in seeing for each in (_height_parameter(segment), _focal_parameter(segment))}
     )
     parameters = (*graph.parameters, *of_corners)
-    looks, cameras = _looks(graph, parameters, masks)
+    looks, cameras = _observations(graph, parameters, masks)
     floor = graph.problem
     n_tags = len(graph.tags)
     seen = np.bincount(looks.tag, minlength=n_tags) > 0
@@ -79,7 +79,7 @@ def corner_graph(
         measured=floor.measured,
         columns=columns_of(len(state.poses), seen, sigmas),
         anchor=floor.anchor,
-        wobble_sigma=np.zeros(3) if wobble_sigma is None else wobble_sigma,
+        attitude_sigmas=np.zeros(3) if wobble_sigma is None else wobble_sigma,
         upright=NOTHING_UPRIGHT
         if upright_sigma_rad is None
         else UprightFactors(np.flatnonzero(seen), upright_sigma_rad),
@@ -97,13 +97,13 @@ def corner_graph(
     return CornerGraph(problem, graph, parameters), start
 
 
-def _looks(
+def _observations(
     graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
-) -> tuple[Looks, tuple[CameraModel, ...]]:
+) -> tuple[CornerObservations, tuple[CameraModel, ...]]:
     """Those readings of each segment that have corners, and the cameras."""
     floor = _readings_where(graph.problem.readings, np.concatenate(masks))
     cameras: list[CameraModel] = []
-    shown: list[_Shown] = []
+    shown: list[_CornerData] = []
     of_segment: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
     for segment, mask in zip(graph.segments, masks, strict=True):
         camera = segment.run.camera
@@ -114,14 +114,14 @@ def _looks(
         own = [parameters.index(each) for each in (_height_parameter(segment), _focal_parameter(segment))]
         of_segment.append((own[0], own[1], cameras.index(camera)))
         shown.append(_corner_arrays(segment, mask, camera.height_px))
-    found = _Shown(*(np.concatenate(each) for each in zip(*shown, strict=True)))
+    found = _CornerData(*(np.concatenate(each) for each in zip(*shown, strict=True)))
     heights, focal, camera_of = np.repeat(of_segment, [len(each.sigma_px) for each in shown], axis=0).T
     index: dict[str, IntArray] = {
         **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
         **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
         _HEIGHT: heights,
     }
-    looks = Looks(
+    looks = CornerObservations(
         pose=floor.pose,
         tag=floor.tag,
         corners_px=found.corners_px,
@@ -141,8 +141,8 @@ def _looks(
     return looks, tuple(cameras)
 
 
-class _Shown(NamedTuple):
-    """What the floor knows nothing of: arrays of `Looks` with the same names."""
+class _CornerData(NamedTuple):
+    """What the floor knows nothing of: arrays of `CornerObservations` with the same names."""
 
     corners_px: FloatArray
     sigma_px: FloatArray
@@ -152,7 +152,7 @@ class _Shown(NamedTuple):
     mount: FloatArray
 
 
-def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _Shown:
+def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _CornerData:
     """Of those readings of one segment that have corners."""
     robot, readings = segment.run.robot, segment.readings
     corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
@@ -160,7 +160,7 @@ def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _Shown:
     variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
     sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in segment.tags])
     moved, twist = _base_motion(segment, readings.keyframe[mask], corners_px, height_px)
-    return _Shown(
+    return _CornerData(
         corners_px,
         np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
         sides_m[readings.tag[mask]],

@@ -12,10 +12,10 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.linearisation import add_looks
-from groundsbot.offline.corners.kernels.view_selection import judges, looks_by_tag
-from groundsbot.offline.corners.multifrontal.fronts import Fronts, NotPositiveError, build_fronts
-from groundsbot.offline.corners.multifrontal.kernels import System
+from groundsbot.offline.corners.kernels.linearisation import add_corners
+from groundsbot.offline.corners.kernels.view_selection import judges, observations_by_tag
+from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, NotPositiveError, build_fronts
+from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem, columns_of, prior_normal
 
 _LOOKS: Final = 0  # among the kinds of factors
@@ -28,8 +28,8 @@ def initial_calibration(problem: CornerProblem, state: SpatialState) -> SpatialS
         problem: of which only looks and the prior of the calibration count.
         state: its tags hang.
     """
-    looks = problem.corners.looks
-    few = judges(looks_by_tag(looks.tag, len(state.tags))).order
+    looks = problem.corners.observations
+    few = judges(observations_by_tag(looks.tag, len(state.tags))).order
     own = replace(
         problem, corners=CornerFactors(looks.where(few), problem.corners.cameras), columns=_with_held_poses(problem)
     )
@@ -51,7 +51,7 @@ def _with_held_poses(problem: CornerProblem) -> SpatialColumns:
     return replace(free, poses=np.full_like(columns.poses, -1))
 
 
-def _order(problem: CornerProblem) -> Fronts:
+def _order(problem: CornerProblem) -> EliminationFronts:
     """Each tag for itself, then the calibration."""
     columns = problem.columns
     n_tags = len(columns.heights)
@@ -64,12 +64,12 @@ def _order(problem: CornerProblem) -> Fronts:
 
 
 def _system(
-    problem: CornerProblem, order: Fronts, state: SpatialState, *, is_whole: bool = True
-) -> tuple[System, float]:
+    problem: CornerProblem, order: EliminationFronts, state: SpatialState, *, is_whole: bool = True
+) -> tuple[FrontalSystem, float]:
     """Of looks, which come tag by tag, and of the prior; with twice their cost."""
     system, corners, kind = order.empty(is_whole=is_whole), problem.corners, order.kinds[_LOOKS]
-    values, by_tag = spatial_values(state), np.arange(len(corners.looks))
-    cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
+    values, by_tag = spatial_values(state), np.arange(len(corners.observations))
+    cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
     normal, cost_of_prior = prior_normal(problem.prior, state)
     order.add(system, _LOOKS + 1, [normal])
     return system, cost + cost_of_prior

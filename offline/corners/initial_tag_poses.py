@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, SAME_RAD, candidate_poses, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import POSED_LOOKS, judges, looks_by_tag, select_views
+from groundsbot.offline.corners.kernels.view_selection import POSED_LOOKS, judges, observations_by_tag, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem
 
 
@@ -35,7 +35,9 @@ def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) ->
 
     The robots' poses are held: a solve from there tells what each is worth.
     """
-    own = CornerFactors(problem.corners.looks.where(problem.corners.looks.tag == tag), problem.corners.cameras)
+    own = CornerFactors(
+        problem.corners.observations.where(problem.corners.observations.tag == tag), problem.corners.cameras
+    )
     _, places, turns, losses = _fit_poses(own, replace(state, turns=np.full_like(state.turns, np.nan)))
     found: list[SpatialState] = []
     known = [state.turns[tag]]
@@ -57,12 +59,12 @@ def tags_rehung(problem: CornerProblem, state: SpatialState) -> SpatialState:
         state: its solution.
     """
     picture, n = problem.pictures
-    looks = problem.corners.looks
+    looks = problem.corners.observations
     for tag in np.unique(looks.tag).tolist():
         shown = np.zeros(n, dtype=np.bool_)
         shown[picture[looks.tag == tag]] = True
-        own = replace(problem, corners=replace(problem.corners, looks=looks.where(shown[picture])))
-        state = min([state, *alternative_states(own, state, tag)], key=own.looks_cost)
+        own = replace(problem, corners=replace(problem.corners, observations=looks.where(shown[picture])))
+        state = min([state, *alternative_states(own, state, tag)], key=own.corners_cost)
     return state
 
 
@@ -77,10 +79,10 @@ def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, F
 
     They begin where single looks put them, and where they hang in the state if they do.
     """
-    tag, values = factors.looks.tag, spatial_values(state)
-    by_tag = looks_by_tag(tag, len(state.tags))
+    tag, values = factors.observations.tag, spatial_values(state)
+    by_tag = observations_by_tag(tag, len(state.tags))
     chosen = np.empty((len(state.tags), POSED_LOOKS), dtype=np.int64)
-    select_views(factors.looks.corners_px, by_tag, chosen)
+    select_views(factors.observations.corners_px, by_tag, chosen)
     chosen = chosen[chosen >= 0]
     places, turns = np.empty((len(chosen), POSES, 3)), np.empty((len(chosen), POSES, 3, 3))
     candidate_poses(factors.arrays, values, chosen, _rays(factors, chosen), places, turns)
@@ -102,6 +104,6 @@ def _rays(factors: CornerFactors, which: IntArray) -> FloatArray:
     rays = np.empty((len(which), 4, 3))
     rays_of(factors.arrays, factors.lenses, which, rays)
     for i in np.flatnonzero(~np.isfinite(rays).all((-1, -2))).tolist():  # where the quick way failed
-        camera = factors.cameras[factors.looks.camera[which[i]]]
-        rays[i] = camera.unproject(factors.looks.corners_px[which[i]])
+        camera = factors.cameras[factors.observations.camera[which[i]]]
+        rays[i] = camera.unproject(factors.observations.corners_px[which[i]])
     return rays

@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.linearisation import N_LOOK, add_wobble
+from groundsbot.offline.corners.kernels.linearisation import N_LOOK, add_attitude_noise
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem
 
 _BY_THE_LOSS: Final = np.zeros(0)
@@ -36,11 +36,11 @@ class Pictures(NamedTuple):
 def pictures_at(problem: CornerProblem, state: SpatialState) -> Pictures:
     """Of all pictures at a state; how they stand by the problem's sigmas decides what a look counts."""
     picture, n = problem.pictures
-    corners, n_looks = problem.corners, len(problem.corners.looks)
+    corners, n_looks = problem.corners, len(problem.corners.observations)
     weight = _BY_THE_LOSS
-    if problem.wobble_sigma.any():
+    if problem.attitude_sigmas.any():
         linearised, wobble = corners.linearise(state, problem.columns)
         weight = problem.weigh(linearised.residual, wobble).weight
     found = Pictures(picture, np.empty(n_looks), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.empty((n_looks, 3, N_LOOK)))
-    add_wobble(corners.arrays, corners.lenses, CORNER_LOSS, spatial_values(state), weight, *found)
+    add_attitude_noise(corners.arrays, corners.lenses, CORNER_LOSS, spatial_values(state), weight, *found)
     return found

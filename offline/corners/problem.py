@@ -10,10 +10,10 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.elimination_order import corner_order
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.linearisation import N_LOOK, add_looks, add_motions
+from groundsbot.offline.corners.kernels.linearisation import N_LOOK, add_corners, add_motions
 from groundsbot.offline.corners.kernels.step import move
-from groundsbot.offline.corners.multifrontal.fronts import FrontFactor, Fronts, Normal
-from groundsbot.offline.corners.multifrontal.kernels import System
+from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, FrontFactor, Normal
+from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
@@ -21,9 +21,9 @@ from groundsbot.offline.sam import (
     CalibrationPrior,
     Linearised,
     Loss,
-    Measured,
-    Odometry,
+    OdometryArrays,
     OdometryFactors,
+    Priors,
     ReadingFactors,
     Values,
     compiled_motions,
@@ -38,7 +38,7 @@ _WEIGHT_ROUNDS: Final = 3
 LOOKS: Final = -2  # among `kinds`; the last are pairs
 
 
-class Weighed(NamedTuple):
+class WeightedCorners(NamedTuple):
     """Looks weighed by how well they fit, each picture standing as it fits best.
 
     Attributes:
@@ -69,39 +69,39 @@ class CornerProblem:
     corners: CornerFactors
     readings: ReadingFactors
     prior: CalibrationPrior
-    measured: Measured
+    measured: Priors
     columns: SpatialColumns
     anchor: IntArray
-    wobble_sigma: FloatArray
+    attitude_sigmas: FloatArray
     upright: UprightFactors = NOTHING_UPRIGHT
 
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
         measured = self.readings.value.size + self.measured.n_residuals
-        return self.odometry.motion.size + 8 * len(self.corners.looks) + measured
+        return self.odometry.motion.size + 8 * len(self.corners.observations) + measured
 
     @cached_property
-    def order(self) -> Fronts:
+    def order(self) -> EliminationFronts:
         """The order of elimination, settled once."""
-        looks, readings = self.corners.looks, self.readings
+        looks, readings = self.corners.observations, self.readings
         pose, tag = np.concatenate([looks.pose, readings.pose]), np.concatenate([looks.tag, readings.tag])
         return corner_order(self.columns, self.kinds(), self.odometry, self.measured, pose, tag)
 
     @cached_property
-    def look_order(self) -> IntArray:
+    def observation_order(self) -> IntArray:
         """(M,) of looks by front, and by tag."""
-        return np.lexsort((self.corners.looks.tag, self.order.kinds[LOOKS].node))
+        return np.lexsort((self.corners.observations.tag, self.order.kinds[LOOKS].node))
 
     @cached_property
-    def motions(self) -> Odometry:
+    def motions(self) -> OdometryArrays:
         """The odometry for compiled functions."""
         return compiled_motions(self.odometry, np.arange(len(self.odometry.first)))
 
     @cached_property
     def pictures(self) -> tuple[IntArray, int]:
         """(M,) picture of each look, and how many there are."""
-        poses, picture = np.unique(self.corners.looks.pose, return_inverse=True)
+        poses, picture = np.unique(self.corners.observations.pose, return_inverse=True)
         return picture, len(poses)
 
     @property
@@ -113,7 +113,7 @@ class CornerProblem:
     @cached_property
     def pairs(self) -> IntArray:
         """(N, 2) looks that share a picture, which couples them where pictures wobble."""
-        if not self.wobble_sigma.any():
+        if not self.attitude_sigmas.any():
             return np.zeros((0, 2), dtype=np.int64)
         picture, n = self.pictures
         order = np.argsort(picture, kind="stable")
@@ -168,13 +168,13 @@ class CornerProblem:
         """Normal equations of each kind, in the order of `kinds`, and the cost: half the sum of all losses."""
         odometry = _normal(self.odometry.linearise(state, self.columns), DEFAULT_LOSSES.odometry)
         plain = [odometry, *self._few(state)]
-        look, pair, cost = self._looks(state)
+        look, pair, cost = self._corners(state)
         return [*(normal for normal, _ in plain), look, pair], 0.5 * (sum(each for _, each in plain) + cost)
 
-    def system(self, state: SpatialState, *, is_whole: bool = True) -> tuple[System, float]:
+    def system(self, state: SpatialState, *, is_whole: bool = True) -> tuple[FrontalSystem, float]:
         """The same added up, compiled where all is level; and the cost. Without matrices it takes half of the time."""
         system = self.order.empty(is_whole=is_whole)
-        if self.wobble_sigma.any():
+        if self.attitude_sigmas.any():
             normals, cost = self.linearise(state)
             self.order.add(system, 0, normals)
             return system, cost
@@ -182,7 +182,7 @@ class CornerProblem:
         total = add_motions(self.motions, DEFAULT_LOSSES.odometry, values, odometry, system)
         few = self._few(state)
         self.order.add(system, 1, [normal for normal, _ in few])
-        total += sum(each for _, each in few) + self._level_looks(state, system)
+        total += sum(each for _, each in few) + self._level_observations(state, system)
         return system, 0.5 * total
 
     def factor(self, state: SpatialState) -> FrontFactor:
@@ -206,14 +206,14 @@ class CornerProblem:
             _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
         ]
 
-    def _level_looks(self, state: SpatialState, system: System) -> float:
+    def _level_observations(self, state: SpatialState, system: FrontalSystem) -> float:
         """Adds looks at level pictures; twice their cost."""
         corners, values = self.corners, spatial_values(state)
         kind = self.order.kinds[LOOKS]
-        cost = add_looks(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.look_order, system)
+        cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.observation_order, system)
         return cost if np.isfinite(cost) else np.inf
 
-    def weigh(self, residual: FloatArray, wobble: FloatArray) -> Weighed:
+    def weigh(self, residual: FloatArray, wobble: FloatArray) -> WeightedCorners:
         """Weighs looks whose pictures may stand off level.
 
         Args:
@@ -223,9 +223,9 @@ class CornerProblem:
         picture, n = self.pictures
         losses, weight = losses_and_weights(CORNER_LOSS, residual)
         standing: FloatArray = np.zeros((n, 3))
-        if not self.wobble_sigma.any():
-            return Weighed(weight, residual, standing, float(losses.sum()))
-        inverse = 1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2
+        if not self.attitude_sigmas.any():
+            return WeightedCorners(weight, residual, standing, float(losses.sum()))
+        inverse = 1.0 / np.maximum(self.attitude_sigmas, _LEVEL) ** 2
         level: FloatArray = residual
         for _ in range(_WEIGHT_ROUNDS):
             heavy = (weight[:, None, None] * wobble).swapaxes(-1, -2)
@@ -233,20 +233,20 @@ class CornerProblem:
             standing = np.asarray(-np.linalg.solve(information, self._by_picture(heavy @ level[..., None]))[..., 0])
             residual = np.asarray(level + (wobble @ standing[picture][..., None])[..., 0], dtype=np.float64)
             losses, weight = losses_and_weights(CORNER_LOSS, residual)
-        return Weighed(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
+        return WeightedCorners(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
 
-    def looks_cost(self, state: SpatialState) -> float:
+    def corners_cost(self, state: SpatialState) -> float:
         """Twice the cost of the looks alone; infinite where a lens has no image of a corner."""
         linearised, wobble = self.corners.linearise(state, self.columns)
         cost = self.weigh(linearised.residual, wobble).cost
         return cost if np.isfinite(cost) else np.inf
 
-    def log_spread(self, state: SpatialState) -> float:
+    def log_determinant(self, state: SpatialState) -> float:
         """Logarithm of the determinant of the whitened corners' covariance I + J S J^T; 0 where all is level."""
         linearised, wobble = self.corners.linearise(state, self.columns)
         weight = self.weigh(linearised.residual, wobble).weight
         own = self._by_picture(wobble.swapaxes(-1, -2) @ (weight[:, None, None] * wobble))
-        _, logarithms = np.linalg.slogdet(np.eye(3) + self.wobble_sigma**2 * own)
+        _, logarithms = np.linalg.slogdet(np.eye(3) + self.attitude_sigmas**2 * own)
         return float(np.sum(logarithms))
 
     def retract(self, state: SpatialState, step: FloatArray) -> SpatialState:
@@ -266,7 +266,7 @@ class CornerProblem:
         )  # fmt: skip
         return after
 
-    def _looks(self, state: SpatialState) -> tuple[Normal, Normal, float]:
+    def _corners(self, state: SpatialState) -> tuple[Normal, Normal, float]:
         """Of looks and of pairs that share a picture, how the pictures stand eliminated; and twice their cost."""
         linearised, wobble = self.corners.linearise(state, self.columns)
         weighed = self.weigh(linearised.residual, wobble)
@@ -276,13 +276,13 @@ class CornerProblem:
         transposed = jacobian.swapaxes(-1, -2)
         matrix = transposed @ (weighed.weight[:, None, None] * jacobian)
         gradient = (transposed @ (weighed.weight[:, None] * weighed.residual)[..., None])[..., 0]
-        if not self.wobble_sigma.any():
+        if not self.attitude_sigmas.any():
             none = Normal(np.zeros((0, 2 * N_LOOK, 2 * N_LOOK)), np.zeros((0, 2 * N_LOOK)))
             return Normal(matrix, gradient), none, weighed.cost
         picture, _ = self.pictures
         heavy = weighed.weight[:, None, None] * wobble
         own = self._by_picture(wobble.swapaxes(-1, -2) @ heavy)
-        own += np.diag(1.0 / np.maximum(self.wobble_sigma, _LEVEL) ** 2)
+        own += np.diag(1.0 / np.maximum(self.attitude_sigmas, _LEVEL) ** 2)
         coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 19)
         taken = np.linalg.solve(own[picture], coupled)
         matrix = matrix - coupled.swapaxes(-1, -2) @ taken

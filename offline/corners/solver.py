@@ -9,7 +9,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import SpatialState
 from groundsbot.offline.corners.multifrontal.fronts import FrontFactor, NotPositiveError
-from groundsbot.offline.corners.multifrontal.kernels import System
+from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.picture_tilt import Pictures, pictures_at
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.sam import Damping
@@ -82,16 +82,16 @@ class _Step(NamedTuple):
         return share * self.by_slope - share**2 * (self.by_slope - self.expected)
 
 
-class _Taken(NamedTuple):
+class _StepResult(NamedTuple):
     """What came of a step: where it led, and what it brought as a share of what it promised."""
 
     state: SpatialState
-    system: System
+    system: FrontalSystem
     cost: float
     gain: float
 
 
-class _ClosedIn(NamedTuple):
+class _LastSteps(NamedTuple):
     """Where the last steps end, and the cost after each but the last."""
 
     state: SpatialState
@@ -140,7 +140,7 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
     return ended(f"stopped after {_MOST_STEPS} steps")
 
 
-def _step(problem: CornerProblem, system: System, state: SpatialState, share: float) -> _Step:
+def _step(problem: CornerProblem, system: FrontalSystem, state: SpatialState, share: float) -> _Step:
     """Gauss-Newton's, the diagonal raised by a share; the factor takes the system's entries."""
     raised = share * problem.order.diagonal_of(system) if share else None
     factor = problem.order.factorise(system, raised)
@@ -152,17 +152,17 @@ def _step(problem: CornerProblem, system: System, state: SpatialState, share: fl
     return _Step(factor, step, expected, by_slope, problem.retract(state, step))
 
 
-def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _Taken | None:
+def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _StepResult | None:
     """The step, or less of it; None where none of that goes down."""
     for share in _SHARES:
         there = step.state if share == 1.0 else problem.retract(state, share * step.by)
         system, found = problem.system(there)
         if found < cost:
-            return _Taken(there, system, found, (cost - found) / step.predicted_decrease(share))
+            return _StepResult(there, system, found, (cost - found) / step.predicted_decrease(share))
     return None
 
 
-def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn | None:
+def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _LastSteps | None:
     """The last steps, by one factor, as H hardly changes any more; None where it takes more than a few."""
     state, costs, before = step.state, list[float](), step.expected
     while True:
@@ -174,4 +174,4 @@ def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _ClosedIn |
         costs.append(now)
         state, cost, before = problem.retract(state, by), now, expected
         if expected <= _COST_TOLERANCE:
-            return _ClosedIn(state, costs)
+            return _LastSteps(state, costs)

@@ -132,7 +132,7 @@ def _check_extent(component: Component, entries: Sequence[SurveyEntry]) -> None:
 
 
 @dataclass(frozen=True)
-class _Adjusted:
+class _SurveyFit:
     """What a least-squares fit of the survey onto the map leaves over.
 
     Attributes:
@@ -153,7 +153,7 @@ class _Adjusted:
         return shift, float(pulled @ shift)
 
 
-def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> _Adjusted:
+def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> _SurveyFit:
     """Generalised least squares for the transform alone."""
     information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     T_map_survey = fit_transform(map_m, survey_m)
@@ -169,7 +169,7 @@ def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> 
     jacobian = _by_transform(placed)
     weighted = information @ jacobian
     reliability: FloatArray = information - weighted @ _solve_least_norm(jacobian.T @ weighted, weighted.T)
-    return _Adjusted(T_map_survey, (map_m - placed).reshape(-1), reliability)
+    return _SurveyFit(T_map_survey, (map_m - placed).reshape(-1), reliability)
 
 
 def _solve_least_norm(normal: FloatArray, right: FloatArray) -> FloatArray:
@@ -220,7 +220,7 @@ def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEn
 
 def _with(
     map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, part: list[int]
-) -> tuple[list[int], _Adjusted]:
+) -> tuple[list[int], _SurveyFit]:
     """The fit of some entries."""
     rows = np.array([(2 * k, 2 * k + 1) for k in part]).reshape(-1)
     return part, _adjust(map_m[part], survey_m[part], covariance[np.ix_(rows, rows)])
@@ -256,7 +256,7 @@ def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray,
     return found
 
 
-def _scale(adjusted: _Adjusted, map_m: FloatArray) -> tuple[float, float]:
+def _scale(adjusted: _SurveyFit, map_m: FloatArray) -> tuple[float, float]:
     """How much longer the map is than the survey, as a share, and its sigma."""
     direction = (map_m - map_m.mean(axis=0)).reshape(-1)
     pulled = adjusted.reliability @ direction

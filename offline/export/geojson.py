@@ -19,7 +19,7 @@ _DIGITS: Final = 9  # 0.1 mm
 _MAX_LATITUDE_DEG: Final = 89.9  # at a pole east and north mean nothing
 
 
-class Place:
+class TangentPlane:
     """The map's floor as the plane that touches the ellipsoid in its origin."""
 
     def __init__(self, origin: str) -> None:
@@ -70,11 +70,11 @@ def geojson_of(component: Component, options: ExportOptions) -> dict[str, Any]:
             "--format geojson: a map does not know where on the earth it lies; give "
             "--origin LAT_DEG,LON_DEG,HEADING_DEG of its frame, the start of " + component.frame_run
         )
-    place = Place(options.origin)
+    place = TangentPlane(options.origin)
     return {"type": "FeatureCollection", "features": [*_tags(component, place), *_runs(component, place)]}
 
 
-def _tags(component: Component, place: Place) -> list[dict[str, Any]]:
+def _tags(component: Component, place: TangentPlane) -> list[dict[str, Any]]:
     features = []
     for tag in component.tags:
         spread = place.R_east_map @ tag.covariance @ place.R_east_map.T
@@ -93,7 +93,7 @@ def _tags(component: Component, place: Place) -> list[dict[str, Any]]:
     return features
 
 
-def _runs(component: Component, place: Place) -> list[dict[str, Any]]:
+def _runs(component: Component, place: TangentPlane) -> list[dict[str, Any]]:
     features = []
     for run in component.runs:
         line = [place.longitude_latitude(position_m) for position_m in run.T_map_base[:, :2]]

@@ -2,7 +2,7 @@ from .goodness_of_fit import joint_goodness_of_fit
 from .joint_solve import calibration_of, component_of
 from .overdispersion import misfit_of, noise_freedom
 from .pass_scatter import scatter_of_passes, scatter_warnings
-from .scale_checks import COMPARED, check_warnings, checks_of, metre_of
+from .scale_checks import COMPARED, check_warnings, checks_of, scale_budget
 from .solve_component import SolvedComponent, solve_group
 from .tag_joins.join import TagJoin, join_over_tags
 from .tag_joins.report import join_results, join_warnings
@@ -23,9 +23,9 @@ __all__ = [
     "join_warnings",
     "joint_goodness_of_fit",
     "measurement_warnings",
-    "metre_of",
     "misfit_of",
     "noise_freedom",
+    "scale_budget",
     "scatter_of_passes",
     "scatter_warnings",
     "solve_group",

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from groundsbot.offline.local_map import FALSE_ALARM, Goodness, LocalMap, fit_windows, freedom_of
+from groundsbot.offline.local_map import FALSE_ALARM, GoodnessOfFit, LocalMap, fit_windows, freedom_of
 from groundsbot.offline.sam import Solution
 
 
-def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodness:
+def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit:
     """What it costs that all windows of several runs are one map.
 
     Args:

@@ -15,9 +15,9 @@ from groundsbot.offline.global_map.edges import edges_of
 from groundsbot.offline.global_map.tape import with_measurements
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import (
+    ArchivedCalibration,
     CalibrationResult,
     Component,
-    KeptCalibration,
     MapModel,
     RunResult,
     StartToStart,
@@ -117,10 +117,10 @@ def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
     return {parameter: float(np.mean(found)) for parameter, found in values.items()}
 
 
-def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> KeptCalibration:
+def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> ArchivedCalibration:
     """Of the C numbers that the solve carried: their rows (C, 2 T + C) of the covariance of tags and calibration."""
     n = rows.shape[1] - len(parameters)
-    return KeptCalibration(
+    return ArchivedCalibration(
         owners=tuple(parameter.owner for parameter in parameters),
         names=tuple(parameter.name for parameter in parameters),
         nominal=np.array([nominal_row(parameter.nominal) for parameter in parameters]).reshape(

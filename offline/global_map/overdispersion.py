@@ -15,7 +15,7 @@ from scipy import stats
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.local_map import Goodness, LocalMap, freedom_of
+from groundsbot.offline.local_map import GoodnessOfFit, LocalMap, freedom_of
 from groundsbot.offline.maps import Misfit
 from groundsbot.offline.sam import Graph, Solution, build_graph, losses_and_weights, solve
 
@@ -24,7 +24,7 @@ _FALSE_ALARM: Final = 1e-2
 
 
 def misfit_of(
-    maps: Sequence[LocalMap], graph: Graph, solution: Solution, together: Goodness | None = None
+    maps: Sequence[LocalMap], graph: Graph, solution: Solution, together: GoodnessOfFit | None = None
 ) -> Misfit | None:
     """What contradicts the model most; None where chance explains all of it.
 
@@ -62,7 +62,7 @@ def _of_windows(
     graph: Graph,
     solution: Solution,
     alone: Sequence[Solution],
-    together: Goodness | None,
+    together: GoodnessOfFit | None,
 ) -> Misfit | None:
     """What joining windows of a drive, or of all drives, costs."""
     runs = [each.goodness for each in maps]
@@ -76,7 +76,7 @@ def _of_windows(
     return Misfit("windows", name, _cost(together), max(1, together.expected))
 
 
-def _cost(goodness: Goodness) -> float:
+def _cost(goodness: GoodnessOfFit) -> float:
     """In squared sigmas of the noise that windows show, or of that which the solve had where it was told more."""
     return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import TAG_SCALE
-from groundsbot.offline.maps import CheckResult, MetreResult
+from groundsbot.offline.maps import ConsistencyCheck, ScaleBudget
 from groundsbot.offline.sam import Graph, Solution
 
 # The corrections that each check compares.
@@ -23,9 +23,9 @@ _TELLS_NOTHING: Final = 10.0
 _HELD: Final = 1e-12  # the sigma of what is held: far below any that somebody gives
 
 
-def checks_of(graph: Graph, solution: Solution, component: int) -> list[CheckResult]:
+def checks_of(graph: Graph, solution: Solution, component: int) -> list[ConsistencyCheck]:
     """Each robot's wheels against each batch of tags that it read, where readings compare them."""
-    found: dict[tuple[str, str, str | None], CheckResult] = {}
+    found: dict[tuple[str, str, str | None], ConsistencyCheck] = {}
     for i, segment in enumerate(graph.segments):
         robot_id = segment.run.robot_id
         wheel_scale, _, track_scale = graph.wheel_parameters(i).tolist()
@@ -35,16 +35,16 @@ def checks_of(graph: Graph, solution: Solution, component: int) -> list[CheckRes
         for name, batch, indices in [*pairs, ("turn", None, [wheel_scale, track_scale])]:
             compared = _compare(solution, np.array(indices))
             if compared is not None and (name, robot_id, batch) not in found:
-                found[name, robot_id, batch] = CheckResult(name, component, robot_id, batch, *compared)
+                found[name, robot_id, batch] = ConsistencyCheck(name, component, robot_id, batch, *compared)
     return list(found.values())
 
 
-def check_warnings(checks: Sequence[CheckResult]) -> list[str]:
+def check_warnings(checks: Sequence[ConsistencyCheck]) -> list[str]:
     """Where wheels and tags contradict each other, by how much, and what that usually means."""
     return [_sentence(check) for check in checks if check.contradicts]
 
 
-def metre_of(graph: Graph, component: int) -> MetreResult:
+def scale_budget(graph: Graph, component: int) -> ScaleBudget:
     """How much of what holds the scale is due to what.
 
     Everything can be stretched together without a reading noticing. Along that way only priors and tapes resist.
@@ -66,7 +66,7 @@ def metre_of(graph: Graph, component: int) -> MetreResult:
     resists["starts"] = float((np.einsum("mij,mj->mi", measured.starts.whitening, stretched) ** 2).sum())
     total = sum(resists.values())
     shares = {kind: value / total for kind, value in resists.items()} if total else resists
-    return MetreResult(component, total**-0.5 if total else float("inf"), shares)
+    return ScaleBudget(component, total**-0.5 if total else float("inf"), shares)
 
 
 def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float] | None:
@@ -104,7 +104,7 @@ def _positive(matrix: FloatArray) -> FloatArray:
     return positive
 
 
-def _sentence(check: CheckResult) -> str:
+def _sentence(check: ConsistencyCheck) -> str:
     by = f"{100.0 * abs(check.value):.2f} % (sigma {100.0 * check.sigma:.2f} %)"
     allowed = f"{check.sigmas:.0f} sigma, where robot.yaml allows {100.0 * check.prior_sigma:.2f} %"
     if check.name == "turn":

@@ -15,13 +15,13 @@ from groundsbot.offline.maps import (
 )
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.outliers import (
-    Searched,
+    OutlierSearch,
+    false_detections,
     join_places,
-    phantoms,
+    outlier_report,
     read_as_another,
     split_together,
     stray_passes,
-    suspect_tags,
     without_tags,
 )
 from groundsbot.offline.sam import Graph, Solution
@@ -87,7 +87,7 @@ def solve_group(
     return solved._replace(refined=refined, told=(*told, *more))
 
 
-def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
+def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
     """Tags that do not belong apart; None where the drives do not fit even so.
 
     Where a drive whose noise was fitted does not fit, or all do not fit together, what tags seem to have done is not
@@ -101,12 +101,14 @@ def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap])
     return searched if len(maps) == 1 or joint_goodness_of_fit(maps, searched.solution).fits else None
 
 
-def _outlier_report(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
+def _outlier_report(
+    searched: OutlierSearch, *, noise_is_fitted: bool
+) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
     """The tags that do not belong, those that are left out, and a sentence of the latter that are not named.
 
     Noise that was fitted has heavier tails than normal errors have: there a pass that goes astray names no tag.
     """
-    suspects, stray = suspect_tags(searched), set[TagKey]()
+    suspects, stray = outlier_report(searched), set[TagKey]()
     told = []
     if noise_is_fitted and (stray := stray_passes(searched)):
         ids = {(tag.family, tag.tag_id) for tag in stray}
@@ -118,7 +120,7 @@ def _outlier_report(searched: Searched, *, noise_is_fitted: bool) -> tuple[list[
             f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'reading')}) of tags {_list_ids(ids)} "
             "went astray from where all others have them: left out"
         )
-    return suspects, stray | phantoms(searched.graph, suspects), told
+    return suspects, stray | false_detections(searched.graph, suspects), told
 
 
 def _list_ids(ids: Collection[tuple[str, int]]) -> str:

@@ -15,7 +15,7 @@ from groundsbot.offline.sam import (
     DistanceFactors,
     Graph,
     Linearised,
-    Measured,
+    Priors,
     Solution,
     StartFactors,
     State,
@@ -41,7 +41,7 @@ def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
     (pose_a, pose_b), (tag_a, tag_b) = (
         [np.array([index.get(end, -1) for end in side], dtype=np.int64) for side in ends] for index in (firsts, tags)
     )
-    measured = Measured(
+    measured = Priors(
         StartFactors(
             pose=np.array([firsts[start.run] for start in starts], dtype=np.int64),
             T_map_start=np.array([place.T_a_b for place in places]).reshape(-1, 3),

@@ -6,17 +6,17 @@ from .archive import (
     run_without_log,
     segment_from_arrays,
     tags_of,
-    tape_of,
+    tape_options_of,
 )
-from .goodness_of_fit import FALSE_ALARM, WINDOW_M, Goodness, fit_windows, freedom_of
-from .local_map import LocalMap, ShownNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
+from .goodness_of_fit import FALSE_ALARM, WINDOW_M, GoodnessOfFit, fit_windows, freedom_of
+from .local_map import LocalMap, WindowNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
 
 __all__ = [
     "FALSE_ALARM",
     "WINDOW_M",
-    "Goodness",
+    "GoodnessOfFit",
     "LocalMap",
-    "ShownNoise",
+    "WindowNoise",
     "archive_map",
     "check_extendable",
     "check_sizes_in_map",
@@ -29,6 +29,6 @@ __all__ = [
     "segment_from_arrays",
     "solve_local_map",
     "tags_of",
-    "tape_of",
+    "tape_options_of",
     "with_goodness_of_fit",
 ]

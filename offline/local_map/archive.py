@@ -16,9 +16,9 @@ from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.local_map.goodness_of_fit import Goodness
+from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit
 from groundsbot.offline.local_map.local_map import LocalMap
-from groundsbot.offline.maps import KeptSegment, MapResult
+from groundsbot.offline.maps import ArchivedSegment, MapResult
 from groundsbot.offline.measurements import (
     SAME_SIZE_M,
     CovarianceParts,
@@ -34,11 +34,11 @@ from groundsbot.offline.measurements import (
 from groundsbot.offline.sam import State, build_graph, solve
 
 
-def archive_map(local_map: LocalMap) -> KeptSegment:
+def archive_map(local_map: LocalMap) -> ArchivedSegment:
     """What a later run needs of a local map."""
     segment, state = local_map.segment, local_map.solution.state
     run, odometry, readings = segment.run, segment.odometry, segment.readings
-    return KeptSegment(
+    return ArchivedSegment(
         name=segment.name,
         run=run.name,
         log=str(run.log),
@@ -73,14 +73,14 @@ def archive_map(local_map: LocalMap) -> KeptSegment:
     )
 
 
-def local_map_of(kept: KeptSegment) -> LocalMap:
+def local_map_of(kept: ArchivedSegment) -> LocalMap:
     """The local map again, under the noise that it was kept with."""
     segment = _segment(kept)
     graph = build_graph([segment])
     solution = solve(graph.problem, State(kept.poses, kept.tags_m, kept.calibration))
     chi_square, expected, bound, odometry_factor, reading_factor = kept.goodness.tolist()
     return LocalMap(
-        segment, graph, solution, Goodness(chi_square, round(expected), bound, odometry_factor, reading_factor)
+        segment, graph, solution, GoodnessOfFit(chi_square, round(expected), bound, odometry_factor, reading_factor)
     )
 
 
@@ -161,7 +161,7 @@ def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
     )
 
 
-def _segment(kept: KeptSegment) -> Segment:
+def _segment(kept: ArchivedSegment) -> Segment:
     names = zip(kept.tag_families, kept.tag_ids.tolist(), kept.tag_instances, strict=True)
     tags = tuple(TagKey(*name) for name in names)
     camera = json.loads(kept.camera_json) if kept.camera_json else None
@@ -205,7 +205,7 @@ def check_extendable(known: MapResult) -> None:
         )
 
 
-def tags_of(kept: KeptSegment) -> list[TagKey]:
+def tags_of(kept: ArchivedSegment) -> list[TagKey]:
     """The ids of the tags that a segment read, whichever instance."""
     return [TagKey(family, tag_id) for family, tag_id in zip(kept.tag_families, kept.tag_ids.tolist(), strict=True)]
 
@@ -228,7 +228,7 @@ def check_sizes_in_map(run: Run, known: MapResult) -> None:
             )
 
 
-def tape_of(known: MapResult, tape: TapeOptions) -> TapeOptions:
+def tape_options_of(known: MapResult, tape: TapeOptions) -> TapeOptions:
     """What somebody measured for a map that is kept, and for its extension."""
     starts, distances = [], []
     for each in known.measurements:

@@ -22,13 +22,13 @@ from groundsbot.offline.local_map.correlated_errors import fit_shared_errors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     MAX_TRIES,
-    NOTHING_MEASURED,
+    NO_PRIORS,
     Columns,
-    Effort,
     Losses,
     OdometryFactors,
     Problem,
     Solution,
+    SolveBudget,
     State,
     losses_and_weights,
     solve,
@@ -60,7 +60,7 @@ _SEED: Final = 7
 
 
 @dataclass(frozen=True)
-class Goodness:
+class GoodnessOfFit:
     """What it costs that all windows are one map.
 
     Attributes:
@@ -120,19 +120,19 @@ class Windows:
     freedom: float
     cost: float
     n_conditions: int
-    effort: Effort | None = None
+    effort: SolveBudget | None = None
     share: float = 1.0
 
-    def judge(self, state: State) -> Goodness:
+    def judge(self, state: State) -> GoodnessOfFit:
         """What it costs to join them in the valley of a state."""
         problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.sharing)
-        most_tries = self.effort.tries(problem, self.share) if self.effort else MAX_TRIES
+        most_tries = self.effort.max_linearisations(problem, self.share) if self.effort else MAX_TRIES
         together = solve(problem, state, losses=self.losses, most_tries=most_tries)
         if self.effort:
             self.effort.spend(together)
         n = self.n_conditions
         quantile = stats.f.isf(FALSE_ALARM, n, self.freedom) if n else 1.0
-        return Goodness(
+        return GoodnessOfFit(
             chi_square=max(0.0, 2.0 * (together.cost - self.cost)),
             expected=n,
             bound=float(n * quantile),
@@ -144,7 +144,7 @@ class Windows:
 def fit_windows(
     problem: Problem,
     losses: Losses = DEFAULT_LOSSES,
-    effort: Effort | None = None,
+    effort: SolveBudget | None = None,
     share: float = 1.0,
     least_shared: FloatArray | float = 0.0,
     *,
@@ -165,10 +165,10 @@ def fit_windows(
         least_factor: the noise is taken to be so many times as large as told at least. Where errors last, windows show
             too little of them: what was fitted to whole drives is then the least.
     """
-    problem = replace(problem, measured=NOTHING_MEASURED) if len(problem.measured) else problem
+    problem = replace(problem, measured=NO_PRIORS) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
     state = _dead_reckon(problem, apart)
-    left = effort.tries(apart, share, _MAX_FITS * MAX_TRIES) if effort else _MAX_FITS * MAX_TRIES
+    left = effort.max_linearisations(apart, share, _MAX_FITS * MAX_TRIES) if effort else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
     last = np.ones(2)
     for _ in range(_MAX_FITS):
@@ -245,7 +245,7 @@ def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: i
     return solution
 
 
-def _affordable_windows(problem: Problem, effort: Effort | None) -> Problem:
+def _affordable_windows(problem: Problem, effort: SolveBudget | None) -> Problem:
     """In windows, which are longer where there is not enough effort for so many tags of their own."""
     window_m = WINDOW_M
     apart = in_windows(problem)

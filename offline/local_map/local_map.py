@@ -16,7 +16,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, Windows, fit_windows
+from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
@@ -29,7 +29,16 @@ from groundsbot.offline.measurements import (
     telling_keyframes,
     without_unconfirmed_tracks,
 )
-from groundsbot.offline.sam import Effort, Graph, Parameter, Solution, State, build_graph, parameters_of_wheels, solve
+from groundsbot.offline.sam import (
+    Graph,
+    Parameter,
+    Solution,
+    SolveBudget,
+    State,
+    build_graph,
+    parameters_of_wheels,
+    solve,
+)
 
 # A segment is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
 # farther than its heading is known to this sigma, under the noise and the wheels' calibration as the pieces before tell
@@ -68,7 +77,7 @@ class LocalMap:
     segment: Segment
     graph: Graph
     solution: Solution
-    goodness: Goodness
+    goodness: GoodnessOfFit
     is_noisy: bool = False  # its windows show far more noise than was told: that comes first, what does not fit after
     whole: Segment | None = None  # with readings that nothing confirms, where these were left out of a noisy one
     n_misread: int = 0  # readings that were left out of it since they are of another tag, or of none
@@ -94,7 +103,7 @@ class LocalMap:
         return replace(self, solution=replace(self.solution))
 
 
-class _BuiltUp(NamedTuple):
+class _PartialMap(NamedTuple):
     """What is known of a segment as far as it has been built up."""
 
     poses: FloatArray
@@ -103,7 +112,7 @@ class _BuiltUp(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(segment: Segment, effort: Effort | None = None, *, noise_is_open: bool = False) -> LocalMap:
+def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
     """Solves the whole segment from where building up leads.
 
     Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
@@ -118,7 +127,7 @@ def solve_local_map(segment: Segment, effort: Effort | None = None, *, noise_is_
     Raises:
         OfflineError: there are more readings than a log of this size can be worth.
     """
-    effort = effort or Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     effort.check(build_graph([segment]).problem, segment.run.log, segment.name)
     shown, check = _noise_of_windows(segment, effort, noise_is_open=noise_is_open)
     segment, whole = shown.apply_to(segment)
@@ -133,7 +142,7 @@ def solve_local_map(segment: Segment, effort: Effort | None = None, *, noise_is_
     for n_others in range(1 + _OTHER_STARTS):
         poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+        solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
@@ -151,7 +160,7 @@ def solve_local_map(segment: Segment, effort: Effort | None = None, *, noise_is_
     return _with_edges_at_solved_ranges(best, effort) if far_larger else best
 
 
-def _with_edges_at_solved_ranges(local_map: LocalMap, effort: Effort) -> LocalMap:
+def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
     """The map of noisy ranges solved again, with what depends on ranges taken at those of the map."""
 
     def changed(segment: Segment) -> Segment:
@@ -164,13 +173,13 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: Effort) -> LocalMa
         return local_map
     graph = build_graph([segment])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-    solution = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
     graph.problem.arrowhead.without_scratch()
     whole = local_map.whole
     return replace(local_map, segment=segment, graph=graph, solution=solution, whole=whole and changed(whole))
 
 
-class ShownNoise(NamedTuple):
+class WindowNoise(NamedTuple):
     """What the windows of a segment show of its noise.
 
     Attributes:
@@ -191,15 +200,15 @@ class ShownNoise(NamedTuple):
         return without_unconfirmed_tracks(whole), whole
 
 
-def noise_of_windows(segment: Segment) -> ShownNoise:
+def noise_of_windows(segment: Segment) -> WindowNoise:
     """What the windows show, where the noise that the segment is under is a first guess."""
-    effort = Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     return _noise_of_windows(segment, effort, noise_is_open=True)[0]
 
 
-def first_solution(segment: Segment, shown: ShownNoise) -> tuple[Graph, Solution]:
+def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solution]:
     """The segment solved once from where building up leads, whether it fits together or not."""
-    effort = Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far off the priors costs less than the right one
         wheels, readings = (
@@ -210,20 +219,20 @@ def first_solution(segment: Segment, shown: ShownNoise) -> tuple[Graph, Solution
     known = _build_up(coarsen(segment, keyframes), effort)
     poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
     start = graph.start(poses, known.tags, known.calibration)
-    return graph, solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    return graph, solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 
-def with_goodness_of_fit(local_map: LocalMap, effort: Effort | None = None) -> LocalMap:
+def with_goodness_of_fit(local_map: LocalMap, effort: SolveBudget | None = None) -> LocalMap:
     """The map with its test of goodness of fit made again, under the noise that was fitted to whole drives."""
     segment = local_map.segment
-    effort = effort or Effort.of_log(segment.run.log_bytes, segment.run.inputs)
+    effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, effort, least_factor=1.0)
     found = replace(local_map, goodness=check.judge(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
 
 
-def _noise_of_windows(segment: Segment, effort: Effort, *, noise_is_open: bool) -> tuple[ShownNoise, "_Check"]:
+def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
     """What the windows show, and the check of solutions of the segment that `ShownNoise.applied_to` returns."""
     is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
@@ -232,7 +241,7 @@ def _noise_of_windows(segment: Segment, effort: Effort, *, noise_is_open: bool) 
     factors = check.noise_factors if is_left_open else check.usual_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
     is_beyond_pixels = factors[1] * segment.readings.corner_sigma_px > _MOST_CORNER_PX
-    shown = ShownNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
+    shown = WindowNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
     applied, whole = shown.apply_to(segment)
     if likely is not segment if whole is None else whole.readings is not segment.readings:
         check = _Check(build_graph([applied]), effort)
@@ -243,7 +252,7 @@ def _noise_of_windows(segment: Segment, effort: Effort, *, noise_is_open: bool) 
 class _Check:
     """Tests the goodness of fit of solutions of a segment, without most of the poses from which no tag was observed."""
 
-    def __init__(self, graph: Graph, effort: Effort, least_factor: float = 0.0) -> None:
+    def __init__(self, graph: Graph, effort: SolveBudget, least_factor: float = 0.0) -> None:
         (segment,) = graph.segments
         whole = graph
         self._keyframes = telling_keyframes(segment)
@@ -277,7 +286,7 @@ class _Check:
         wheels, readings = self._windows.usual_factors.tolist()
         return wheels, readings
 
-    def judge(self, solution: Solution) -> Goodness:
+    def judge(self, solution: Solution) -> GoodnessOfFit:
         state = solution.state
         return self._windows.judge(
             State(state.poses[self._keyframes], state.tags[self._tags], state.calibration[self._calibration])
@@ -290,7 +299,7 @@ def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
     return replace(
         segment,
         odometry=replace(segment.odometry, covariance=of_wheels**2 * segment.odometry.covariance),
-        readings=segment.readings.spread(np.full((len(segment.readings), 2), of_readings)),
+        readings=segment.readings.inflate(np.full((len(segment.readings), 2), of_readings)),
     )
 
 
@@ -301,30 +310,30 @@ def _redrawn(segment: Segment, rng: np.random.Generator) -> Segment:
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _build_up(segment: Segment, effort: Effort) -> _BuiltUp:
+def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
     """Solves the segment piece by piece, each from the solution of the last; dead reckoning where effort ends."""
-    known = _BuiltUp(np.zeros((1, 3)), np.zeros(3), {}, {})
+    known = _PartialMap(np.zeros((1, 3)), np.zeros(3), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
-    pieces, n_keyframes = _Pieces(segment), 1
+    pieces, n_keyframes = _BuildUpSteps(segment), 1
     while True:
         n_keyframes = pieces.next_end(n_keyframes)
         part = segment.prefix(n_keyframes)
         graph = build_graph([part])
         poses = _extend(part, known.poses, known.wheel_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        most_tries = effort.tries(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        most_tries = effort.max_linearisations(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
         solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
         effort.spend(solution)
         state = solution.state
         wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
-        known = _BuiltUp(state.poses, wheels, tags, graph.calibration_of(state))
+        known = _PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
         if n_keyframes == len(segment.stamps_ns) or effort.left < enough:
             break
         pieces.wheel_covariance = solution.covariance(graph.problem.columns.calibration[graph.wheel_parameters(0)])
     return known._replace(poses=_extend(segment, known.poses, known.wheel_calibration))
 
 
-class _Pieces:
+class _BuildUpSteps:
     """Numbers of keyframes at which building up stops and solves; the last is all of them.
 
     Attributes:

@@ -16,10 +16,10 @@ from groundsbot.offline.alignment import MARGIN_NATS, reason_not_joined
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.local_map import LocalMap, check_sizes_in_map
-from groundsbot.offline.localization.map_prior import KnownMap, prior_from_map
+from groundsbot.offline.localization.map_prior import MapPrior, prior_from_map
 from groundsbot.offline.localization.placement import Located, locate
 from groundsbot.offline.localization.result import Candidate, Localization, LocatedRun, MovedTag, NotLocated
-from groundsbot.offline.localization.solve_in_map import HeldRun, solve_in_map
+from groundsbot.offline.localization.solve_in_map import RunInMap, solve_in_map
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import Run, segments_of
 from groundsbot.offline.noise import with_noise_of_map
@@ -122,7 +122,7 @@ class _SegmentPlaces:
         return self.located[0]
 
     @property
-    def rivals(self) -> tuple[Located, ...]:
+    def alternatives(self) -> tuple[Located, ...]:
         """Places in other components that explain its tags too."""
         best = _evidence(self.best)
         return tuple(e for e in self.located[1:] if e.is_sure or _evidence(e) > max(best, 0.0) - MARGIN_NATS)
@@ -130,7 +130,7 @@ class _SegmentPlaces:
     @property
     def is_sure(self) -> bool:
         """In one place."""
-        return bool(self.located) and self.best.is_sure and not self.rivals
+        return bool(self.located) and self.best.is_sure and not self.alternatives
 
     def is_in(self, component: int) -> bool:
         """Surely there."""
@@ -142,8 +142,8 @@ class _SegmentPlaces:
         if not self.located:
             return NotLocated(name, f"{name} shares no tag with the map; drive it past two tags of the map")
         best = self.best
-        if self.rivals:
-            ways = [each for each in (best, *self.rivals) if each.alignment is not None]
+        if self.alternatives:
+            ways = [each for each in (best, *self.alternatives) if each.alignment is not None]
             several = " and ".join(f"tags {_list_runs(each)} in component {each.component}" for each in ways)
             reason = (
                 f"where {name} drove is ambiguous, because it fits {several}: if both are one place, extend the map by "
@@ -158,7 +158,7 @@ class _SegmentPlaces:
         return NotLocated(name, reason, tuple(_candidates(best)) if is_ambiguous else ())
 
 
-def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, KnownMap]:
+def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, MapPrior]:
     """The components to look in."""
     n = len(known.components)
     if component is not None and not 0 <= component < n:
@@ -170,7 +170,7 @@ def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, K
     return parts
 
 
-def _locate(local_map: LocalMap, parts: dict[int, KnownMap]) -> tuple[Located, ...]:
+def _locate(local_map: LocalMap, parts: dict[int, MapPrior]) -> tuple[Located, ...]:
     """In each component that shares a tag, best first."""
     found = [place for i, part in parts.items() if (place := locate(local_map, part, i)) is not None]
     return tuple(sorted(found, key=lambda each: (-_evidence(each), -len(each.pairs), each.component)))
@@ -180,7 +180,7 @@ def _evidence(located: Located) -> float:
     return float("-inf") if located.alignment is None else located.alignment.evidence_nats
 
 
-def _check_shared(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, KnownMap]) -> None:
+def _check_shared(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, MapPrior]) -> None:
     if any(each.located for each in found):
         return
     run = found[0].local_map.segment.run
@@ -201,7 +201,7 @@ def _home(found: Sequence[_SegmentPlaces]) -> int:
     return best.best.component
 
 
-def _solve_in(here: Sequence[Located], known: KnownMap) -> HeldRun:
+def _solve_in(here: Sequence[Located], known: MapPrior) -> RunInMap:
     names, maybe = [each.names() for each in here], [each.others() for each in here]
     starts = np.array([_transform(each) for each in here])
     return solve_in_map([each.local_map for each in here], starts, names, maybe, known)
@@ -213,7 +213,7 @@ def _transform(located: Located) -> FloatArray:
     return located.alignment.T_a_b
 
 
-def _runs(held: HeldRun) -> tuple[LocatedRun, ...]:
+def _runs(held: RunInMap) -> tuple[LocatedRun, ...]:
     state = held.solution.state
     covariance = _in_map_axes(held.solution.pose_covariances(np.arange(len(state.poses))), state.poses)
     runs = []
@@ -245,7 +245,7 @@ def _in_map_axes(covariance: FloatArray, poses: FloatArray) -> FloatArray:
     return turned
 
 
-def _moved_tags(here: Sequence[Located], held: HeldRun) -> tuple[MovedTag, ...]:
+def _moved_tags(here: Sequence[Located], held: RunInMap) -> tuple[MovedTag, ...]:
     found = [
         MovedTag(
             tag=each.known,

@@ -15,16 +15,16 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.alignment import CondensedMap
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.maps import Component, KeptCalibration, nominal_row
+from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
-from groundsbot.offline.sam import NOTHING_MEASURED, CalibrationPrior, Graph, KnownPlaces, Parameter, whitening
+from groundsbot.offline.sam import NO_PRIORS, CalibrationPrior, Graph, JointPrior, Parameter, whitening
 
 # Far below what a tag's place is ever known to, and far above rounding.
 _LEAST_SIGMA_M: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class KnownMap:
+class MapPrior:
     """The tags of one component whose places mean something, and its calibration.
 
     Attributes:
@@ -38,7 +38,7 @@ class KnownMap:
     frame_run: str
     tags: tuple[TagKey, ...]
     places_m: FloatArray
-    calibration: KeptCalibration
+    calibration: ArchivedCalibration
     covariance: FloatArray
 
     @property
@@ -82,14 +82,14 @@ class KnownMap:
         known = self._prior(graph, names)
         sigma = graph.problem.prior.sigma.copy()
         sigma[known.calibration] = np.inf  # what robot.yaml says of these is in the map already
-        measured = replace(NOTHING_MEASURED, known=known)
+        measured = replace(NO_PRIORS, known=known)
         return replace(graph, problem=replace(graph.problem, prior=CalibrationPrior(sigma), measured=measured))
 
-    def _prior(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> KnownPlaces:
+    def _prior(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> JointPrior:
         tags = [tag for tag in graph.tags if tag in names]
         numbers = self.numbers_among(graph.parameters)
         rows = self.rows([names[tag] for tag in tags], list(numbers.values()))
-        return KnownPlaces(
+        return JointPrior(
             tags=np.array([graph.tags.index(tag) for tag in tags], dtype=np.int64),
             calibration=np.array(list(numbers), dtype=np.int64),
             mean=self.mean[rows],
@@ -107,7 +107,7 @@ class KnownMap:
         return {i: known[key] for i, key in wanted.items() if key in known}
 
 
-def prior_from_map(component: Component, where: str) -> KnownMap:
+def prior_from_map(component: Component, where: str) -> MapPrior:
     """What a component of a map tells of the places of its tags.
 
     Args:
@@ -117,7 +117,7 @@ def prior_from_map(component: Component, where: str) -> KnownMap:
     Raises:
         OfflineError: the map holds numbers that are none.
     """
-    calibration = component.calibration or KeptCalibration(
+    calibration = component.calibration or ArchivedCalibration(
         (), (), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 2 * len(component.tags)))
     )
     places = np.array([tag.position_m for tag in component.tags]).reshape(-1, 2)
@@ -133,7 +133,7 @@ def prior_from_map(component: Component, where: str) -> KnownMap:
     covariance = joint[np.ix_(kept, kept)]
     of_tags = np.arange(2 * int(is_told.sum()))
     covariance[of_tags, of_tags] += _LEAST_SIGMA_M**2
-    return KnownMap(
+    return MapPrior(
         component.frame_run,
         tuple(tag for tag, told in zip(tags, is_told.tolist(), strict=True) if told),
         places[is_told],

@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.offline.alignment import Alignment, CondensedMap, align, condense, variance_factor
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.localization.map_prior import KnownMap
+from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import TagKey
 
 
@@ -58,7 +58,7 @@ class Located:
         }
 
 
-def locate(local_map: LocalMap, known: KnownMap, component: int) -> Located | None:
+def locate(local_map: LocalMap, known: MapPrior, component: int) -> Located | None:
     """Looks for the run's place; None where it saw none of the map's tags."""
     seen = [tag for tag in local_map.graph.tags if tag.whole in known.instances]
     if not seen:

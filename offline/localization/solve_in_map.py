@@ -18,7 +18,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import squared_sigmas
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.localization.map_prior import KnownMap
+from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.outliers import FALSE_ALARM, rename_tags
 from groundsbot.offline.sam import Graph, Solution, State, build_graph, solve, unheld
@@ -28,7 +28,7 @@ _MOVED: Final = "moved, "
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class TagOffset:
     """A tag of the run against the map's: how far it lies from where the map and all else foretell it."""
 
     known: TagKey
@@ -38,7 +38,7 @@ class Elsewhere:
 
 
 @dataclass(frozen=True)
-class HeldRun:
+class RunInMap:
     """Where the solve ended.
 
     Attributes:
@@ -52,7 +52,7 @@ class HeldRun:
     graph: Graph
     solution: Solution
     held: tuple[tuple[TagKey, ...], ...]
-    elsewhere: tuple[tuple[Elsewhere, ...], ...]
+    elsewhere: tuple[tuple[TagOffset, ...], ...]
     called: tuple[dict[TagKey, TagKey], ...]
 
 
@@ -61,8 +61,8 @@ def solve_in_map(
     T_map_start: FloatArray,
     names: Sequence[dict[TagKey, TagKey]],
     maybe: Sequence[dict[TagKey, TagKey]],
-    known: KnownMap,
-) -> HeldRun:
+    known: MapPrior,
+) -> RunInMap:
     """Solves segments in a map, and frees the tags of it that were moved.
 
     Args:
@@ -72,16 +72,16 @@ def solve_in_map(
         maybe: for each, that of its tags that did not fit; named as moved unless they fit after all.
         known: the map.
     """
-    split = _Split(known, members, [dict(each) for each in names], [dict(each) for each in maybe])
+    split = _TagAssignment(known, members, [dict(each) for each in names], [dict(each) for each in maybe])
     graph, solution = _solve(members, T_map_start, split, known)
-    judge = _Judge(graph, solution, known)
+    judge = _TagTest(graph, solution, known)
     for _ in range(_MOST_CHANGES):
         if not split.update(judge):
             break
         graph, solution = _solve(members, solution.state.poses[graph.first_pose], split, known)
-        judge = _Judge(graph, solution, known)
+        judge = _TagTest(graph, solution, known)
     off = split.elsewhere(judge)
-    return HeldRun(
+    return RunInMap(
         graph,
         solution,
         tuple(tuple(each.values()) for each in split.held),
@@ -93,12 +93,12 @@ def solve_in_map(
     )
 
 
-class _Split:
+class _TagAssignment:
     """Which of the map's tags hold which segment, and which are loose."""
 
     def __init__(
         self,
-        known: KnownMap,
+        known: MapPrior,
         members: Sequence[LocalMap],
         held: list[dict[TagKey, TagKey]],
         loose: list[dict[TagKey, TagKey]],
@@ -113,7 +113,7 @@ class _Split:
         own = {tag: _own_name(self.members[member], tag) for tag in self.loose[member]}
         return self.held[member] | own
 
-    def update(self, judge: "_Judge") -> bool:
+    def update(self, judge: "_TagTest") -> bool:
         """Frees the tag that all else contradicts most, or holds the one that fits after all; False for none."""
         off = {key: judge.tag_offset(tag) for key, tag in _entries(self.held)}
         worst = max(off, key=lambda key: off[key].squares, default=None)
@@ -132,7 +132,7 @@ class _Split:
         self._settled.add(best)
         return True
 
-    def elsewhere(self, judge: "_Judge") -> "dict[tuple[int, TagKey], Elsewhere]":
+    def elsewhere(self, judge: "_TagTest") -> "dict[tuple[int, TagKey], TagOffset]":
         """The loose ones against where the map foretells them."""
         return {(i, own): judge.free(tag, _own_name(self.members[i], own)) for (i, own), tag in _entries(self.loose)}
 
@@ -140,8 +140,8 @@ class _Split:
 def _solve(
     members: Sequence[LocalMap],
     T_map_start: FloatArray,
-    split: "_Split",
-    known: KnownMap,
+    split: "_TagAssignment",
+    known: MapPrior,
 ) -> tuple[Graph, Solution]:
     called = [rename_tags(each, split.name_of(i)) for i, each in enumerate(members)]
     graph = unheld(build_graph([each.segment for each in called]))
@@ -167,10 +167,10 @@ def _entries(groups: Sequence[dict[TagKey, TagKey]]) -> list[tuple[tuple[int, Ta
     return [((i, own), tag) for i, group in enumerate(groups) for own, tag in group.items()]
 
 
-class _Judge:
+class _TagTest:
     """What a solution says of tags of the map."""
 
-    def __init__(self, graph: Graph, solution: Solution, known: KnownMap) -> None:
+    def __init__(self, graph: Graph, solution: Solution, known: MapPrior) -> None:
         self._known = known
         self._state: State = solution.state
         self._index = {tag: i for i, tag in enumerate(graph.tags)}
@@ -187,7 +187,7 @@ class _Judge:
         self._pull = information @ self._off
         self._checked = information - information @ self._joint[:n, :n] @ information
 
-    def tag_offset(self, tag: TagKey) -> Elsewhere:
+    def tag_offset(self, tag: TagKey) -> TagOffset:
         """A tag that is held."""
         at = 2 * self._held.index(tag)
         rows = slice(at, at + 2)
@@ -196,7 +196,7 @@ class _Judge:
         covariance = np.asarray(np.linalg.pinv(ways, rcond=1e-9, hermitian=True), dtype=np.float64)
         return self._tag_offset(tag, tag, covariance @ shares, covariance)
 
-    def free(self, tag: TagKey, own: TagKey) -> Elsewhere:
+    def free(self, tag: TagKey, own: TagKey) -> TagOffset:
         """A tag of the map that the run has under a name of its own."""
         known, n = self._known, len(self._off)
         rows, others = known.rows([tag]), known.rows(self._held, list(self._numbers.values()))
@@ -208,7 +208,7 @@ class _Judge:
         covariance += known.covariance[np.ix_(rows, rows)] - by @ known.covariance[np.ix_(others, rows)]
         return self._tag_offset(tag, own, self._state.tags[self._index[own]] - foretold, covariance)
 
-    def _tag_offset(self, tag: TagKey, own: TagKey, off_m: FloatArray, covariance: FloatArray) -> Elsewhere:
+    def _tag_offset(self, tag: TagKey, own: TagKey, off_m: FloatArray, covariance: FloatArray) -> TagOffset:
         spread = covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
         squares = float(squared_sigmas(off_m[None], spread[None])[0])
-        return Elsewhere(tag, self._state.tags[self._index[own]], off_m, squares)
+        return TagOffset(tag, self._state.tags[self._index[own]], off_m, squares)

@@ -146,7 +146,7 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
     Raises:
         GroundsbotError: the log is missing, damaged, no log of ours, or its robot.yaml cannot be used.
     """
-    collected, losses = _Collected(), LogLosses()
+    collected, losses = _LogStatistics(), LogLosses()
     for entry in read_log(log, losses=losses, allowance=allowance):
         collected.add(entry)
     run = collected.run
@@ -182,7 +182,7 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
 
 
 @dataclass
-class _Collected:
+class _LogStatistics:
     """What one pass over a log gathers."""
 
     run: RunInfo | None = None
@@ -228,7 +228,7 @@ class _Collected:
             self.distances_m.append((message.wheels.left_m + message.wheels.right_m) / 2)
 
 
-def _distance_m(collected: _Collected, wheels: Wheels) -> float | None:
+def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:
     """Length of the path of the point midway between the wheels; unknown motion at a restart counts as none."""
     if collected.ticks:
         left_m, right_m = wheels.metres_per_tick

@@ -1,10 +1,10 @@
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
-from .workings import Solved, Workings
+from .workings import Diagnostics, SolvedGroup
 
 __all__ = [
-    "Solved",
-    "Workings",
+    "Diagnostics",
+    "SolvedGroup",
     "build_map",
     "check_robots",
     "read_runs",

@@ -12,22 +12,22 @@ from groundsbot.offline.global_map import (
     compare_measurements,
     component_of,
     joint_goodness_of_fit,
-    metre_of,
     misfit_of,
     noise_freedom,
+    scale_budget,
     scatter_of_passes,
     scatter_warnings,
     weak_parts,
 )
-from groundsbot.offline.local_map import Goodness, LocalMap
-from groundsbot.offline.mapping.workings import Solved
+from groundsbot.offline.local_map import GoodnessOfFit, LocalMap
+from groundsbot.offline.mapping.workings import SolvedGroup
 from groundsbot.offline.maps import (
     AdviceResult,
     CalibrationResult,
-    CheckResult,
     Component,
+    ConsistencyCheck,
     MeasurementResult,
-    MetreResult,
+    ScaleBudget,
     SuspectTag,
     inflate_covariances,
 )
@@ -36,22 +36,22 @@ from groundsbot.offline.sam import Solution
 
 
 @dataclass
-class Found:
+class Findings:
     """What the components gave, one after the other."""
 
     components: list[Component] = field(default_factory=list)
     suspects: list[SuspectTag] = field(default_factory=list)
     calibration: list[CalibrationResult] = field(default_factory=list)
     measured: list[MeasurementResult] = field(default_factory=list)
-    checks: list[CheckResult] = field(default_factory=list)
-    metres: list[MetreResult] = field(default_factory=list)
+    checks: list[ConsistencyCheck] = field(default_factory=list)
+    metres: list[ScaleBudget] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: set[tuple[str, int]] = field(default_factory=set)
     advice: list[AdviceResult] = field(default_factory=list)
 
     def take(
         self, maps: Sequence[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
-    ) -> Solved:
+    ) -> SolvedGroup:
         """Takes what one more component says."""
         index = len(self.components)
         members, graph, solution, suspects, refined, told, left_out = solved
@@ -71,7 +71,7 @@ class Found:
             self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
             self.measured += compare_measurements(graph, last, measurements, index)
             self.checks += [replace(each, sigma=factor**0.5 * each.sigma) for each in checks_of(graph, solution, index)]
-            self.metres.append(metre_of(graph, index))
+            self.metres.append(scale_budget(graph, index))
         is_refined, poses = refined is not None, last.state.poses
         del solved, refined, last  # the factor on corners, which nothing below asks
         if not is_refined:  # else the map's sigmas are not those that advice is foretold from
@@ -83,17 +83,17 @@ class Found:
             )
         self.warnings += weak_parts(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
-        return Solved(members, graph, solution, poses)
+        return SolvedGroup(members, graph, solution, poses)
 
 
-def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodness | None:
+def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
     """Whether several drives fit together that do so each by itself; None where there are none."""
     if len(maps) == 1 or not all(each.goodness.fits for each in maps):
         return None
     return joint_goodness_of_fit(maps, solution)
 
 
-def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness | None) -> list[str]:
+def _contradictions(maps: Sequence[LocalMap], component: int, together: GoodnessOfFit | None) -> list[str]:
     """Drives that do not fit together in themselves, and a component that does not though its drives do."""
     found = [w for each in maps for w in each.goodness.warnings(each.segment.name)]
     return found if together is None else found + together.warnings(f"component {component}")

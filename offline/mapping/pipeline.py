@@ -17,12 +17,12 @@ from groundsbot.offline.global_map import (
     solve_group,
     unused_measurements,
 )
-from groundsbot.offline.local_map import LocalMap, archive_map, local_map_of, tags_of, tape_of
-from groundsbot.offline.mapping.findings import Found
+from groundsbot.offline.local_map import LocalMap, archive_map, local_map_of, tags_of, tape_options_of
+from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import (
     Measurements,
@@ -42,7 +42,7 @@ from groundsbot.offline.outliers import (
 from groundsbot.offline.self_calibration import (
     TIMES_MAPPED,
     Calibrate,
-    Freed,
+    FreedRobots,
     about_the_files,
     free_parameters,
     put_right,
@@ -62,7 +62,7 @@ def build_map(
     corners: bool = False,
     upright_sigma_rad: float | None = None,
     calibrate: Calibrate = Calibrate(is_on=True),
-    workings: Workings | None = None,
+    workings: Diagnostics | None = None,
     extending: MapResult | None = None,
 ) -> MapResult:
     """Turns runs into one map in the frame of the first run's start.
@@ -91,8 +91,8 @@ def build_map(
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
         calibrate = Calibrate()  # a kept map has its calibration
-        noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_of(extending, tape)
-    workings = workings or Workings()
+        noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_options_of(extending, tape)
+    workings = workings or Diagnostics()
     workings.runs += runs
     given = runs
     (runs, choices, put_in, searches), segments = _calibrate_runs(
@@ -116,7 +116,7 @@ def build_map(
     )
     workings.maps += maps
     joined = join_results(components, joins)
-    found = Found()
+    found = Findings()
     while components:  # each is let go of where it has told its part: a factor on corners may take 100 MiB
         workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
     found.measured += unused_measurements(measurements, found.measured)
@@ -146,15 +146,15 @@ def build_map(
 
 def _calibrate_runs(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
-) -> tuple[Freed, list[Segment]]:
+) -> tuple[FreedRobots, list[Segment]]:
     """The runs as their robots are to be taken, and their segments."""
     with stages.stage("start values of robots"):
         runs, started, searches = start_left_open(runs, noise)
-    found = Freed(runs, started, put_right(started), searches)
+    found = FreedRobots(runs, started, put_right(started), searches)
     if calibrate.is_on:
         with stages.stage("self-calibration"):
             freed = free_parameters(runs, noise, calibrate.names, corners=corners)
-        found = Freed(
+        found = FreedRobots(
             freed.runs, (*started, *freed.choices), found.put_in | freed.put_in, found.searches | freed.searches
         )
     return found, _segments(found.runs, noise, stages)
@@ -188,7 +188,7 @@ def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMa
         return [local_map_of(each) for each in extending.kept]
 
 
-class _Together(NamedTuple):
+class _SolvedTogether(NamedTuple):
     """Local maps, how they were aligned and solved together, and which single tags were asked to join components."""
 
     maps: list[LocalMap]  # tags apart that lie elsewhere than in the other maps
@@ -205,7 +205,7 @@ def _align_and_solve(
     keep_suspects: bool,
     corners: bool,
     upright_sigma_rad: float | None,
-) -> _Together:
+) -> _SolvedTogether:
     """Aligns local maps and solves each group that hangs together; on corners a single tag may join two of them."""
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([each.segment.name for each in maps]))
@@ -216,4 +216,4 @@ def _align_and_solve(
     if corners and len(components) > 1:
         components, joins = join_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)
         merged = replace(merged, groups=tuple(each.members for each in components))
-    return _Together(maps, merged, components, joins)
+    return _SolvedTogether(maps, merged, components, joins)

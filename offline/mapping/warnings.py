@@ -7,9 +7,9 @@ from groundsbot.calib.robot import TAG_SCALE
 from groundsbot.offline.alignment import Merge
 from groundsbot.offline.global_map import COMPARED, TagJoin, check_warnings, measurement_warnings
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.mapping.findings import Found
+from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.merge_report import merge_warnings
-from groundsbot.offline.maps import MAX_SIGMAS, CalibrationResult, CheckResult
+from groundsbot.offline.maps import MAX_SIGMAS, CalibrationResult, ConsistencyCheck
 from groundsbot.offline.measurements import Run, Segment
 
 
@@ -18,7 +18,7 @@ def map_warnings(
     maps: Sequence[LocalMap],
     broken: Sequence[str],
     merged: Merge,
-    found: Found,
+    found: Findings,
     not_joined: Sequence[TagJoin] | None,
 ) -> tuple[str, ...]:
     """All that a person must be told, in the order in which it came up, each sentence once."""
@@ -34,14 +34,14 @@ def map_warnings(
     )
 
 
-def _in_one_place(found: Found) -> set[tuple[str, int]]:
+def _in_one_place(found: Findings) -> set[tuple[str, int]]:
     """Family and id of tags that all drives of a component together have in one place, whatever two of them had."""
     n_places = [Counter((tag.family, tag.tag_id) for tag in component.tags) for component in found.components]
     several = {each for counts in n_places for each, n in counts.items() if n > 1}
     return {each for counts in n_places for each in counts} - several
 
 
-def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[CheckResult]) -> list[str]:
+def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[ConsistencyCheck]) -> list[str]:
     """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
     told = {
         (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)

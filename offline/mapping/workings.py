@@ -11,7 +11,7 @@ from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration import TimeOffsetSearch
 
 
-class Solved(NamedTuple):
+class SolvedGroup(NamedTuple):
     """One component, as it was solved.
 
     Attributes:
@@ -33,7 +33,7 @@ class Solved(NamedTuple):
 
 
 @dataclass
-class Workings:
+class Diagnostics:
     """Filled by `build_map`.
 
     Attributes:
@@ -44,6 +44,6 @@ class Workings:
     """
 
     maps: list[LocalMap] = field(default_factory=list)
-    solved: list[Solved] = field(default_factory=list)
+    solved: list[SolvedGroup] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
     searches: dict[str, TimeOffsetSearch] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-from .archive import KeptCalibration, KeptSegment, nominal_row
+from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
 from .files import JSON_FILE, read_map, write_map
 from .fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
 from .json_document import advice_as_json, map_as_json
@@ -9,11 +9,11 @@ from .parameter_results import (
     NOT_NEEDED,
     CalibrationChoice,
     CalibrationResult,
-    CheckResult,
+    ConsistencyCheck,
     FittedNoise,
     FittedParameter,
-    MetreResult,
     RobotNumber,
+    ScaleBudget,
 )
 from .result import (
     AdviceResult,
@@ -37,24 +37,24 @@ __all__ = [
     "NOT_NEEDED",
     "AdviceResult",
     "AlignmentResult",
+    "ArchivedCalibration",
+    "ArchivedSegment",
     "CalibrationChoice",
     "CalibrationResult",
-    "CheckResult",
     "Component",
+    "ConsistencyCheck",
     "FittedNoise",
     "FittedParameter",
     "FloorSigmas",
     "GraphEdges",
-    "KeptCalibration",
-    "KeptSegment",
     "MapModel",
     "MapResult",
     "MeasurementResult",
-    "MetreResult",
     "Misfit",
     "RivalResult",
     "RobotNumber",
     "RunResult",
+    "ScaleBudget",
     "StartToStart",
     "SuspectTag",
     "TagPose",

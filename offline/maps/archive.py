@@ -16,7 +16,7 @@ _NOMINAL: Final = 4
 
 
 @dataclass(frozen=True)
-class KeptCalibration:
+class ArchivedCalibration:
     """What a component's solve knows of the calibration, together with its tags.
 
     Attributes:
@@ -37,7 +37,7 @@ class KeptCalibration:
 
 
 @dataclass(frozen=True)
-class KeptSegment:
+class ArchivedSegment:
     """The measurements of one segment as they entered the joint solve, and where its own solve ended.
 
     Attributes:
@@ -91,7 +91,7 @@ class KeptSegment:
     goodness: FloatArray
 
 
-def arrays_of(kept: KeptCalibration | KeptSegment, key: str) -> dict[str, Any]:
+def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str, Any]:
     """Arrays by name, each after the key; texts as unicode arrays."""
     arrays: dict[str, Any] = {}
     for each in fields(kept):
@@ -101,19 +101,19 @@ def arrays_of(kept: KeptCalibration | KeptSegment, key: str) -> dict[str, Any]:
     return arrays
 
 
-def calibration_from(arrays: Any, key: str) -> KeptCalibration | None:  # noqa: ANN401 - numpy's file of arrays
+def calibration_from(arrays: Any, key: str) -> ArchivedCalibration | None:  # noqa: ANN401 - numpy's file of arrays
     """What `arrays_of` wrote; None where there is none."""
-    return KeptCalibration(**_values(KeptCalibration, arrays, key)) if f"{key}owners" in arrays else None
+    return ArchivedCalibration(**_values(ArchivedCalibration, arrays, key)) if f"{key}owners" in arrays else None
 
 
-def segment_from(arrays: Any, key: str) -> KeptSegment | None:  # noqa: ANN401 - numpy's file of arrays
+def segment_from(arrays: Any, key: str) -> ArchivedSegment | None:  # noqa: ANN401 - numpy's file of arrays
     """What `arrays_of` wrote; None where there is none, or one of a program that knew fewer numbers of a camera."""
     if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
         return None
-    return KeptSegment(**_values(KeptSegment, arrays, key))
+    return ArchivedSegment(**_values(ArchivedSegment, arrays, key))
 
 
-def _values(kind: type[KeptCalibration | KeptSegment], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
+def _values(kind: type[ArchivedCalibration | ArchivedSegment], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
     """Of a dataclass: texts and counts as Python's own, all else as arrays."""
     values: dict[str, Any] = {}
     for each in fields(kind):

@@ -17,7 +17,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
-from groundsbot.offline.maps.archive import KeptSegment, arrays_of, calibration_from, segment_from
+from groundsbot.offline.maps.archive import ArchivedSegment, arrays_of, calibration_from, segment_from
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.maps.json_document import (
     FORMAT_VERSION,
@@ -35,7 +35,7 @@ from groundsbot.offline.maps.json_document import (
     tag_from,
 )
 from groundsbot.offline.maps.model import MapModel
-from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, MetreResult, RobotNumber
+from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, RobotNumber, ScaleBudget
 from groundsbot.offline.maps.result import Component, GraphEdges, MapResult, RunResult, StartToStart
 from groundsbot.offline.maps.tags_table import tags_csv
 from groundsbot.offline.maps.tum import read_tum, write_tum
@@ -106,7 +106,7 @@ def read_map(folder: Path) -> MapResult:
             robot_numbers=tuple(RobotNumber(**entry) for entry in data.get("robot_numbers", ())),
             measurements=tuple(measurement_from(entry) for entry in data["measurements"]),
             checks=tuple(check_from(entry) for entry in data["checks"]),
-            metres=tuple(MetreResult(**entry) for entry in data["metres"]),
+            metres=tuple(ScaleBudget(**entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
             losses=tuple(data.get("losses", ())),
             suspects=tuple(SuspectTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
@@ -192,9 +192,9 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     )
 
 
-def _archived_segments(arrays: Mapping[str, Any]) -> tuple[KeptSegment, ...]:
+def _archived_segments(arrays: Mapping[str, Any]) -> tuple[ArchivedSegment, ...]:
     """All that there are; none in a map of an older program."""
-    found: list[KeptSegment] = []
+    found: list[ArchivedSegment] = []
     while (kept := segment_from(arrays, f"run{len(found)}_")) is not None:
         found.append(kept)
     return tuple(found)

@@ -12,7 +12,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
-from groundsbot.offline.maps.parameter_results import CheckResult, FittedNoise, FittedParameter
+from groundsbot.offline.maps.parameter_results import ConsistencyCheck, FittedNoise, FittedParameter
 from groundsbot.offline.maps.result import (
     AdviceResult,
     Component,
@@ -238,9 +238,9 @@ def measurement_from(entry: dict[str, Any]) -> MeasurementResult:
     return MeasurementResult(**entry | arrays | {"in_map": None if in_map is None else array_from(in_map)})
 
 
-def check_from(entry: dict[str, Any]) -> CheckResult:
+def check_from(entry: dict[str, Any]) -> ConsistencyCheck:
     """Of an entry of `checks`."""
-    return CheckResult(**{name: value for name, value in entry.items() if name != "sigmas"})
+    return ConsistencyCheck(**{name: value for name, value in entry.items() if name != "sigmas"})
 
 
 def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:

@@ -79,7 +79,7 @@ class RobotNumber:
 
 
 @dataclass(frozen=True)
-class CheckResult:
+class ConsistencyCheck:
     """Two ways to know one thing, held against each other: wheels and tags."""
 
     name: str  # scale: how much longer a metre by the tags is than one by the wheels; turn: likewise a full turn
@@ -102,7 +102,7 @@ class CheckResult:
 
 
 @dataclass(frozen=True)
-class MetreResult:
+class ScaleBudget:
     """What holds the length of a metre in a component: wheels, tags and all places could be stretched together."""
 
     component: int

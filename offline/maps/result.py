@@ -10,16 +10,16 @@ from pathlib import Path
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.archive import KeptCalibration, KeptSegment
+from groundsbot.offline.maps.archive import ArchivedCalibration, ArchivedSegment
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, SuspectTag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
     CalibrationChoice,
     CalibrationResult,
-    CheckResult,
+    ConsistencyCheck,
     FittedNoise,
-    MetreResult,
     RobotNumber,
+    ScaleBudget,
 )
 
 
@@ -166,7 +166,7 @@ class Component:
     start_to_start: tuple[StartToStart, ...] = ()
     edges: GraphEdges | None = None
     model: MapModel = MapModel.FLOOR
-    calibration: KeptCalibration | None = None  # with its covariance, and that with the tags
+    calibration: ArchivedCalibration | None = None  # with its covariance, and that with the tags
     floor: FloorSigmas | None = None  # None where nobody looked at corners
     # By how many times all sigmas of the component are larger than computed; 1 where the model explains the drives.
     sigma_factor: float = 1.0
@@ -214,8 +214,8 @@ class MapResult:
     noise: NoiseParameters
     calibration: tuple[CalibrationResult, ...] = ()
     measurements: tuple[MeasurementResult, ...] = ()
-    checks: tuple[CheckResult, ...] = ()
-    metres: tuple[MetreResult, ...] = ()
+    checks: tuple[ConsistencyCheck, ...] = ()
+    metres: tuple[ScaleBudget, ...] = ()
     warnings: tuple[str, ...] = field(default=())
     losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
     suspects: tuple[SuspectTag, ...] = ()
@@ -223,7 +223,7 @@ class MapResult:
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
     choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none where it was off
     robot_numbers: tuple[RobotNumber, ...] = ()  # what the drives say of each number of robots' files
-    kept: tuple[KeptSegment, ...] = ()  # each run's measurements, to solve them again together with another run's
+    kept: tuple[ArchivedSegment, ...] = ()  # each run's measurements, to solve them again together with another run's
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.maps.archive import KeptCalibration
+from groundsbot.offline.maps.archive import ArchivedCalibration
 from groundsbot.offline.maps.fit_results import Misfit
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagResult
 
@@ -77,5 +77,5 @@ def _edges(edges: GraphEdges, factor: float) -> GraphEdges:
     )
 
 
-def _calibration(kept: KeptCalibration, factor: float) -> KeptCalibration:
+def _calibration(kept: ArchivedCalibration, factor: float) -> ArchivedCalibration:
     return replace(kept, covariance=factor * kept.covariance, with_tags=factor * kept.with_tags)

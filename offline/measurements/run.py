@@ -15,7 +15,7 @@ from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
-from groundsbot.offline.measurements.tag_messages import RunReadings
+from groundsbot.offline.measurements.tag_messages import TagMessages
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log import (
     Allowance,
@@ -93,7 +93,7 @@ _MOST_EVENTS = 500  # a recorder gathers what happens often into one event
 
 
 @dataclass
-class _Collected:
+class _RunMessages:
     """What one pass over a log gathers."""
 
     info: RunInfo | None = None
@@ -101,7 +101,7 @@ class _Collected:
     wheels: list[WheelRow] = field(default_factory=list)
     odometry: list[PlanarOdometry] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
-    readings: RunReadings = field(default_factory=RunReadings)
+    readings: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
 
@@ -172,7 +172,7 @@ def load_run(
         GroundsbotError: one line that says why the log cannot be mapped.
     """
     log = Path(log)
-    collected, losses = _Collected(), LogLosses()
+    collected, losses = _RunMessages(), LogLosses()
     log_bytes = size_bytes(log)
     for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
@@ -212,7 +212,7 @@ def load_run(
     ).shift_stamps(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
 
 
-def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:
+def _run_info(collected: _RunMessages, log: Path, losses: LogLosses) -> RunInfo:
     """Whose run it is, by names that are fit for files."""
     info = collected.info
     if info is None:
@@ -223,7 +223,7 @@ def _run_info(collected: _Collected, log: Path, losses: LogLosses) -> RunInfo:
     return info
 
 
-def _not_used(collected: _Collected, every: int, log_bytes: int) -> list[str]:
+def _not_used(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
     """Sentences about what was read and is left out."""
     told = []
     if every > 1:
@@ -237,7 +237,7 @@ def _not_used(collected: _Collected, every: int, log_bytes: int) -> list[str]:
     return told
 
 
-def _camera(collected: _Collected, given: CameraModel | None, log: Path) -> CameraModel | None:
+def _camera(collected: _RunMessages, given: CameraModel | None, log: Path) -> CameraModel | None:
     """The given calibration, or the log's; None where there are no pictures to need one."""
     calibration, size = collected.calibration, collected.picture_size
     camera, source = given, "the camera file given with --robot"

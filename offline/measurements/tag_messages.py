@@ -19,7 +19,7 @@ from groundsbot.onboard.detection import REFINED_CORNERS
 from groundsbot.onboard.log import TagDetections, TagObservations
 
 
-class Gathered(NamedTuple):
+class CollectedTags(NamedTuple):
     """What the looks that are used read.
 
     Attributes:
@@ -53,7 +53,7 @@ _FREE_TO_USE: Final = 8000
 _BYTES_TO_USE: Final = 12
 
 
-class RunReadings:
+class TagMessages:
     """Fills from messages, one after the other."""
 
     def __init__(self) -> None:
@@ -121,7 +121,7 @@ class RunReadings:
                 "are their numbers right?"
             )
 
-    def collect(self, log_bytes: int, n_logs: int = 1) -> Gathered:
+    def collect(self, log_bytes: int, n_logs: int = 1) -> CollectedTags:
         """Those of all looks, or of as many as one of so many logs is worth with this size, evenly spread."""
         tags = tuple(sorted(self._numbers))
         rank = np.empty(len(tags), dtype=np.int64)
@@ -146,7 +146,7 @@ class RunReadings:
             detections = detections.where(np.isin(detections.stamps_ns, used_ns))
             positions = positions.where(np.isin(positions.stamps_ns, used_ns))
         corners_refined = self.in_pixels and not self._as_detected
-        return Gathered(tags, pictures_ns, detections, positions, every, corners_refined)
+        return CollectedTags(tags, pictures_ns, detections, positions, every, corners_refined)
 
     def _number(self, family: str, tag_id: int) -> int:
         key = TagKey(family, tag_id)

@@ -95,7 +95,7 @@ class Part:
     components: Components
 
 
-class Seen(NamedTuple):
+class PartLikelihood(NamedTuple):
     """What one part says at given variances.
 
     Attributes:
@@ -112,7 +112,7 @@ class Seen(NamedTuple):
     n_groups: FloatArray
 
 
-class Looker:
+class LikelihoodEvaluator:
     """Looks at one part again and again.
 
     Attributes:
@@ -124,7 +124,7 @@ class Looker:
         self._components = part.components
         self._steps_left = _STEPS_IN_ALL
 
-    def look(self, variances: FloatArray) -> Seen:
+    def evaluate(self, variances: FloatArray) -> PartLikelihood:
         """Solves under (C,) variances, which are K of factors and two of each level."""
         odometry, readings = self._components.covariances(variances)
         problem = self.solution.problem.reweigh(whitening(odometry), whitening(readings))
@@ -152,7 +152,7 @@ class Looker:
         lasting = slice(n - self._components.n_lasting, n)
         n_groups = lengths[lasting] ** 2 / np.maximum(np.diag(traces)[lasting], 1e-300)
         unscaled = rows.squares(rows.residuals(rows.weigh(rows.random_unscaled_errors(rng)))).mean(axis=1)
-        return Seen(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, at_most, n_groups)
+        return PartLikelihood(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, at_most, n_groups)
 
 
 class _Rows:
@@ -284,7 +284,7 @@ def _within_noise(residual: FloatArray) -> FloatArray:
     return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)
 
 
-def all_looks(lookers: list[Looker], variances: FloatArray) -> Seen:
+def evaluate_all(lookers: list[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
     """What all parts say together."""
-    seen: Iterator[Seen] = (each.look(variances) for each in lookers)
-    return Seen(*(np.asarray(sum(each)) for each in zip(*seen, strict=True)))
+    seen: Iterator[PartLikelihood] = (each.evaluate(variances) for each in lookers)
+    return PartLikelihood(*(np.asarray(sum(each)) for each in zip(*seen, strict=True)))

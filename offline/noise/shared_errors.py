@@ -54,7 +54,7 @@ def in_cell(segment: Segment) -> IntArray:
     return _n_in_group(cells_of(segment))
 
 
-def spread_of_corners(segment: Segment, n_in_cell: IntArray, sigma_corner_px: float) -> FloatArray:
+def inflation_of_corners(segment: Segment, n_in_cell: IntArray, sigma_corner_px: float) -> FloatArray:
     """(M,) how many times their sigma corners count with, for what refined corners are known to share.
 
     Args:
@@ -82,8 +82,8 @@ def with_shared_errors(segment: Segment, shared: FloatArray, sigma_corner_px: fl
         times += errors.alike()[:, None] * np.einsum("mij,j->mi", back**2, both)
     n_in_cell = in_cell(segment)
     sigmas = np.sqrt(1.0 + np.maximum(times, n_in_cell[:, None] * least_shared(readings)))
-    of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), spread_of_corners(segment, n_in_cell, sigma_corner_px))
-    return replace(segment, readings=readings.spread(sigmas, of_corners))
+    of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), inflation_of_corners(segment, n_in_cell, sigma_corner_px))
+    return replace(segment, readings=readings.inflate(sigmas, of_corners))
 
 
 def _n_in_group(group: IntArray) -> IntArray:

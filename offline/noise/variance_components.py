@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.noise.likelihood import Looker, Part, Seen, all_looks
+from groundsbot.offline.noise.likelihood import LikelihoodEvaluator, Part, PartLikelihood, evaluate_all
 from groundsbot.offline.sam import Solution
 
 # Of a logarithm of sigma: a factor of ten either way is one such sigma.
@@ -141,13 +141,13 @@ class _Search:
     """
 
     def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, start: FloatArray) -> None:
-        self.lookers = [Looker(part) for part in parts]
+        self.lookers = [LikelihoodEvaluator(part) for part in parts]
         self._n = len(sigma)
         n_shared = parts[0].components.n_lasting if parts else 0
         self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
         self.variances = np.maximum(np.append(start**2, self._middle[self._n :]), self._least)
-        self.seen: Seen = all_looks(self.lookers, self.variances)
+        self.seen: PartLikelihood = evaluate_all(self.lookers, self.variances)
 
     def run(self, free: BoolArray) -> bool:
         """Repeats the estimate of those that are free (C,) until what the data tell stands; False if it does not."""
@@ -155,7 +155,7 @@ class _Search:
             times = np.where(free, self._estimate(free), 1.0)
             moved = 0.5 * np.log(np.clip(times, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
             self.variances = np.clip(self.variances * np.exp(2.0 * moved), self._least, _MOST_TIMES * self._middle)
-            self.seen = all_looks(self.lookers, self.variances)
+            self.seen = evaluate_all(self.lookers, self.variances)
             deviation = np.sqrt(np.diag(self.log_covariance()))
             matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
             # Far too small, all readings are cut off as faults, and nothing is told until sigmas have grown.
@@ -172,7 +172,7 @@ class _Search:
             if not (moved > _GROWING).any():
                 return
             self.variances = np.minimum(self.variances * np.exp(2.0 * moved), _MOST_TIMES * self._middle)
-            self.seen = all_looks(self.lookers, self.variances)
+            self.seen = evaluate_all(self.lookers, self.variances)
 
     def hold_untold(self, told: BoolArray) -> bool:
         """Puts sigmas of which little is told up to the prior's, where the data do not speak against it."""
@@ -181,7 +181,7 @@ class _Search:
         untold = ~told & (np.arange(len(fitted)) < n)
         # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
         self.variances = np.where(untold, np.maximum(fitted, self._middle), fitted)
-        self.seen = all_looks(self.lookers, self.variances)
+        self.seen = evaluate_all(self.lookers, self.variances)
         expected = self.seen.traces @ self.variances
         excess = (expected - self.seen.squares) * self.variances
         spread = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))

@@ -1,23 +1,23 @@
 from .duplicate_ids import split_duplicates
-from .left_out import phantoms, read_as_another, stray_passes, without_tags
+from .left_out import false_detections, read_as_another, stray_passes, without_tags
 from .local_maps_without_outliers import local_maps_of, remove_outliers_under_own_noise
-from .outliers import Searched, join_places, rename_tags, split_together, with_outliers_apart
-from .report import suspect_tags
+from .outliers import OutlierSearch, join_places, rename_tags, split_together, with_outliers_apart
+from .report import outlier_report
 from .search import FALSE_ALARM
 
 __all__ = [
     "FALSE_ALARM",
-    "Searched",
+    "OutlierSearch",
+    "false_detections",
     "join_places",
     "local_maps_of",
-    "phantoms",
+    "outlier_report",
     "read_as_another",
     "remove_outliers_under_own_noise",
     "rename_tags",
     "split_duplicates",
     "split_together",
     "stray_passes",
-    "suspect_tags",
     "with_outliers_apart",
     "without_tags",
 ]

@@ -17,16 +17,16 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.local_map import Goodness
+from groundsbot.offline.local_map import GoodnessOfFit
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
 from groundsbot.offline.outliers.joint_information import Information, no_information
-from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.outliers.sightings import Tracks
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     PLAIN_SQUARES,
     Columns,
     Graph,
-    Measured,
+    Priors,
     Problem,
     State,
     factorise,
@@ -53,7 +53,7 @@ class Evidence:
     places_m: FloatArray
 
 
-def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
+def noise_scales(goodness: Sequence[GoodnessOfFit]) -> FloatArray:
     """(C, 2) how many times larger than told the noise of each segment's wheels and readings is, 1 at least.
 
     By what the windows of each segment leave over, which no tag that was moved between them raises; where windows do
@@ -67,7 +67,7 @@ def noise_scales(goodness: Sequence[Goodness]) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Heard:
+class LinearisedObservations:
     """A problem under its segments' own noise, and what its readings say at a state.
 
     Attributes:
@@ -81,7 +81,7 @@ class Heard:
     by_tag: FloatArray
 
 
-def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> Heard:
+def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> LinearisedObservations:
     """Linearises the readings of a graph.
 
     Args:
@@ -91,12 +91,12 @@ def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> He
     """
     problem = _scale_noise(graph, scales)
     readings = problem.readings.linearise(state, problem.columns)
-    return Heard(problem, state, readings.residual, readings.blocks[1][1])
+    return LinearisedObservations(problem, state, readings.residual, readings.blocks[1][1])
 
 
 def marginalise(
-    at: Heard,
-    sightings: Sightings,
+    at: LinearisedObservations,
+    sightings: Tracks,
     unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
     *,
     weighed: bool = True,
@@ -123,7 +123,7 @@ def marginalise(
     return Evidence(which, information, unmodelled_sigma_m**-2 * by_tag[which].reshape(-1), state.tags[which])
 
 
-def _apart(problem: Problem, state: State, sightings: Sightings) -> tuple[Problem, State]:
+def _apart(problem: Problem, state: State, sightings: Tracks) -> tuple[Problem, State]:
     """Each sighting with a tag of its own, in the same places; what was measured to a tag was to where it was first."""
     columns, n = problem.columns, len(sightings)
     of_tag, first_reading = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
@@ -150,14 +150,14 @@ def _apart(problem: Problem, state: State, sightings: Sightings) -> tuple[Proble
     return other, State(state.poses, state.tags[of_tag], state.calibration)
 
 
-def to_other_tags(measured: Measured, index: IntArray) -> Measured:
+def to_other_tags(measured: Priors, index: IntArray) -> Priors:
     """What was measured, with tags numbered anew by index (T,)."""
     distances = measured.distances
     tag_a, tag_b = (np.where(tag >= 0, index[tag], -1) for tag in (distances.tag_a, distances.tag_b))
     return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
 
 
-def find_contradictions(at: Heard, sightings: Sightings) -> BoolArray:
+def find_contradictions(at: LinearisedObservations, sightings: Tracks) -> BoolArray:
     """(M,) readings before which a tag seems to have moved though it was in sight.
 
     The poses count as known, which a few metres apart they nearly are: that finds a move too many rather than one too
@@ -228,7 +228,7 @@ def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
     )
 
 
-def _reweigh(at: Heard, sightings: Sightings) -> Problem:
+def _reweigh(at: LinearisedObservations, sightings: Tracks) -> Problem:
     """The problem with readings weighed by the others of their sighting.
 
     Not by where the tag is said to be: what is off together was moved, and is to be heard in full.
@@ -238,7 +238,7 @@ def _reweigh(at: Heard, sightings: Sightings) -> Problem:
     return replace(at.problem, readings=replace(readings, whitening=readings.whitening * root[:, None, None]))
 
 
-def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Sightings) -> FloatArray:
+def _own_weights(residual: FloatArray, by_tag: FloatArray, sightings: Tracks) -> FloatArray:
     """(M,) robust weights of readings about the place that their passing alone gives the tag, poses held."""
     of = sightings.passing
     n_readings = np.bincount(of)

@@ -14,7 +14,7 @@ from scipy.stats import binom
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.outliers.sightings import Tracks
 from groundsbot.offline.sam import Graph, State
 
 # "Read once or a few times."
@@ -38,7 +38,7 @@ class Views:
     near: IntArray
 
 
-def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
+def views_of(graph: Graph, state: State, sightings: Tracks) -> Views:
     """Counts near views, in runs that tell when pictures were taken that showed nothing."""
     n = len(sightings)
     views = Views(np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64))
@@ -50,7 +50,7 @@ def views_of(graph: Graph, state: State, sightings: Sightings) -> Views:
     return views
 
 
-def _count_views(graph: Graph, state: State, sightings: Sightings, which: IntArray) -> tuple[IntArray, IntArray]:
+def _count_views(graph: Graph, state: State, sightings: Tracks, which: IntArray) -> tuple[IntArray, IntArray]:
     """From how many poses tags were read in some sightings (s,), and how many poses have a near view (s,)."""
     readings, n = graph.problem.readings, len(which)
     number = np.full(len(sightings), -1, dtype=np.int64)
@@ -85,7 +85,7 @@ def _ranges(first: IntArray, length: IntArray) -> tuple[IntArray, IntArray]:
     return np.arange(len(of)) - np.repeat(np.cumsum(length) - length, length) + first[of], of
 
 
-def chances(sightings: Sightings, place: IntArray, views: Views) -> FloatArray:
+def chances(sightings: Tracks, place: IntArray, views: Views) -> FloatArray:
     """(S,) how likely a tag that hangs there is read from so few of the near views; 1 where that says nothing.
 
     Args:

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.outliers.sightings import Sightings, places_told_apart
+from groundsbot.offline.outliers.sightings import Tracks, places_told_apart
 from groundsbot.offline.sam import LEVELS, Graph, Tree
 
 # Of one tag. A choice among so many takes as long as a few linearisations; drives of the project's worlds, and the
@@ -26,7 +26,7 @@ _KEYFRAMES_A_SIGHTING: Final = 16
 _LEVELS: Final = LEVELS - 1  # below the top
 
 
-def few_of_each_tag(graph: Graph, sightings: Sightings) -> Sightings:
+def few_of_each_tag(graph: Graph, sightings: Tracks) -> Tracks:
     """The same readings in fewer sightings where a tag has very many; the same sightings where none has."""
     tag = places_told_apart(graph.segments, sightings)
     most = _most_of_each(np.bincount(tag), _FREE + len(graph.problem.columns.poses) // _KEYFRAMES_A_SIGHTING)
@@ -68,8 +68,8 @@ def _n_groups(tag: IntArray, group: IntArray) -> IntArray:
     return np.bincount(pairs[:, 0])
 
 
-def _together(sightings: Sightings, group: IntArray) -> Sightings:
-    """With those (S,) of one group, all of one tag in one segment, in one; in the order of `Sightings`."""
+def _together(sightings: Tracks, group: IntArray) -> Tracks:
+    """With those (S,) of one group, all of one tag in one segment, in one; in the order of `Tracks`."""
     _, one, number = np.unique(group, return_index=True, return_inverse=True)
     first_ns, last_ns = sightings.first_ns[one], sightings.last_ns[one]
     np.minimum.at(first_ns, number, sightings.first_ns)

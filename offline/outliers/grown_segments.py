@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import Segment, TagKey
-from groundsbot.offline.sam import Effort, Parameter, build_graph, solve
+from groundsbot.offline.sam import Parameter, SolveBudget, build_graph, solve
 
 # Of all drives whose wheels are right, so many are taken for broken.
 FALSE_ALARM: Final = 1e-3
@@ -19,7 +19,7 @@ _PIECE_M: Final = 2.0
 _MOST_PIECES: Final = 60
 
 
-class Grown(NamedTuple):
+class SolvedPart(NamedTuple):
     """A part of a segment, solved."""
 
     first: int
@@ -32,10 +32,10 @@ class Grown(NamedTuple):
     freedom: int
 
 
-def grow_parts(segment: Segment, effort: Effort, *, backwards: bool) -> list[Grown]:
+def grow_parts(segment: Segment, effort: SolveBudget, *, backwards: bool) -> list[SolvedPart]:
     """Longer and longer parts of the segment, from one end on, as long as there is effort for them."""
     n = len(segment.stamps_ns)
-    parts: list[Grown] = []
+    parts: list[SolvedPart] = []
     for end in _coarse_ends(segment):
         if effort.is_spent():
             break
@@ -44,7 +44,7 @@ def grow_parts(segment: Segment, effort: Effort, *, backwards: bool) -> list[Gro
     return parts
 
 
-def noise_factor(grown: Sequence[Sequence[Grown]]) -> float:
+def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
     """How much larger than told the variances are, 1 at least: by what most pieces add, of which a break spoils few."""
     added = [
         2.0 * (after.cost - before.cost) / (after.freedom - before.freedom)
@@ -55,7 +55,7 @@ def noise_factor(grown: Sequence[Sequence[Grown]]) -> float:
     return max(1.0, float(np.median(added))) if added else 1.0
 
 
-def limit_of(segment: Segment, parts: Sequence[Grown], factor: float, effort: Effort) -> Grown | None:
+def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, effort: SolveBudget) -> SolvedPart | None:
     """The longest part whose readings fit together, as far as there is effort; None where all of the segment does."""
     for before, after in pairwise(parts):
         if _strains(before, after, factor, len(parts)):
@@ -63,7 +63,9 @@ def limit_of(segment: Segment, parts: Sequence[Grown], factor: float, effort: Ef
     return None
 
 
-def _refine_end(segment: Segment, known: Grown, beyond: Grown, factor: float, effort: Effort) -> Grown:
+def _refine_end(
+    segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, effort: SolveBudget
+) -> SolvedPart:
     """Between a part that fits and a longer one that does not, keyframe by keyframe."""
     longest = known
     reading = np.unique(segment.readings.keyframe)
@@ -80,28 +82,28 @@ def _refine_end(segment: Segment, known: Grown, beyond: Grown, factor: float, ef
     return longest
 
 
-def _strains(before: Grown, after: Grown, factor: float, n_tests: int) -> bool:
+def _strains(before: SolvedPart, after: SolvedPart, factor: float, n_tests: int) -> bool:
     """Whether a longer part costs more than chance adds."""
     freedom = max(1, after.freedom - before.freedom)
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solve_part(segment: Segment, first: int, end: int, known: Grown | None, effort: Effort) -> Grown:
+def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, effort: SolveBudget) -> SolvedPart:
     """A part of a segment, from what is known of another that has an end in common with it."""
     part = segment.part(first, end)
     graph = build_graph([part])
     wheels = np.zeros(3) if known is None else known.wheels
     poses = _poses(segment, first, end, known, wheels)
     start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
-    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.tries(graph.problem, 1.0))
+    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.max_linearisations(graph.problem, 1.0))
     effort.spend(solution, is_built=True)
     state, problem = solution.state, graph.problem
     freedom = problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
     wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
-    return Grown(first, end, state.poses, wheels, tags, graph.calibration_of(state), solution.cost, freedom)
+    return SolvedPart(first, end, state.poses, wheels, tags, graph.calibration_of(state), solution.cost, freedom)
 
 
-def _poses(segment: Segment, first: int, end: int, known: Grown | None, wheels: FloatArray) -> FloatArray:
+def _poses(segment: Segment, first: int, end: int, known: SolvedPart | None, wheels: FloatArray) -> FloatArray:
     """Of a part: those known, and dead reckoning on from them either way."""
     odometry = segment.odometry.part(first, end - 1)
     motion = se2.compose(odometry.motion, se2.exp(odometry.jacobian @ wheels))

@@ -37,12 +37,12 @@ class Information:
         own = self.root.of(rows)
         return self._of(np.eye(len(rows)), own.against(own))
 
-    def gather(self, label: IntArray, n: int) -> "Gathered":
+    def gather(self, label: IntArray, n: int) -> "PlaceInformation":
         """With sightings (K,) of one label, 0 to n - 1, in one place."""
         column = rows_of(label)
         ones = np.ones(len(column))
         gather = sparse.csc_array((ones, (np.arange(len(column)), column)), shape=(len(column), 2 * n))
-        return Gathered(self, column, self.root.sum_columns(gather), np.bincount(label, minlength=n).repeat(2))
+        return PlaceInformation(self, column, self.root.sum_columns(gather), np.bincount(label, minlength=n).repeat(2))
 
     def _of(self, ones: FloatArray, covariance: FloatArray) -> FloatArray:
         weight = self.slack_sigma_m**-2
@@ -50,7 +50,7 @@ class Information:
 
 
 @dataclass(frozen=True)
-class Gathered:
+class PlaceInformation:
     """The same of P places that several sightings share.
 
     Attributes:

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.places import Places
-from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.outliers.sightings import Tracks
 
 MOVED: Final = "moved"
 MOVING: Final = "moving"
@@ -36,7 +36,7 @@ _SHARE_WRONG: Final = 0.5
 
 
 @dataclass(frozen=True)
-class Stand:
+class TagStand:
     """One of the places of an id.
 
     Attributes:
@@ -52,7 +52,7 @@ class Stand:
 
 
 @dataclass(frozen=True)
-class Case:
+class SeveralPlaces:
     """An id with several places.
 
     Attributes:
@@ -64,18 +64,18 @@ class Case:
     """
 
     tag: TagKey
-    stands: tuple[Stand, ...]
+    stands: tuple[TagStand, ...]
     seen: dict[int, tuple[int, ...]]
     is_ordered: bool
     at_once: bool
 
     @property
-    def most(self) -> Stand:
+    def most(self) -> TagStand:
         """The place with most sightings."""
         return max(self.stands, key=lambda each: (each.n_sightings, each.n_readings))
 
     @property
-    def others(self) -> tuple[Stand, ...]:
+    def others(self) -> tuple[TagStand, ...]:
         """All places but that one."""
         most = self.most
         return tuple(each for each in self.stands if each is not most)
@@ -95,7 +95,7 @@ class Case:
         return MOVING if mixed else MOVED
 
 
-def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case]:
+def cases(sightings: Tracks, evidence: Evidence, places: Places) -> list[SeveralPlaces]:
     """All ids with several places."""
     label = np.full(len(sightings), -1, dtype=np.int64)
     label[evidence.which] = places.place
@@ -110,11 +110,13 @@ def cases(sightings: Sightings, evidence: Evidence, places: Places) -> list[Case
             for c in dict.fromkeys(sightings.segment[own].tolist())
         }
         at_once = _in_two_places_at_once(sightings, own, label[own])
-        found.append(Case(tag, stands, seen, sightings.one_after_the_other(own), at_once))
+        found.append(SeveralPlaces(tag, stands, seen, sightings.one_after_the_other(own), at_once))
     return found
 
 
-def is_within_sight(case: Case, sightings: Sightings, evidence: Evidence, places: Places, picture: IntArray) -> bool:
+def is_within_sight(
+    case: SeveralPlaces, sightings: Tracks, evidence: Evidence, places: Places, picture: IntArray
+) -> bool:
     """Whether these seem two tags with one id, so near that pictures would show both, and none does.
 
     Args:
@@ -134,14 +136,14 @@ def is_within_sight(case: Case, sightings: Sightings, evidence: Evidence, places
     return not any(len(np.intersect1d(seen_in[i], seen_in[j])) for i, j in pairs)
 
 
-def minority(case: Case, share: float) -> list[Stand]:
+def minority(case: SeveralPlaces, share: float) -> list[TagStand]:
     """All places but the one sighted most; none where that has few sightings, or another one more than its share."""
     n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
     is_minority = case.most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in case.others)
     return list(case.others) if is_minority else []
 
 
-def swapped_pairs(found: Sequence[Case], evidence: Evidence, places: Places) -> list[tuple[int, int]]:
+def swapped_pairs(found: Sequence[SeveralPlaces], evidence: Evidence, places: Places) -> list[tuple[int, int]]:
     """Indices of cases of which each hangs where the other one was; each in one pair at most."""
     pairs: list[tuple[int, int]] = []
     for i, j in combinations(range(len(found)), 2):
@@ -163,7 +165,7 @@ def swapped_pairs(found: Sequence[Case], evidence: Evidence, places: Places) -> 
     return pairs
 
 
-def wrong_runs(found: Sequence[Case], sightings: Sightings) -> dict[int, list[int]]:
+def wrong_runs(found: Sequence[SeveralPlaces], sightings: Tracks) -> dict[int, list[int]]:
     """Segments that have most of their shared tags elsewhere than all others have them, and the cases of these."""
     shared: dict[int, int] = {}
     for own in sightings.of_ids():
@@ -184,13 +186,15 @@ def wrong_runs(found: Sequence[Case], sightings: Sightings) -> dict[int, list[in
     }
 
 
-def shift(case: Case, evidence: Evidence, places: Places, first: int = 0, second: int = 1) -> tuple[float, float]:
+def shift(
+    case: SeveralPlaces, evidence: Evidence, places: Places, first: int = 0, second: int = 1
+) -> tuple[float, float]:
     """Metres between two stands of a case, and sigmas."""
     off, covariance = places.apart(evidence, case.stands[first].label, case.stands[second].label)
     return float(np.hypot(*off)), float(np.sqrt(off @ np.linalg.solve(covariance, off)))
 
 
-def _in_two_places_at_once(sightings: Sightings, own: IntArray, label: IntArray) -> bool:
+def _in_two_places_at_once(sightings: Tracks, own: IntArray, label: IntArray) -> bool:
     """Whether sightings (indices) of different places (of each) in one run overlap in time."""
     return any(
         p != q
@@ -206,9 +210,9 @@ def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
     return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(_NOT_THERE, 2)
 
 
-def _stand(sightings: Sightings, label: int, own: IntArray) -> Stand:
+def _stand(sightings: Tracks, label: int, own: IntArray) -> TagStand:
     segments = tuple(dict.fromkeys(sightings.segment[own].tolist()))
-    return Stand(label, segments, int(sightings.n_readings[own].sum()), len(own))
+    return TagStand(label, segments, int(sightings.n_readings[own].sum()), len(own))
 
 
 def _without_repeats(way: Sequence[int]) -> tuple[int, ...]:

@@ -22,39 +22,39 @@ from groundsbot.offline.outliers.kinds import (
     PHANTOM,
     SHARE_ASTRAY,
     SHARE_ASTRAY_WITHIN_SIGHT,
-    Case,
-    Stand,
+    SeveralPlaces,
+    TagStand,
     cases,
     is_within_sight,
     minority,
 )
-from groundsbot.offline.outliers.outliers import Searched
+from groundsbot.offline.outliers.outliers import OutlierSearch
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
 # Of a whitened residual: a reading of a tag itself is nearer but once in a thousand times.
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
-def phantoms(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
+def false_detections(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
     """Tags of the graph that are false detections and nothing else."""
     named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
     few = graph.n_readings() <= MOST_READINGS
     return {tag for tag, is_few in zip(graph.tags, few, strict=True) if is_few and (tag.family, tag.tag_id) in named}
 
 
-def stray_passes(searched: Searched) -> set[TagKey]:
+def stray_passes(searched: OutlierSearch) -> set[TagKey]:
     """Places of ids that next to nothing speaks for, beside one that more does."""
     which, tags = searched.evidence.which, searched.tags
-    found = cases(searched.sightings, searched.evidence, searched.places)
+    found = cases(searched.tracks, searched.evidence, searched.places)
     labels = [stand.label for case in found for stand in _astray(searched, case)]
     return {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
 
 
-def _astray(searched: Searched, case: Case) -> list[Stand]:
+def _astray(searched: OutlierSearch, case: SeveralPlaces) -> list[TagStand]:
     """The places of a tag that are no places; all of them but one, or none."""
     if all(each.n_readings <= FEW_READINGS < case.most.n_readings for each in case.others):
         return list(case.others)
-    is_near = is_within_sight(case, searched.sightings, searched.evidence, searched.places, searched.picture)
+    is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
     return minority(case, SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY)
 
 

@@ -11,7 +11,7 @@ from groundsbot.offline.outliers.false_readings import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.outliers.outliers import RunsAlone
 from groundsbot.offline.outliers.slips import sentence, without_slips
-from groundsbot.offline.sam import efforts_of
+from groundsbot.offline.sam import budgets_of
 
 
 class ExplainedMaps(NamedTuple):
@@ -44,7 +44,7 @@ def local_maps_of(
     """
     maps: list[LocalMap] = []
     with stages.stage("local maps", len(segments)) as done:
-        efforts = efforts_of(segments, times)
+        efforts = budgets_of(segments, times)
         for segment, effort in zip(segments, efforts, strict=True):
             maps.append(solve_local_map(segment, effort, noise_is_open=noise_is_open))
             done()

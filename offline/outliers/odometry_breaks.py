@@ -26,12 +26,12 @@ from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.grown_segments import (
     COST_TOLERANCE,
     FALSE_ALARM,
-    Grown,
+    SolvedPart,
     grow_parts,
     limit_of,
     noise_factor,
 )
-from groundsbot.offline.sam import Effort, Graph, Problem, Solution, State, solve
+from groundsbot.offline.sam import Graph, Problem, Solution, SolveBudget, State, solve
 
 _MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
 _MOST_PLACES: Final = 24
@@ -65,21 +65,21 @@ class Break:
     bound: float
 
 
-class Mended(NamedTuple):
+class SplitMaps(NamedTuple):
     """The segments and local maps of all runs after those that broke were split, and sentences that say so."""
 
     maps: list[LocalMap]
     warnings: list[str]
 
 
-class _Place(NamedTuple):
+class _BreakPlace(NamedTuple):
     """Of a break: one beyond the last keyframe before it, and the first after it."""
 
     end: int
     begin: int
 
 
-class _Split(NamedTuple):
+class _SplitDrive(NamedTuple):
     """Of a drive.
 
     Attributes:
@@ -96,11 +96,11 @@ class _Split(NamedTuple):
 class _Start(NamedTuple):
     """Where to begin a solve with a break."""
 
-    place: _Place
+    place: _BreakPlace
     state: State
 
 
-def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None = None) -> Mended:
+def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[SolveBudget] | None = None) -> SplitMaps:
     """Splits each drive where its wheels do not tell how it moved, and solves the segments on their own.
 
     Args:
@@ -114,10 +114,10 @@ def split_at_breaks(maps: Sequence[LocalMap], efforts: Sequence[Effort] | None =
         warnings += [_sentence(whole.segment, each) for each in split.breaks]
         if not split.is_searched:
             warnings.append(_not_searched(whole.segment))
-    return Mended(_rename_segments(mended) if warnings else mended, warnings)
+    return SplitMaps(_rename_segments(mended) if warnings else mended, warnings)
 
 
-def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | None:
+def find_break(local_map: LocalMap, effort: SolveBudget | None = None) -> Break | None:
     """The break that explains most of what does not fit in a drive; None where it fits, or none explains it.
 
     Nor is there one where the effort is spent before it is found; the whole log's where None.
@@ -150,16 +150,16 @@ def find_break(local_map: LocalMap, effort: Effort | None = None) -> Break | Non
     return _test_break(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
 
 
-def _all_of(local_map: LocalMap) -> Effort:
-    return Effort.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
+def _all_of(local_map: LocalMap) -> SolveBudget:
+    return SolveBudget.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
 
 
-def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
+def _split(whole: LocalMap, most: int, effort: SolveBudget) -> _SplitDrive:
     found = find_break(whole, effort) if most else None
     if found is None:
-        return _Split([whole], [], is_searched=not effort.is_spent() or _fits(whole))
+        return _SplitDrive([whole], [], is_searched=not effort.is_spent() or _fits(whole))
     segment = whole.segment
-    split = _Split([], [(0, found)], is_searched=True)
+    split = _SplitDrive([], [(0, found)], is_searched=True)
     ends = (0, found.end), (found.begin, len(segment.stamps_ns))
     left = [_without_ends(segment.part(*each), *each, segment) for each in ends]
     for (first, _), part in zip(ends, left, strict=True):
@@ -167,7 +167,7 @@ def _split(whole: LocalMap, most: int, effort: Effort) -> _Split:
         inner = _split(solve_local_map(part, own), most - 1, own)
         effort.give_back(own)
         breaks = [(first + offset, each) for offset, each in inner.breaks]
-        split = _Split(split.parts + inner.parts, split.breaks + breaks, split.is_searched and inner.is_searched)
+        split = _SplitDrive(split.parts + inner.parts, split.breaks + breaks, split.is_searched and inner.is_searched)
     return split
 
 
@@ -213,37 +213,37 @@ def _wild_in_a_row(local_map: LocalMap) -> bool:
     return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
 
 
-def _places(segment: Segment, ahead: Grown, behind: Grown) -> list[_Place]:
+def _places(segment: Segment, ahead: SolvedPart, behind: SolvedPart) -> list[_BreakPlace]:
     """Where the break may be: what lies between the two parts, or wherever they overlap.
 
     Not where all was read on one side, for nothing tells of a break there. A place with a single keyframe on one side
     stays: it cannot be a break, since no part can be solved there, but where it explains most none other may.
     """
-    wanted = [_Place(ahead.end, behind.first)]
+    wanted = [_BreakPlace(ahead.end, behind.first)]
     if behind.first <= ahead.end:
         reading = np.unique(segment.readings.keyframe)
         cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
         cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
         cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
-        wanted = [_Place(cut, cut) for cut in cuts.tolist()]
+        wanted = [_BreakPlace(cut, cut) for cut in cuts.tolist()]
     places = dict.fromkeys(_between_readings(segment, each) for each in wanted)
     return [each for each in places if each.end > 0 and each.begin < len(segment.stamps_ns)]
 
 
-def _seconds_between(segment: Segment, place: _Place) -> float:
+def _seconds_between(segment: Segment, place: _BreakPlace) -> float:
     """Who carries a robot has it stand meanwhile."""
     return float(segment.stamps_ns[place.begin] - segment.stamps_ns[place.end - 1]) * 1e-9
 
 
-def _between_readings(segment: Segment, place: _Place) -> _Place:
+def _between_readings(segment: Segment, place: _BreakPlace) -> _BreakPlace:
     """As far as nothing was read: nobody knows where in there it happened."""
     reading = np.unique(segment.readings.keyframe)
     before, after = reading[reading < place.end], reading[reading >= place.begin]
     n = len(segment.stamps_ns)
-    return _Place(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
+    return _BreakPlace(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
 
 
-def _ways_to_align(segment: Segment, behind: Grown, place: _Place, effort: Effort) -> list[FloatArray]:
+def _ways_to_align(segment: Segment, behind: SolvedPart, place: _BreakPlace, effort: SolveBudget) -> list[FloatArray]:
     """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
     apart = _solve_apart(segment, place, effort)
     if apart is None:
@@ -254,19 +254,19 @@ def _ways_to_align(segment: Segment, behind: Grown, place: _Place, effort: Effor
     return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
 
 
-def _solve_from(starts: Sequence[_Start], problem: Problem, effort: Effort) -> list[Solution]:
+def _solve_from(starts: Sequence[_Start], problem: Problem, effort: SolveBudget) -> list[Solution]:
     """With a break, wherever it may be; not from all starts where there is no effort left."""
     found: list[Solution] = []
     for start in starts:
         if effort.is_spent():
             break
         freed = _without_motions(problem, *start.place)
-        found.append(solve(freed, start.state, COST_TOLERANCE, most_tries=effort.tries(freed, 1.0)))
+        found.append(solve(freed, start.state, COST_TOLERANCE, most_tries=effort.max_linearisations(freed, 1.0)))
         effort.spend(found[-1], is_built=True)
     return found
 
 
-def _solve_apart(segment: Segment, place: _Place, effort: Effort) -> tuple[LocalMap, LocalMap] | None:
+def _solve_apart(segment: Segment, place: _BreakPlace, effort: SolveBudget) -> tuple[LocalMap, LocalMap] | None:
     """What comes before and what comes after, each on its own; None where one of them cannot be."""
     n = len(segment.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
@@ -287,7 +287,9 @@ def _align(before: LocalMap, after: LocalMap) -> Alignment | None:
     return align(condense(before, shared), condense(after, shared)) if len(shared) > 1 else None
 
 
-def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_behind: FloatArray) -> _Start:
+def _start(
+    graph: Graph, ahead: SolvedPart, behind: SolvedPart, place: _BreakPlace, T_ahead_behind: FloatArray
+) -> _Start:
     """Starting values for the whole with a break in that place."""
     before, after = ahead.poses[: place.end], behind.poses[place.begin - behind.first :]
     between = chain_motions(graph.segments[0].odometry.motion[place.end - 1 : place.begin - 1], before[-1])[1:]
@@ -297,7 +299,7 @@ def _start(graph: Graph, ahead: Grown, behind: Grown, place: _Place, T_ahead_beh
 
 
 def _test_break(
-    local_map: LocalMap, place: _Place, start: State, equal: Sequence[_Place], effort: Effort
+    local_map: LocalMap, place: _BreakPlace, start: State, equal: Sequence[_BreakPlace], effort: SolveBudget
 ) -> Break | None:
     """The break, if two tags agree on it and it pays to believe in it."""
     segment, problem = local_map.segment, local_map.graph.problem
@@ -306,9 +308,9 @@ def _test_break(
     if parts is None or alignment is None or not alignment.is_sure:
         return None
     freed = _without_motions(problem, *place)
-    apart = solve(freed, start, most_tries=effort.tries(freed, 1.0))
+    apart = solve(freed, start, most_tries=effort.max_linearisations(freed, 1.0))
     effort.spend(apart)
-    together = solve(problem, apart.state, most_tries=effort.tries(problem, 1.0))
+    together = solve(problem, apart.state, most_tries=effort.max_linearisations(problem, 1.0))
     effort.spend(together)
     joined = min(local_map.solution.cost, together.cost)
     factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
@@ -353,8 +355,8 @@ def _rename_segments(maps: Sequence[LocalMap]) -> list[LocalMap]:
 def _not_searched(segment: Segment) -> str:
     return (
         f"{segment.name}: its readings do not fit together, and where its wheels may have lost the way was not "
-        "searched to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, map "
-        "what was recorded before and after as runs of their own, or leave out some of the looks"
+        "searched to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, "
+        "map what was recorded before and after as runs of their own, or leave out some of the looks"
     )
 
 

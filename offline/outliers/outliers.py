@@ -18,7 +18,7 @@ from groundsbot.offline.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import (
     Evidence,
-    Heard,
+    LinearisedObservations,
     find_contradictions,
     linearise_observations,
     marginalise,
@@ -30,14 +30,14 @@ from groundsbot.offline.outliers.kinds import SHARE_ASTRAY_WITHIN_SIGHT, cases, 
 from groundsbot.offline.outliers.places import Places, minimise_places
 from groundsbot.offline.outliers.search import FALSE_ALARM, cost_bound, excess, freedom_of_places, search
 from groundsbot.offline.outliers.sightings import (
-    Sightings,
+    Tracks,
     instances,
     letters,
     places_told_apart,
-    sightings_of,
+    tracks_of,
     with_instances,
 )
-from groundsbot.offline.sam import Graph, Measured, Solution, build_graph, solve
+from groundsbot.offline.sam import Graph, Priors, Solution, build_graph, solve
 
 # Each search is linearised where the last one led; two do where a move is far beyond its sigma.
 _MOST_SEARCHES: Final = 5
@@ -50,7 +50,7 @@ _MOST_JOINS: Final = 12
 
 
 @dataclass(frozen=True)
-class Searched:
+class OutlierSearch:
     """A solve whose tags are where its readings say, split where need be.
 
     Attributes:
@@ -62,7 +62,7 @@ class Searched:
 
     graph: Graph
     solution: Solution
-    sightings: Sightings
+    tracks: Tracks
     place: IntArray
     evidence: Evidence
     places: Places
@@ -70,7 +70,7 @@ class Searched:
     @property
     def tags(self) -> list[TagKey]:
         """The tag of each sighting (S,)."""
-        of = zip(self.sightings.segment, self.sightings.tag, strict=True)
+        of = zip(self.tracks.segment, self.tracks.tag, strict=True)
         return [self.graph.segments[c].tags[t] for c, t in of]
 
     @property
@@ -102,7 +102,7 @@ class RunsAlone:
         Where wheels did not tell how the robot moved, most tags seem to have been moved.
         """
         after = self.split(before)
-        sightings = sightings_of([before.segment])
+        sightings = tracks_of([before.segment])
         n_again = int((np.bincount(sightings.id) > 1).sum())
         n_split = len({tag.whole for tag in after.segment.tags if tag.instance})
         return after if after.goodness.fits and 2 * n_split < max(n_again, _FEW_AGAIN) else before
@@ -118,7 +118,7 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     found = local_map
     if not found.goodness.fits:
         factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
-        sightings = _sightings(found.graph, linearise_observations(found.graph, found.solution.state, factors))
+        sightings = _tracks(found.graph, linearise_observations(found.graph, found.solution.state, factors))
         if len(sightings) > len(sightings.ids):
             found = _in_few_places(_relabel(found, sightings, np.arange(len(sightings))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
@@ -129,7 +129,7 @@ def join_places(local_map: LocalMap) -> LocalMap:
     """With one place for each id again."""
     if not any(tag.instance for tag in local_map.segment.tags):
         return local_map
-    sightings = sightings_of([local_map.segment])
+    sightings = tracks_of([local_map.segment])
     ids = [sightings.ids[i] for i in sightings.id]
     return solve_local_map(with_instances([local_map.segment], sightings, ids)[0])
 
@@ -145,7 +145,7 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
         seen = _collect_tracks(local_map.graph, local_map.solution, scales)
         for place in _joins(seen, tag)[:_MOST_JOINS]:
-            other = _search_alone(_relabel(local_map, seen.sightings, place), scales, false_alarm)
+            other = _search_alone(_relabel(local_map, seen.tracks, place), scales, false_alarm)
             if other.goodness.fits >= found.goodness.fits and _n_places(other, tag) < _n_places(found, tag):
                 found = other
             if _n_places(found, tag) < _MANY_PLACES:
@@ -153,13 +153,13 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     return found
 
 
-def _joins(seen: Searched, tag: TagKey) -> list[IntArray]:
+def _joins(seen: OutlierSearch, tag: TagKey) -> list[IntArray]:
     """(S,) each: the places with two of an id joined, the surest first.
 
     However far apart they are: what turns by an angle moves on an arc, and a linearisation knows of no arcs.
     """
     which, places = seen.evidence.which, seen.places
-    own = np.array([seen.sightings.ids[i] == tag for i in seen.sightings.id[which]], dtype=np.bool_)
+    own = np.array([seen.tracks.ids[i] == tag for i in seen.tracks.id[which]], dtype=np.bool_)
     found = []
     for p, q in combinations(np.unique(places.place[own]).tolist(), 2):
         off, covariance = places.apart(seen.evidence, p, q)
@@ -181,11 +181,11 @@ def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -
         wanted = _best_places(seen, false_alarm)
         if wanted is None or _same(wanted, seen.place):
             break
-        found = _relabel(found, seen.sightings, wanted)
+        found = _relabel(found, seen.tracks, wanted)
     return found
 
 
-def _relabel(local_map: LocalMap, sightings: Sightings, place: IntArray) -> LocalMap:
+def _relabel(local_map: LocalMap, sightings: Tracks, place: IntArray) -> LocalMap:
     """The segment solved anew with these places, whose names no other run has."""
     tag_of = instances(sightings, place, f"{local_map.segment.name} ")
     return solve_local_map(with_instances([local_map.segment], sightings, tag_of)[0])
@@ -211,7 +211,7 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
     return [rename_tags(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
 
 
-def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
+def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
     """Splits and joins the tags of a component until nothing changes.
 
     What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault. None
@@ -232,7 +232,7 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
     return _split(graph, solution, maps)
 
 
-def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Searched | None:
+def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
     scales = noise_scales([each.goodness for each in maps])
     seen = _collect_tracks(graph, solution, scales)
     noise_is_fitted = any(each.is_noisy for each in maps)
@@ -240,7 +240,7 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Search
         wanted = _best_places(seen, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
         if wanted is None:
             return None
-        if instances(seen.sightings, wanted) == seen.tags:
+        if instances(seen.tracks, wanted) == seen.tags:
             break
         seen = _collect_tracks(*_solve_again(seen, wanted), scales)
     if noise_is_fitted:
@@ -250,14 +250,14 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Search
     return seen
 
 
-def _join_near_places(seen: Searched) -> IntArray:
+def _join_near_places(seen: OutlierSearch) -> IntArray:
     """(S,) the places; one for an id of near places that were never seen at once, each sighted more than now and then.
 
     Where noise was fitted, that is an error of the drives.
     """
     found = seen.place.copy()
-    for case in cases(seen.sightings, seen.evidence, seen.places):
-        if is_within_sight(case, seen.sightings, seen.evidence, seen.places, seen.picture) and not minority(
+    for case in cases(seen.tracks, seen.evidence, seen.places):
+        if is_within_sight(case, seen.tracks, seen.evidence, seen.places, seen.picture) and not minority(
             case, SHARE_ASTRAY_WITHIN_SIGHT
         ):
             which = seen.evidence.which[np.isin(seen.places.place, [each.label for each in case.stands])]
@@ -265,22 +265,22 @@ def _join_near_places(seen: Searched) -> IntArray:
     return found
 
 
-def _sightings(graph: Graph, at: Heard) -> Sightings:
+def _tracks(graph: Graph, at: LinearisedObservations) -> Tracks:
     """Cut also where a tag moved in sight."""
-    whole = sightings_of(graph.segments)
+    whole = tracks_of(graph.segments)
     cut = find_contradictions(at, whole)
-    return few_of_each_tag(graph, sightings_of(graph.segments, cut) if cut.any() else whole)
+    return few_of_each_tag(graph, tracks_of(graph.segments, cut) if cut.any() else whole)
 
 
-def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> Searched:
+def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> OutlierSearch:
     at = linearise_observations(graph, solution.state, scales)
-    sightings = _sightings(graph, at)
+    sightings = _tracks(graph, at)
     place = places_told_apart(graph.segments, sightings)
     evidence = marginalise(at, sightings)
-    return Searched(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
+    return OutlierSearch(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
 
 
-def _best_places(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
+def _best_places(seen: OutlierSearch, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
     """(S,) the places that the evidence asks for.
 
     None where most ids ask for several though the noise was fitted to the same passes: then it is not the tags.
@@ -289,9 +289,9 @@ def _best_places(seen: Searched, false_alarm: float, *, noise_is_fitted: bool = 
     found = seen.place.copy()
     if len(which):
         freedom = freedom_of_places(seen.places) if noise_is_fitted else np.inf
-        least_gain = excess(seen.places) * cost_bound(seen.sightings, seen.evidence, false_alarm, freedom)
-        most_ids = max(int((np.bincount(seen.sightings.id) > 1).sum()), _FEW_AGAIN) // 2
-        label = search(seen.evidence, seen.sightings, seen.places, least_gain, most_ids if noise_is_fitted else None)
+        least_gain = excess(seen.places) * cost_bound(seen.tracks, seen.evidence, false_alarm, freedom)
+        most_ids = max(int((np.bincount(seen.tracks.id) > 1).sum()), _FEW_AGAIN) // 2
+        label = search(seen.evidence, seen.tracks, seen.places, least_gain, most_ids if noise_is_fitted else None)
         if label is None:
             return None
         found[which] = seen.place.max() + 1 + label
@@ -304,25 +304,25 @@ def _same(place: IntArray, other: IntArray) -> bool:
     return pairs == len(np.unique(place)) == len(np.unique(other))
 
 
-def _solve_again(seen: Searched, place: IntArray) -> tuple[Graph, Solution]:
+def _solve_again(seen: OutlierSearch, place: IntArray) -> tuple[Graph, Solution]:
     """The same segments with these places, from the poses as they are."""
     graph, state = seen.graph, seen.solution.state
-    again = build_graph(with_instances(graph.segments, seen.sightings, instances(seen.sightings, place)))
+    again = build_graph(with_instances(graph.segments, seen.tracks, instances(seen.tracks, place)))
     again = replace(again, problem=replace(again.problem, measured=_rename_ends(graph, again)))
     start = again.start(state.poses, _unchanged_places(graph, again, state.tags), graph.calibration_of(state))
     return again, solve(again.problem, start)
 
 
-def _loosen_priors(measured: Measured) -> Measured:
+def _loosen_priors(measured: Priors) -> Priors:
     """With sigmas so wide that it contradicts nothing."""
     starts, distances = measured.starts, measured.distances
-    return Measured(
+    return Priors(
         replace(starts, whitening=starts.whitening / _LOOSER),
         replace(distances, sigma_m=distances.sigma_m * _LOOSER),
     )
 
 
-def _rename_ends(before: Graph, after: Graph) -> Measured:
+def _rename_ends(before: Graph, after: Graph) -> Priors:
     """What was measured, now to the first instance of each tag."""
     first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
     return to_other_tags(before.problem.measured, np.array([first[tag.whole] for tag in before.tags], dtype=np.int64))

@@ -10,7 +10,7 @@ from scipy import linalg
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
-from groundsbot.offline.outliers.joint_information import Gathered, Information, rows_of
+from groundsbot.offline.outliers.joint_information import Information, PlaceInformation, rows_of
 
 # A place is somewhere within a kilometre: ties down what no reading does.
 NOWHERE: Final = 1e-6
@@ -28,7 +28,7 @@ class Stiffness:
     """
 
     information: Information
-    gathered: Gathered
+    gathered: PlaceInformation
     covariance: FloatArray
 
     def among_each(self, parts: Sequence[IntArray]) -> Iterator[FloatArray]:
@@ -54,7 +54,7 @@ class Stiffness:
         return self.information.times(moved - way[self.gathered.column])
 
 
-class Held(NamedTuple):
+class TracksOfPlace(NamedTuple):
     """The sightings of one place.
 
     Attributes:
@@ -66,16 +66,16 @@ class Held(NamedTuple):
     stiffness: FloatArray
     pull: FloatArray
 
-    def of(self, which: BoolArray) -> "Held":
+    def of(self, which: BoolArray) -> "TracksOfPlace":
         """Some of them (m,)."""
         rows = np.repeat(which, 2)
-        return Held(self.members[which], self.stiffness[np.ix_(rows, rows)], self.pull[which])
+        return TracksOfPlace(self.members[which], self.stiffness[np.ix_(rows, rows)], self.pull[which])
 
-    def release(self, against: FloatArray, inner: FloatArray, own: FloatArray) -> "Held":
+    def release(self, against: FloatArray, inner: FloatArray, own: FloatArray) -> "TracksOfPlace":
         """Once what felt `against` (2 K, 2) of all with `inner` (2, 2) has followed its pull (2,)."""
         felt = against[rows_of(self.members)]
         way = np.linalg.solve(inner, felt.T)
-        return Held(self.members, self.stiffness - felt @ way, self.pull - (own @ way).reshape(-1, 2))
+        return TracksOfPlace(self.members, self.stiffness - felt @ way, self.pull - (own @ way).reshape(-1, 2))
 
     def gains(self, masks: FloatArray) -> FloatArray:
         """(n,) what it brings to give some of them (n, m) another place, each choice by itself; in squared sigmas."""
@@ -103,12 +103,12 @@ class Places:
     stiffness: Stiffness
 
     @cached_property
-    def tracks(self) -> list["Held"]:
+    def tracks(self) -> list["TracksOfPlace"]:
         """Of each place its sightings."""
         order = np.argsort(self.place, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.place))[:-1]) if len(order) else []
         return [
-            Held(each, among, self.pull[each])
+            TracksOfPlace(each, among, self.pull[each])
             for each, among in zip(parts, self.stiffness.among_each(parts), strict=True)
         ]
 

@@ -14,39 +14,39 @@ from groundsbot.offline.outliers.kinds import (
     MOVING,
     PHANTOM,
     SWAPPED,
-    Case,
+    SeveralPlaces,
     cases,
     shift,
     swapped_pairs,
     wrong_runs,
 )
-from groundsbot.offline.outliers.outliers import Searched
+from groundsbot.offline.outliers.outliers import OutlierSearch
 from groundsbot.offline.outliers.search import FALSE_ALARM
 
 _MOST_NAMED: Final = 4
 
 
-def suspect_tags(searched: Searched) -> list[SuspectTag]:
+def outlier_report(searched: OutlierSearch) -> list[SuspectTag]:
     """All suspects of a component, in order of their ids."""
     return _Report(searched).suspects()
 
 
 class _Report:
-    def __init__(self, searched: Searched) -> None:
+    def __init__(self, searched: OutlierSearch) -> None:
         self._searched = searched
         self._names = [segment.name for segment in searched.graph.segments]
-        self._cases = cases(searched.sightings, searched.evidence, searched.places)
-        self._views: Views = views_of(searched.graph, searched.solution.state, searched.sightings)
-        self._chances: FloatArray = chances(searched.sightings, searched.place, self._views)
+        self._cases = cases(searched.tracks, searched.evidence, searched.places)
+        self._views: Views = views_of(searched.graph, searched.solution.state, searched.tracks)
+        self._chances: FloatArray = chances(searched.tracks, searched.place, self._views)
 
     def suspects(self) -> list[SuspectTag]:
         """Each case once; then ids that nothing supports."""
         found: dict[int, SuspectTag] = {}
         for i, j in swapped_pairs(self._cases, self._searched.evidence, self._searched.places):
             found[i], found[j] = self._swap(i, j), self._swap(j, i)
-        wrong = wrong_runs(self._cases, self._searched.sightings)
+        wrong = wrong_runs(self._cases, self._searched.tracks)
         for i, case in enumerate(self._cases):
-            if i not in found and (stand := self._phantom_stand(case)) is not None:
+            if i not in found and (stand := self._false_detection_place(case)) is not None:
                 found[i] = self._false_detection(case, stand)
         for run, which in wrong.items():
             left = [i for i in which if i not in found]
@@ -57,21 +57,21 @@ class _Report:
                 found[i] = self._displacement(case)
         return sorted([*found.values(), *self._unsupported_tags()], key=lambda each: (each.family, each.tag_id))
 
-    def _displacement(self, case: Case) -> SuspectTag:
+    def _displacement(self, case: SeveralPlaces) -> SuspectTag:
         kind = case.kind()
         apart_m, sigmas = self._shift(case)
         if kind == MOVED:
             elsewhere = [c for c in case.seen if c not in case.stands[0].segments]
             words = f"by {_metres(apart_m)} ({sigmas:.0f} sigma) between runs: {self._where(case)}"
-            return self._suspect(case, kind, elsewhere, words)
+            return self._outlier(case, kind, elsewhere, words)
         if kind == MOVING:
             during = [c for c, way in case.seen.items() if len(way) > 1]
             words = (
                 f"by {_metres(apart_m)} ({sigmas:.0f} sigma) during {self._list_segments(during)}: {self._where(case)}"
             )
-            return self._suspect(case, kind, during, words)
+            return self._outlier(case, kind, during, words)
         words = f"two tags with one id, {_metres(apart_m)} ({sigmas:.0f} sigma) apart: {self._where(case)}"
-        return self._suspect(case, kind, list(case.seen), words)
+        return self._outlier(case, kind, list(case.seen), words)
 
     def _swap(self, i: int, j: int) -> SuspectTag:
         case, other = self._cases[i], self._cases[j]
@@ -81,17 +81,17 @@ class _Report:
             f"with tag {other.tag.tag_id}: each hangs where the other was, {_metres(apart_m)} ({sigmas:.0f} sigma) "
             f"away: {self._where(case)}"
         )
-        return self._suspect(case, SWAPPED, [c for c in case.seen if c not in first], words, other.tag.tag_id)
+        return self._outlier(case, SWAPPED, [c for c in case.seen if c not in first], words, other.tag.tag_id)
 
-    def _inconsistent(self, case: Case, run: int, n_wrong: int) -> SuspectTag:
+    def _inconsistent(self, case: SeveralPlaces, run: int, n_wrong: int) -> SuspectTag:
         apart_m, sigmas = self._shift(case)
         words = (
             f"{self._names[run]} has this tag and {n_wrong - 1} more, most of those it shares, elsewhere than all "
             f"others have them, this one by {_metres(apart_m)} ({sigmas:.0f} sigma): {self._where(case)}"
         )
-        return self._suspect(case, INCONSISTENT, [run], words)
+        return self._outlier(case, INCONSISTENT, [run], words)
 
-    def _phantom_stand(self, case: Case) -> int | None:
+    def _false_detection_place(self, case: SeveralPlaces) -> int | None:
         """A place that only false detections speak for."""
         searched = self._searched
         for k, stand in enumerate(case.stands):
@@ -105,7 +105,7 @@ class _Report:
                 return k
         return None
 
-    def _false_detection(self, case: Case, k: int) -> SuspectTag:
+    def _false_detection(self, case: SeveralPlaces, k: int) -> SuspectTag:
         stand = case.stands[k]
         nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
         rest = sum(each.n_readings for each in case.stands) - stand.n_readings
@@ -113,12 +113,12 @@ class _Report:
             f"{plural(stand.n_readings, 'reading')} in {self._list_segments(stand.segments)} {_metres(nearest[0])} "
             f"({nearest[1]:.0f} sigma) from where {plural(rest, 'other')} have it: a false detection"
         )
-        return self._suspect(case, PHANTOM, list(stand.segments), words)
+        return self._outlier(case, PHANTOM, list(stand.segments), words)
 
     def _unsupported_tags(self) -> list[SuspectTag]:
         """Ids read once or a few times from where they should have been read more often."""
         searched = self._searched
-        sightings = searched.sightings
+        sightings = searched.tracks
         alone = np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] == 1
         asked = alone & (self._chances < 1.0)
         found = []
@@ -133,16 +133,16 @@ class _Report:
             found.append(SuspectTag(tag.family, tag.tag_id, PHANTOM, (run,), words))
         return found
 
-    def _suspect(
-        self, case: Case, kind: str, runs: Sequence[int], words: str, swapped_with: int | None = None
+    def _outlier(
+        self, case: SeveralPlaces, kind: str, runs: Sequence[int], words: str, swapped_with: int | None = None
     ) -> SuspectTag:
         names = tuple(self._names[c] for c in sorted(runs))
         return SuspectTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with)
 
-    def _shift(self, case: Case, first: int = 0, second: int = 1) -> tuple[float, float]:
+    def _shift(self, case: SeveralPlaces, first: int = 0, second: int = 1) -> tuple[float, float]:
         return shift(case, self._searched.evidence, self._searched.places, first, second)
 
-    def _where(self, case: Case) -> str:
+    def _where(self, case: SeveralPlaces) -> str:
         """Who saw it at which instance."""
         told = [
             f"in {self._list_segments(stand.segments)} ({plural(stand.n_readings, 'reading')})"

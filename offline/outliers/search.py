@@ -18,7 +18,7 @@ from scipy.special import chdtri
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.places import NOWHERE, Places, minimise_places
-from groundsbot.offline.outliers.sightings import Sightings
+from groundsbot.offline.outliers.sightings import Tracks
 
 # One map in a hundred names a tag that is where it was.
 FALSE_ALARM: Final = 0.01
@@ -30,7 +30,7 @@ _MANY: Final = 5
 
 
 def cost_bound(
-    sightings: Sightings, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf
+    sightings: Tracks, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf
 ) -> float:
     """By how many squared sigmas a split must lower the cost, all that could be looked at counted.
 
@@ -66,7 +66,7 @@ def excess(places: Places) -> float:
 
 
 def search(
-    evidence: Evidence, sightings: Sightings, begin: Places, least_gain: float, most_ids: int | None = None
+    evidence: Evidence, sightings: Tracks, begin: Places, least_gain: float, most_ids: int | None = None
 ) -> IntArray | None:
     """(K,) the places that the evidence asks for; None where more ids than are plausible ask for several.
 
@@ -113,7 +113,7 @@ def search(
     return _simplest(evidence, sightings, found, least_gain)
 
 
-def _undo_chance_splits(evidence: Evidence, sightings: Sightings, found: Places, least_gain: float) -> IntArray:
+def _undo_chance_splits(evidence: Evidence, sightings: Tracks, found: Places, least_gain: float) -> IntArray:
     """Without the splits that chance explains, the least of them first."""
     own = sightings.id[evidence.which]
     while True:
@@ -134,7 +134,7 @@ def _undo_chance_splits(evidence: Evidence, sightings: Sightings, found: Places,
         found = minimise_places(evidence, np.where(labels == pair[1], pair[0], labels))
 
 
-def _simplest(evidence: Evidence, sightings: Sightings, labels: IntArray, least_gain: float) -> IntArray:
+def _simplest(evidence: Evidence, sightings: Tracks, labels: IntArray, least_gain: float) -> IntArray:
     """With one move instead of there and back, where chance explains what that costs more.
 
     A tag that was moved by little, one of whose sightings errs towards its first place, looks like two tags.
@@ -170,7 +170,7 @@ def _by_label(label: IntArray, values: IntArray) -> list[IntArray]:
     return np.split(values[order], np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
 
 
-def _masks(sightings: Sightings, own: IntArray) -> FloatArray:
+def _masks(sightings: Tracks, own: IntArray) -> FloatArray:
     """(n, m) a one for each of the sightings (m,) of a place that might have another."""
     order = np.argsort(sightings.rank[own])
     splits = _splits_of(sightings, own[order])
@@ -179,12 +179,12 @@ def _masks(sightings: Sightings, own: IntArray) -> FloatArray:
     return masks
 
 
-def _in_time(sightings: Sightings, which: IntArray, members: IntArray) -> IntArray:
+def _in_time(sightings: Tracks, which: IntArray, members: IntArray) -> IntArray:
     """Members of the evidence in order of time."""
     return members[np.argsort(sightings.rank[which[members]])]
 
 
-def _splits_of(sightings: Sightings, members: IntArray) -> BoolArray:
+def _splits_of(sightings: Tracks, members: IntArray) -> BoolArray:
     """(n, m) which of the sightings (m,) of one place, in order of time, may have another."""
     _, segment = np.unique(sightings.segment[members], return_inverse=True)
     return _splits(tuple(segment.tolist()))

@@ -20,7 +20,7 @@ _INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Tracks:
     """S sightings of the tags of some segments, in order of id, segment and time.
 
     Attributes:
@@ -86,7 +86,7 @@ class Sightings:
         return any(len(set(way)) < len(way) for way in changes)
 
 
-def sightings_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Sightings:
+def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Tracks:
     """Cuts the readings of segments into sightings; instances of one id that a segment tells apart stay apart.
 
     Args:
@@ -112,7 +112,7 @@ def sightings_of(segments: Sequence[Segment], begins: BoolArray | None = None) -
     rank[order] = np.arange(len(order))
     own, segment_of, tag, first_ns, last_ns, count = table[order].T
     sighting_of = rank[np.concatenate(of_reading)]
-    return Sightings(ids, sighting_of, sighting_of, own, segment_of, first_ns, last_ns, count, tag)
+    return Tracks(ids, sighting_of, sighting_of, own, segment_of, first_ns, last_ns, count, tag)
 
 
 def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
@@ -127,14 +127,14 @@ def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
     return np.column_stack(rows).reshape(-1, 4), of_reading
 
 
-def places_told_apart(segments: Sequence[Segment], sightings: Sightings) -> IntArray:
+def places_told_apart(segments: Sequence[Segment], sightings: Tracks) -> IntArray:
     """(S,) equal for sightings of what the segments take for one tag."""
     keys = [(*segments[c].tags[t],) for c, t in zip(sightings.segment, sightings.tag, strict=True)]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     return np.array([number[key] for key in keys], dtype=np.int64)
 
 
-def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[TagKey]:
+def instances(sightings: Tracks, place: IntArray, only_in: str = "") -> list[TagKey]:
     """The tag of each sighting: the id alone where it has one place, else a, b, ... in order of time.
 
     Args:
@@ -155,7 +155,7 @@ def instances(sightings: Sightings, place: IntArray, only_in: str = "") -> list[
     ]
 
 
-def with_instances(segments: Sequence[Segment], sightings: Sightings, tag_of: Sequence[TagKey]) -> list[Segment]:
+def with_instances(segments: Sequence[Segment], sightings: Tracks, tag_of: Sequence[TagKey]) -> list[Segment]:
     """The same segments with readings of the tags that each sighting (S,) is of."""
     relabelled = []
     first = 0

@@ -7,7 +7,7 @@ _MOST_ROWS: Final = 1000
 UNKNOWN: Final = "\N{EN DASH}"
 
 
-class Table(NamedTuple):
+class ReportTable(NamedTuple):
     """A table and what it is about; `more` rows were left out."""
 
     key: str  # names it in the page
@@ -18,10 +18,10 @@ class Table(NamedTuple):
     more: int = 0
 
 
-def table_of(key: str, title: str, note: str, columns: Iterable[str], rows: Sequence[Sequence[str]]) -> Table:
+def table_of(key: str, title: str, note: str, columns: Iterable[str], rows: Sequence[Sequence[str]]) -> ReportTable:
     """A table of the first rows, as many as a page takes; how many it leaves out it says itself."""
     kept = tuple(tuple(row) for row in rows[:_MOST_ROWS])
-    return Table(key, title, note, tuple(columns), kept, len(rows) - len(kept))
+    return ReportTable(key, title, note, tuple(columns), kept, len(rows) - len(kept))
 
 
 def number(value: float | None, digits: int) -> str:

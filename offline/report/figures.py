@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.mapping import Solved, Workings
+from groundsbot.offline.mapping import Diagnostics, SolvedGroup
 from groundsbot.offline.report.picture import RUN_COLOURS
 from groundsbot.offline.report.sentences import advice_sentence, has_several_families, tag_label, would_help
 from groundsbot.offline.report.timeline import events_of, timeline
@@ -22,7 +22,7 @@ _MOST_TIMELINES: Final = 24
 _DECIMALS: Final = 3  # millimetres
 
 
-def figures(document: dict[str, Any], workings: Workings) -> dict[str, Any]:
+def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
     """Data of all figures, ready for JSON.
 
     Args:
@@ -67,18 +67,18 @@ def run_colours(document: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def residual_sigmas(solved: Solved) -> FloatArray:
+def residual_sigmas(solved: SolvedGroup) -> FloatArray:
     """(M,) what each reading leaves over: root mean square of its two whitened coordinates."""
     residual = solved.graph.problem.readings.residual(solved.solution.state)
     return np.asarray(np.sqrt((residual**2).mean(axis=1)))
 
 
-def segment_of_reading(solved: Solved) -> IntArray:
+def segment_of_reading(solved: SolvedGroup) -> IntArray:
     """(M,) index of the segment that each reading belongs to."""
     return np.searchsorted(solved.graph.first_pose, solved.graph.problem.readings.pose, side="right") - 1
 
 
-def tag_readings(solved: Solved) -> list[list[dict[str, Any]]]:
+def tag_readings(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
     """For each tag of a component, a record for each segment that read it: how often, and what that leaves over."""
     n_segments, n_tags = len(solved.graph.segments), len(solved.graph.tags)
     sigmas = residual_sigmas(solved)
@@ -102,7 +102,7 @@ def tag_readings(solved: Solved) -> list[list[dict[str, Any]]]:
 
 
 def _component(
-    document: dict[str, Any], index: int, solved: Solved, workings: Workings, colours: dict[str, str]
+    document: dict[str, Any], index: int, solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str]
 ) -> dict[str, Any]:
     runs = [run for run in document["runs"] if run["component"] == index]
     tags = [tag for tag in document["tags"] if tag["component"] == index]
@@ -146,7 +146,7 @@ def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_fam
 
 
 def _before(
-    solved: Solved, workings: Workings, colours: dict[str, str], *, several_families: bool
+    solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str], *, several_families: bool
 ) -> list[dict[str, Any]]:
     """Each local map laid where the alignments put it, with its own tags."""
     layers = []

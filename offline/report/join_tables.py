@@ -5,14 +5,14 @@ from itertools import combinations
 from math import degrees
 from typing import Any, Final
 
-from groundsbot.offline.report.cells import Table, number, table_of
+from groundsbot.offline.report.cells import ReportTable, number, table_of
 from groundsbot.offline.report.sentences import has_several_families, largest_sigma_m, linking_tags, tag_label
 
 # Fewer shared tags tell no transform.
 _LEAST_SHARED: Final = 2
 
 
-def alignments(document: dict[str, Any]) -> Table:
+def alignments(document: dict[str, Any]) -> ReportTable:
     """Pairs of runs."""
     rows = []
     for each in document["alignments"]:
@@ -43,7 +43,7 @@ def _sureness(alignment: dict[str, Any]) -> str:
     return f"weak: one tag; to {x_m:.2f} m, {y_m:.2f} m, {degrees(theta_rad):.2f} deg"
 
 
-def holding(document: dict[str, Any]) -> Table:
+def holding(document: dict[str, Any]) -> ReportTable:
     """Tags that several runs read."""
     several = has_several_families(document)
     rows = []
@@ -70,12 +70,12 @@ def essential_tags(document: dict[str, Any], component: int) -> list[dict[str, A
     """Linking tags without any one of which the runs would fall apart, were runs joined by two shared tags each."""
     links = linking_tags(document, component)
     names = document["components"][component]["runs"]
-    if not _hang_together(names, links):
+    if not _are_joined(names, links):
         return []
-    return [tag for tag in links if not _hang_together(names, [other for other in links if other is not tag])]
+    return [tag for tag in links if not _are_joined(names, [other for other in links if other is not tag])]
 
 
-def _hang_together(names: Sequence[str], links: Sequence[dict[str, Any]]) -> bool:
+def _are_joined(names: Sequence[str], links: Sequence[dict[str, Any]]) -> bool:
     shared = dict.fromkeys(combinations(names, 2), 0)
     for tag in links:
         runs = set(tag["runs"])
@@ -88,7 +88,7 @@ def _hang_together(names: Sequence[str], links: Sequence[dict[str, Any]]) -> boo
     return len(reached) == len(names)
 
 
-def start_to_start(document: dict[str, Any]) -> Table:
+def start_to_start(document: dict[str, Any]) -> ReportTable:
     """From each run's start to each other's."""
     rows = [
         (each["a"], each["b"], number(each["distance_m"], 3), number(each["sigma_m"], 3))

@@ -11,7 +11,7 @@ from string import Template
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from groundsbot.offline.report.cells import Table
+from groundsbot.offline.report.cells import ReportTable
 
 _ASSETS: Final = "groundsbot.offline.report.assets"
 # Longer tables are folded away.
@@ -22,7 +22,11 @@ _BELOW: Final = ("runs", "tags", "noise")
 
 
 def page(
-    title: str, sentences: Sequence[str], warnings: Sequence[str], tables: Sequence[Table], figures: dict[str, Any]
+    title: str,
+    sentences: Sequence[str],
+    warnings: Sequence[str],
+    tables: Sequence[ReportTable],
+    figures: dict[str, Any],
 ) -> str:
     """The whole page as text."""
     from plotly.offline import get_plotlyjs
@@ -126,13 +130,13 @@ def _add_timelines(main: Element, timelines: Sequence[dict[str, Any]], n_timelin
         _note(section, f"The first {len(timelines)} of {n_timelines}.")
 
 
-def _add_tables(main: Element, tables: dict[str, Table], keys: Sequence[str]) -> None:
+def _add_tables(main: Element, tables: dict[str, ReportTable], keys: Sequence[str]) -> None:
     for key in keys:
         if key in tables:
             _add_table(main, tables[key])
 
 
-def _add_table(main: Element, table: Table) -> None:
+def _add_table(main: Element, table: ReportTable) -> None:
     section = _section(main, table.key, table.title, table.note)
     holder = section
     if len(table.rows) > _MOST_ROWS_SHOWN:

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from groundsbot.offline.report.cells import Table, number, numbers, table_of
+from groundsbot.offline.report.cells import ReportTable, number, numbers, table_of
 from groundsbot.offline.report.sentences import check_contradicts
 
 
-def checks(document: dict[str, Any]) -> Table:
+def checks(document: dict[str, Any]) -> ReportTable:
     """Wheels and tags."""
     names = {"scale": "length of a metre", "turn": "a full turn"}
     rows = [
@@ -37,7 +37,7 @@ def checks(document: dict[str, Any]) -> Table:
     )
 
 
-def metres(document: dict[str, Any]) -> Table:
+def scale_table(document: dict[str, Any]) -> ReportTable:
     """Components, and what each one's metre comes from."""
     kinds = ("wheels", "track", "tags", "mount", "distances", "starts")
     rows = [
@@ -53,7 +53,7 @@ def metres(document: dict[str, Any]) -> Table:
     return table_of("metres", "What holds the length of a metre", note, columns, rows)
 
 
-def measurements(document: dict[str, Any]) -> Table:
+def measurements(document: dict[str, Any]) -> ReportTable:
     """What somebody measured."""
     rows = [
         (
@@ -73,7 +73,7 @@ def measurements(document: dict[str, Any]) -> Table:
     return table_of("measurements", "Measured by hand", note, columns, rows)
 
 
-def noise(document: dict[str, Any]) -> Table:
+def noise(document: dict[str, Any]) -> ReportTable:
     """Sigmas of wheels and readings."""
     fit = document.get("noise_fit")
     fitted = {each["name"]: each for each in (fit["parameters"] if fit else [])}
@@ -100,7 +100,7 @@ def noise(document: dict[str, Any]) -> Table:
     )
 
 
-def robots(document: dict[str, Any]) -> Table:
+def robots(document: dict[str, Any]) -> ReportTable:
     """What the drives say of robots' files."""
     rows = [
         (

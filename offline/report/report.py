@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from groundsbot.calib.foundation import atomic_write, plural
-from groundsbot.offline.mapping import Workings
+from groundsbot.offline.mapping import Diagnostics
 from groundsbot.offline.maps import MapResult, map_as_json
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.page import page
@@ -11,7 +11,7 @@ from groundsbot.offline.report.sentences import sentences
 from groundsbot.offline.report.tables import tables
 
 
-def write_report(result: MapResult, workings: Workings, path: Path) -> None:
+def write_report(result: MapResult, workings: Diagnostics, path: Path) -> None:
     """Writes the report of a map.
 
     Args:

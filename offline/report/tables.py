@@ -3,23 +3,23 @@
 from math import degrees
 from typing import Any
 
-from groundsbot.offline.report.cells import Table, number, table_of
+from groundsbot.offline.report.cells import ReportTable, number, table_of
 from groundsbot.offline.report.join_tables import alignments, holding, start_to_start
-from groundsbot.offline.report.parameter_tables import checks, measurements, metres, noise, robots
+from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
 from groundsbot.offline.report.sentences import advice_sentence, has_several_families, largest_sigma_m
 
 
-def tables(document: dict[str, Any]) -> list[Table]:
+def tables(document: dict[str, Any]) -> list[ReportTable]:
     """Those that hold something."""
     made = [
-        _suspects(document),
+        _outliers(document),
         _advice(document),
         alignments(document),
         holding(document),
         start_to_start(document),
         robots(document),
         checks(document),
-        metres(document),
+        scale_table(document),
         measurements(document),
         _runs(document),
         _tags(document),
@@ -28,7 +28,7 @@ def tables(document: dict[str, Any]) -> list[Table]:
     return [table for table in made if table.rows]
 
 
-def _suspects(document: dict[str, Any]) -> Table:
+def _outliers(document: dict[str, Any]) -> ReportTable:
     rows = [
         (str(each["tag_id"]), each["family"], each["kind"], ", ".join(each["runs"]), each["evidence"])
         for each in document["suspect_tags"]
@@ -37,7 +37,7 @@ def _suspects(document: dict[str, Any]) -> Table:
     return table_of("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows)
 
 
-def _advice(document: dict[str, Any]) -> Table:
+def _advice(document: dict[str, Any]) -> ReportTable:
     several = has_several_families(document)
     rows = [
         (
@@ -53,7 +53,7 @@ def _advice(document: dict[str, Any]) -> Table:
     return table_of("advice", "What to do next", note, columns, rows)
 
 
-def _runs(document: dict[str, Any]) -> Table:
+def _runs(document: dict[str, Any]) -> ReportTable:
     rows = []
     for run in document["runs"]:
         x_m, y_m, theta_rad = run["T_map_start"]
@@ -75,7 +75,7 @@ def _runs(document: dict[str, Any]) -> Table:
     return table_of("runs", "Runs", "", columns, rows)
 
 
-def _tags(document: dict[str, Any]) -> Table:
+def _tags(document: dict[str, Any]) -> ReportTable:
     rows = []
     for tag in document["tags"]:
         covariance = tag["covariance"]

@@ -3,7 +3,7 @@ from .arrowhead.covariance import SquareRoot
 from .arrowhead.dissection import LEVELS
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
-from .budget import Effort, efforts_of
+from .budget import SolveBudget, budgets_of
 from .damping import Damping
 from .factors.odometry_and_readings import (
     CalibrationPrior,
@@ -15,10 +15,10 @@ from .factors.odometry_and_readings import (
     stack,
     whitening,
 )
-from .factors.priors import NOTHING_MEASURED, DistanceFactors, KnownPlaces, Measured, StartFactors, ends_of
+from .factors.priors import NO_PRIORS, DistanceFactors, JointPrior, Priors, StartFactors, ends_of
 from .factors.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .graph import Graph, build_graph, unheld
-from .linearisation.kernels import Odometry, Values, advance, go_along, multiply, series, wrap
+from .linearisation.kernels import OdometryArrays, Values, advance, go_along, multiply, series, wrap
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from .linearisation.readings import N_READING, reading_factor
 from .parameters import (
@@ -50,36 +50,36 @@ __all__ = [
     "LEVELS",
     "MAX_RELATIVE_ERROR",
     "MAX_TRIES",
-    "NOTHING_MEASURED",
     "NO_PARAMETER",
+    "NO_PRIORS",
     "N_READING",
     "PLAIN_SQUARES",
     "CalibrationPrior",
     "Columns",
     "Damping",
     "DistanceFactors",
-    "Effort",
     "Graph",
-    "KnownPlaces",
+    "JointPrior",
     "Linearised",
     "Loss",
     "Losses",
-    "Measured",
-    "Odometry",
+    "OdometryArrays",
     "OdometryFactors",
     "Parameter",
+    "Priors",
     "Problem",
     "ReadingFactors",
     "Solution",
+    "SolveBudget",
     "SquareRoot",
     "StartFactors",
     "State",
     "Tree",
     "Values",
     "advance",
+    "budgets_of",
     "build_graph",
     "compiled_motions",
-    "efforts_of",
     "eliminate_columns",
     "ends_of",
     "error_by_wheels",

@@ -43,7 +43,7 @@ _BYTES_A_PLACE: Final = 5200
 
 
 @dataclass
-class Effort:
+class SolveBudget:
     """What may be spent on a log or on one of its segments, and what is left of it.
 
     Attributes:
@@ -60,33 +60,33 @@ class Effort:
     memory_bytes: float
     promised: float = 0.0
     places: float = np.inf
-    whole: "Effort | None" = None
+    whole: "SolveBudget | None" = None
 
     @staticmethod
-    def of_log(log_bytes: int, inputs: Inputs = ALONE, times: int = 1) -> "Effort":
+    def of_log(log_bytes: int, inputs: Inputs = ALONE, times: int = 1) -> "SolveBudget":
         """What a log of this size is worth beside the others that are mapped with it, each of so many times."""
         free = 1.0 / inputs.n_logs
         size_mib, all_mib = log_bytes / 2**20, max(log_bytes, inputs.n_bytes) / 2**20
         allowed = free * _FREE_WORK + _WORK_AT_A_MIB * size_mib * all_mib
-        return Effort(
+        return SolveBudget(
             allowed / times,
             allowed / times,
             free * _FREE_BYTES + _BYTES_PER_BYTE * log_bytes,
             places=_FREE_PLACES + log_bytes / _BYTES_A_PLACE,
         )
 
-    def split(self, sizes: Sequence[int]) -> list["Effort"]:
+    def split(self, sizes: Sequence[int]) -> list["SolveBudget"]:
         """Of segments, each as much as its share of all their sizes."""
         allowed = [self.allowed * size / max(1, sum(sizes)) for size in sizes]
         return [replace(self, allowed=each, left=each, whole=self) for each in allowed]
 
-    def take(self, share: float) -> "Effort":
+    def take(self, share: float) -> "SolveBudget":
         """A share of what is left, for a part of a segment that was itself found to be affordable."""
         work = share * max(self.left, 0.0)
         self.left -= work
-        return Effort(work, work, self.memory_bytes, promised=-np.inf)
+        return SolveBudget(work, work, self.memory_bytes, promised=-np.inf)
 
-    def give_back(self, taken: "Effort") -> None:
+    def give_back(self, taken: "SolveBudget") -> None:
         """What is left of it, or what it used beyond it."""
         self.left += taken.left
 
@@ -123,7 +123,7 @@ class Effort:
             "this size; are the tags' numbers right? leave out some of the looks"
         )
 
-    def tries(self, problem: Problem, share: float, most: int = MAX_TRIES) -> int:
+    def max_linearisations(self, problem: Problem, share: float, most: int = MAX_TRIES) -> int:
         """How many tries a share of what is allowed is enough for, or what the solves before have left of it."""
         work = min(share * self.allowed, max(self.left, 0.0))
         return max(_LEAST_OF_A_SOLVE, min(most, int(work / step_work(problem))))
@@ -135,13 +135,15 @@ class Effort:
             self.left -= _A_BUILDING * _A_FACTOR * _n_factors(solution.problem)
 
 
-def efforts_of(segments: Sequence[Segment], times: int = 1) -> list[Effort]:
+def budgets_of(segments: Sequence[Segment], times: int = 1) -> list[SolveBudget]:
     """What each segment of some runs is worth of its log, each of the times that a command maps them."""
     of_run: dict[str, list[Segment]] = {}
     for segment in segments:
         of_run.setdefault(segment.run.name, []).append(segment)
     parts = {
-        name: iter(Effort.of_log(some[0].run.log_bytes, some[0].run.inputs, times).split([size_of(c) for c in some]))
+        name: iter(
+            SolveBudget.of_log(some[0].run.log_bytes, some[0].run.inputs, times).split([size_of(c) for c in some])
+        )
         for name, some in of_run.items()
     }
     return [next(parts[segment.run.name]) for segment in segments]

@@ -14,7 +14,7 @@ from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.factors.odometry_and_readings import Columns, OdometryFactors, ReadingFactors, State
-from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors, ends_of
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors, ends_of
 
 # Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.
 _FREE: Final = 1e-12
@@ -22,7 +22,7 @@ _MOVES: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class Untied:
+class UnobservableDirections:
     """What nothing ties down.
 
     Attributes:
@@ -38,8 +38,8 @@ class Untied:
 
 
 def find_unobservable(
-    odometry: OdometryFactors, readings: ReadingFactors, measured: Measured, columns: Columns, state: State
-) -> Untied:
+    odometry: OdometryFactors, readings: ReadingFactors, measured: Priors, columns: Columns, state: State
+) -> UnobservableDirections:
     """Looks for motions of whole segments, and for tags, that change no residual; priors hold all calibration.
 
     Args:
@@ -72,7 +72,9 @@ def find_unobservable(
     unread = np.bincount(readings.tag, minlength=len(columns.tags)) == 0
     n_unread = int((columns.tags[unread & ~np.isin(np.arange(len(unread)), points)] >= 0).sum())
     tags = np.flatnonzero(unread & (columns.tags >= 0).any(axis=1))
-    return Untied(int(free.sum()) + n_unread, tuple(np.flatnonzero(moves).tolist()), tuple(tags.tolist()))
+    return UnobservableDirections(
+        int(free.sum()) + n_unread, tuple(np.flatnonzero(moves).tolist()), tuple(tags.tolist())
+    )
 
 
 def segments_of_poses(odometry: OdometryFactors, n_poses: int) -> IntArray:
@@ -101,7 +103,7 @@ def _of_held_poses(
     along = np.stack([cos, sin, sin * x - cos * y], axis=-1)
     across = np.stack([-sin, cos, cos * x + sin * y], axis=-1)
     turn = np.broadcast_to([0.0, 0.0, 1.0], along.shape)
-    return _spread(np.choose(direction[:, None], [along, across, turn]), segment_of[pose], n_segments)
+    return _scatter(np.choose(direction[:, None], [along, across, turn]), segment_of[pose], n_segments)
 
 
 def _of_tags(
@@ -120,7 +122,7 @@ def _of_tags(
     for axis, turned in enumerate((-place[:, 1], place[:, 0])):
         moved = np.zeros((len(tag), 3))
         moved[:, axis], moved[:, 2] = 1.0, turned[tag]
-        by_segment = _spread(moved, segment, n_segments)
+        by_segment = _scatter(moved, segment, n_segments)
         # The best place for a tag is the mean of where its segments take it; a held one stays, a point is where it is.
         free = (columns.tags[tag, axis] >= 0) & ~is_point
         mean = sparse.csr_array((free / np.sqrt(count[tag]), (tag, np.arange(len(tag)))), shape=(len(place), len(tag)))
@@ -158,7 +160,7 @@ def _pad_columns(rows: FloatArray, n: int) -> FloatArray:
     return np.pad(rows, ((0, 0), (0, n - rows.shape[1])))
 
 
-def _spread(rows: FloatArray, segment: IntArray, n_segments: int) -> FloatArray:
+def _scatter(rows: FloatArray, segment: IntArray, n_segments: int) -> FloatArray:
     """Rows (N, 3) by the motion of one segment each, as rows (N, 3 n_segments) by those of all."""
     spread = np.zeros((len(rows), n_segments, 3))
     spread[np.arange(len(rows)), segment] = rows

@@ -24,12 +24,12 @@ from groundsbot.offline.sam.factors.odometry_and_readings import (
     ReadingFactors,
     State,
 )
-from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
+from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber, losses_and_weights
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import diagonal_square
-from groundsbot.offline.sam.observability import Untied, find_unobservable
-from groundsbot.offline.sam.step import Before, take_step
+from groundsbot.offline.sam.observability import UnobservableDirections, find_unobservable
+from groundsbot.offline.sam.step import StepStart, take_step
 
 # Rounding that changes a covariance by a hundredth is a tenth of what the sigma of a good noise model is off.
 MAX_RELATIVE_ERROR: Final = 0.01
@@ -77,7 +77,7 @@ class Problem:
     prior: CalibrationPrior
     columns: Columns
     anchor: IntArray
-    measured: Measured = NOTHING_MEASURED
+    measured: Priors = NO_PRIORS
 
     def check(self, state: State) -> None:
         """Raises ValueError for a state of another problem, which compiled code would read beyond its end."""
@@ -182,7 +182,7 @@ class Solution:
         return factorise(self.problem.arrowhead, system, 0.0)
 
     @cached_property
-    def unobservable(self) -> Untied:
+    def unobservable(self) -> UnobservableDirections:
         """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
         problem = self.problem
         return find_unobservable(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
@@ -260,7 +260,7 @@ def solve(
             return ended("a variable is in no factor", converged=False)
         if expected <= cost_tolerance + relative_tolerance * cost:
             return ended("converged", converged=True)
-        before = Before(state, cost, rolled)
+        before = StepStart(state, cost, rolled)
         taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spare)
         n_linearised += taken.n_linearised
         if curvature.misleads(cost - taken.cost, expected):
@@ -285,7 +285,9 @@ def solve(
     return ended(reason, converged=False)
 
 
-def _step(arrowhead: Arrowhead, system: System, damping: Damping, rows: Rows) -> tuple[FloatArray, float]:
+def _step(
+    arrowhead: Arrowhead, system: NormalEquations, damping: Damping, rows: SquareRootFactor
+) -> tuple[FloatArray, float]:
     """The next step, damped as it has to be, and by how much the linear model says that the cost falls.
 
     Raises:
@@ -308,7 +310,7 @@ def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cos
 
 
 def factorise(
-    arrowhead: Arrowhead, system: System, damping: float, out: Rows | None = None
+    arrowhead: Arrowhead, system: NormalEquations, damping: float, out: SquareRootFactor | None = None
 ) -> tuple[Factorisation, float]:
     """R of H + damping diag(H), with as little more damping as it takes in double precision, and the damping used.
 
@@ -334,7 +336,7 @@ def _solve_preintegrated(problem: Problem, start: State, steps: int) -> tuple[St
         return start, 0
 
 
-def _expected_decrease(system: System, step: FloatArray, damping: float) -> float:
+def _expected_decrease(system: NormalEquations, step: FloatArray, damping: float) -> float:
     """-g s - s H s / 2 of a step with (H + damping D) s = -g."""
     along = -float(system.gradient @ step)
     return 0.5 * (along + damping * diagonal_square(system, step)) if damping else 0.5 * along

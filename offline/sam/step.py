@@ -8,14 +8,14 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.robust_losses import Loss
-from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 
 # A step that brings less than this share of what the linear model says is also tried in the other way.
 _GOOD_GAIN: Final = 0.75
 _SHARES: Final = (1.0, 0.5, 0.2)
 
 
-class Before(NamedTuple):
+class StepStart(NamedTuple):
     """Where a step begins, its cost, and whether the last step was rolled: taken motion by motion."""
 
     state: State
@@ -23,7 +23,7 @@ class Before(NamedTuple):
     rolled: bool
 
 
-class Taken(NamedTuple):
+class StepResult(NamedTuple):
     """What came of a step: how much of it was taken, in which way, and how often factors were linearised for that."""
 
     state: State
@@ -37,11 +37,11 @@ def take_step(
     arrowhead: Arrowhead,
     losses: tuple[Loss, Loss],
     anchor: IntArray,
-    before: Before,
+    before: StepStart,
     step: FloatArray,
     expected: float,
-    out: System,
-) -> Taken:
+    out: NormalEquations,
+) -> StepResult:
     """Takes a step: the other way too where the first is not good, and less of it where none goes down.
 
     Where a part hangs loose, a step swings it by metres for next to nothing. Damping holds that back for good, less of
@@ -61,13 +61,13 @@ def take_step(
     """
     n_linearised = 0
 
-    def tried(share: float, *, rolled: bool) -> Taken:
+    def tried(share: float, *, rolled: bool) -> StepResult:
         nonlocal n_linearised
         n_linearised += 1
         part = share * step
         moved = arrowhead.retract(before.state, part, anchor)
         moved = arrowhead.retract_relative(before.state, part, anchor, moved) if rolled else moved
-        return Taken(moved, arrowhead.linearise(moved, *losses, out=out)[1], rolled, share, n_linearised)
+        return StepResult(moved, arrowhead.linearise(moved, *losses, out=out)[1], rolled, share, n_linearised)
 
     for share in _SHARES:
         first = tried(share, rolled=before.rolled)
@@ -78,4 +78,4 @@ def take_step(
             return other
         if first.cost < before.cost:
             return tried(share, rolled=before.rolled)
-    return Taken(before.state, np.inf, before.rolled, 1.0, n_linearised)
+    return StepResult(before.state, np.inf, before.rolled, 1.0, n_linearised)

@@ -19,9 +19,9 @@ from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, R
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared
-from groundsbot.offline.noise import in_cell, spread_of_corners
-from groundsbot.offline.sam import Effort, Parameter, Solution, build_graph, solve
-from groundsbot.offline.self_calibration.selection import Told
+from groundsbot.offline.noise import in_cell, inflation_of_corners
+from groundsbot.offline.sam import Parameter, Solution, SolveBudget, build_graph, solve
+from groundsbot.offline.self_calibration.selection import CalibrationInformation
 
 # Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
 _STRETCHES: Final = 5
@@ -47,10 +47,10 @@ def information_of(
     maps: Sequence[LocalMap],
     robots: Mapping[str, Robot],
     noise: NoiseParameters,
-    efforts: Sequence[Effort],
+    efforts: Sequence[SolveBudget],
     *,
     corners: bool,
-) -> Told:
+) -> CalibrationInformation:
     """What all segments of some runs tell.
 
     Args:
@@ -79,7 +79,7 @@ def information_of(
     for k, part in enumerate(parts):
         at = [index[parameter[:3]] for parameter in part.parameters]
         information[k][np.ix_(at, at)], vector[k, at] = part.information, part.vector
-    return Told(parameters, information, vector)
+    return CalibrationInformation(parameters, information, vector)
 
 
 def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
@@ -90,7 +90,7 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
-def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort) -> Segment:
+def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
     """The segment under the noise that its windows leave over, errors that neighbouring readings share included."""
     least = least_shared(local_map.segment.readings)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
@@ -100,9 +100,9 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: Effort
     segment = local_map.segment.with_noise(own)
     if not len(segment.readings):
         return segment
-    of_corners = spread_of_corners(segment, in_cell(segment), own.sigma_corner_px)
+    of_corners = inflation_of_corners(segment, in_cell(segment), own.sigma_corner_px)
     of_corners = np.maximum(windows.sharing.max(axis=-1), of_corners)
-    return replace(segment, readings=segment.readings.spread(windows.sharing, of_corners))
+    return replace(segment, readings=segment.readings.inflate(windows.sharing, of_corners))
 
 
 def _cuts(segment: Segment) -> list[tuple[int, int]]:
@@ -114,7 +114,7 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 
 
 def _information_of_segment(
-    segment: Segment, whole: LocalMap, first: int, end: int, effort: Effort, *, corners: bool
+    segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, corners: bool
 ) -> _SegmentInformation | None:
     """None where a segment reads no tag or cannot be solved alone."""
     part = segment.part(first, end)
@@ -125,7 +125,7 @@ def _information_of_segment(
     start = graph.start(
         whole.T_start_base[first:end], whole.tags_m, {p: calibration.get(p[:3], 0.0) for p in graph.parameters}
     )
-    on_floor = solve(graph.problem, start, most_tries=effort.tries(graph.problem, _SOLVING_SHARE))
+    on_floor = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
     effort.spend(on_floor)
     solution: Solution | CornerSolution = on_floor
     parameters = graph.parameters

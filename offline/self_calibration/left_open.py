@@ -11,12 +11,12 @@ import numpy as np
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.measurements import Run
-from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
+from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
 from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 
-class Started(NamedTuple):
+class StartedRobots(NamedTuple):
     """Runs of robots with start values in their files, what was put in, and the searches for time offsets by robot."""
 
     runs: list[Run]
@@ -32,7 +32,7 @@ def by_robot(runs: Sequence[Run]) -> list[list[int]]:
     return list(groups.values())
 
 
-def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> Started:
+def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> StartedRobots:
     """Estimates what files leave open, robot by robot; robots whose files do not stay as they are.
 
     Args:
@@ -52,10 +52,10 @@ def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> Started:
         for i in own:
             found[i] = with_start_values(runs[i], start.learnt)
         choices += [_choice(robot, name, each) for name, each in start.learnt.items() if each.value]
-    return Started(found, tuple(choices), searches)
+    return StartedRobots(found, tuple(choices), searches)
 
 
-def _choice(robot: Robot, name: str, learnt: Learnt) -> CalibrationChoice:
+def _choice(robot: Robot, name: str, learnt: Correction) -> CalibrationChoice:
     sigmas = {
         TIME_OFFSET: robot.time_offset_s_sigma,
         TRACK_SCALE: robot.wheels.track_m_sigma / robot.wheels.track_m,

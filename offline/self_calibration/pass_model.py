@@ -33,7 +33,7 @@ _NEAREST_M: Final = 1e-3
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedTracks:
     """Residuals of M readings, predicted less read, and their derivatives.
 
     Attributes:
@@ -90,7 +90,7 @@ def places_of_tags(passes: Passes, parameters: FloatArray) -> FloatArray:
     return np.asarray(np.add.reduceat(places, passes.first) / np.bincount(passes.group)[:, None])
 
 
-def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> Linearised:
+def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> LinearisedTracks:
     """Residuals and derivatives.
 
     Args:
@@ -126,4 +126,4 @@ def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> Lin
     by_parameters[:, 1, 5] = -1.0
     by_parameters[:, 0, 6] = 1.0
     by_parameters[:, 0, 7] = -range_m / scale**2
-    return Linearised(residual, by_tag, by_parameters)
+    return LinearisedTracks(residual, by_tag, by_parameters)

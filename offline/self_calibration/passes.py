@@ -103,7 +103,7 @@ class Passes:
 
 
 @dataclass(frozen=True)
-class _Looks:
+class _Stamps:
     """M readings by their stamps alone: when, of which tag, and where they are in their run."""
 
     time_s: FloatArray
@@ -113,8 +113,8 @@ class _Looks:
     run: IntArray
     index: IntArray  # into its positions, and after these into its detections
 
-    def where(self, which: BoolArray | IntArray) -> "_Looks":
-        return _Looks(
+    def where(self, which: BoolArray | IntArray) -> "_Stamps":
+        return _Stamps(
             self.time_s[which],
             self.way_m[which],
             self.turn_rad[which],
@@ -133,7 +133,7 @@ def gather_passes(runs: Sequence[Run]) -> Passes | None:
     wheels = _wheel_axis(runs)
     if wheels is None:
         return None
-    looks, group = _choose_tracks(_looks(runs, wheels))
+    looks, group = _choose_tracks(_stamps(runs, wheels))
     value, sigma, sensor = np.full((len(group), 2), np.nan), np.ones((len(group), 2)), np.zeros((len(group), 3))
     twist = wheels.twist_at(looks.time_s)
     for number, run in enumerate(runs):
@@ -171,7 +171,7 @@ def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
     return WheelAxis(time_s, motion, tuple(begins_s), runs[0].robot.wheels.track_m)
 
 
-def _looks(runs: Sequence[Run], wheels: WheelAxis) -> _Looks:
+def _stamps(runs: Sequence[Run], wheels: WheelAxis) -> _Stamps:
     """All readings around which wheels are known."""
     left_m, right_m = np.diff(wheels.motion[:, :2], axis=0, prepend=wheels.motion[:1, :2]).T
     way_m, turn_rad = np.cumsum(np.abs(left_m + right_m) / 2), np.cumsum(np.abs(right_m - left_m) / wheels.track_m)
@@ -190,10 +190,10 @@ def _looks(runs: Sequence[Run], wheels: WheelAxis) -> _Looks:
             where = (np.interp(time_s, wheels.time_s, each) for each in (way_m, turn_rad))
             moved.append(np.stack([time_s, *where]))
             names.append(np.stack([tag[index], np.full(len(index), number), index]))
-    return _Looks(*np.concatenate(moved, axis=1), *np.concatenate(names, axis=1))
+    return _Stamps(*np.concatenate(moved, axis=1), *np.concatenate(names, axis=1))
 
 
-def _choose_tracks(looks: _Looks) -> tuple[_Looks, IntArray]:
+def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
     """Readings of passes that tell something, by pass, and the pass of each; passes by their beginning."""
     looks = looks.where(np.lexsort((looks.time_s, looks.tag)))
     begins = np.ones(len(looks.tag), dtype=np.bool_)
@@ -246,7 +246,7 @@ def _polar(readings: Readings) -> tuple[FloatArray, FloatArray]:
 
 
 def _passes(
-    wheels: WheelAxis, looks: _Looks, group: IntArray, value: FloatArray, sigma: FloatArray, sensor: FloatArray
+    wheels: WheelAxis, looks: _Stamps, group: IntArray, value: FloatArray, sigma: FloatArray, sensor: FloatArray
 ) -> Passes:
     """Adds stations, and what wheels add to the sigmas."""
     noise, n = NoiseParameters(), np.bincount(group)

@@ -45,25 +45,25 @@ OFF_BY_FAR: Final = (TIME_OFFSET, TRACK_SCALE, *MOUNT_PARAMETERS)
 MOST_SIGMAS: Final = 3.0
 
 
-class Learnt(NamedTuple):
+class Correction(NamedTuple):
     """A correction to what a robot.yaml says, and how well it is known."""
 
     value: float
     sigma: float
 
 
-class Owned(NamedTuple):
+class OwnedParameter(NamedTuple):
     """A calibration number by name, and whose it is: a robot id, or a batch of tags with its family."""
 
     owner: str
     name: str
 
 
-def open_parameters(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
+def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robot:
     """The robot whose file leaves open what is freed, with these sigmas; its values stay."""
 
     def sigma(name: str) -> float | None:
-        return freed.get(Owned(robot.robot_id, name))
+        return freed.get(OwnedParameter(robot.robot_id, name))
 
     wheels, mount = robot.wheels, robot.mount
     track = sigma(TRACK_SCALE)
@@ -92,16 +92,16 @@ def open_parameters(robot: Robot, freed: Mapping[Owned, float]) -> Robot:
 
 def as_if_unknown(robot: Robot) -> Robot:
     """The robot as if nobody had measured what is off by far where it is off at all; the focal length is open too."""
-    own = {Owned(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
-    batches = [*(_of_batch(batch) for batch in robot.tags), Owned(IMPORTED_BATCH, TAG_SCALE)]
+    own = {OwnedParameter(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
+    batches = [*(_of_batch(batch) for batch in robot.tags), OwnedParameter(IMPORTED_BATCH, TAG_SCALE)]
     return open_parameters(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
 
 
-def correct_robot(robot: Robot, learnt: Mapping[Owned, Learnt]) -> Robot:
+def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> Robot:
     """The robot with what was learnt for its values and sigmas; what was not learnt stays. Its camera is not in it."""
 
-    def of(name: str) -> Learnt | None:
-        return learnt.get(Owned(robot.robot_id, name))
+    def of(name: str) -> Correction | None:
+        return learnt.get(OwnedParameter(robot.robot_id, name))
 
     changed: dict[str, object] = {
         "wheels": _correct_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(TRACK_SCALE)),
@@ -124,8 +124,8 @@ def _mount_fields() -> list[str]:
     return [name.removeprefix(_MOUNT) for name in OPEN_SIGMAS if name.startswith(_MOUNT)]
 
 
-def _of_batch(batch: TagBatch) -> Owned:
-    return Owned(f"{batch.batch} {batch.family}", TAG_SCALE)
+def _of_batch(batch: TagBatch) -> OwnedParameter:
+    return OwnedParameter(f"{batch.batch} {batch.family}", TAG_SCALE)
 
 
 def _open_batch(batch: TagBatch, sigma: float | None) -> TagBatch:
@@ -134,7 +134,9 @@ def _open_batch(batch: TagBatch, sigma: float | None) -> TagBatch:
     return batch.model_copy(update={"sigma_size_m": sigma * batch.sigma_size_m / batch.relative_sigma})
 
 
-def _correct_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None, track: Learnt | None) -> Wheels:
+def _correct_wheels(
+    wheels: Wheels, scale: Correction | None, ratio: Correction | None, track: Correction | None
+) -> Wheels:
     changed: dict[str, float] = {}
     if scale and ratio:
         of_one = (scale.sigma**2 + 0.25 * ratio.sigma**2) ** 0.5  # as a share, of one radius
@@ -148,7 +150,7 @@ def _correct_wheels(wheels: Wheels, scale: Learnt | None, ratio: Learnt | None, 
     return wheels.model_copy(update=changed)
 
 
-def _correct_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount:
+def _correct_mount(mount: Mount, learnt: Mapping[str, Correction | None]) -> Mount:
     changed: dict[str, float] = {}
     for field, found in learnt.items():
         if found:
@@ -156,7 +158,7 @@ def _correct_mount(mount: Mount, learnt: Mapping[str, Learnt | None]) -> Mount:
     return mount.model_copy(update=changed)
 
 
-def _correct_batch(batch: TagBatch, scale: Learnt | None) -> TagBatch:
+def _correct_batch(batch: TagBatch, scale: Correction | None) -> TagBatch:
     if scale is None:
         return batch
     larger = 1.0 + scale.value

@@ -18,7 +18,7 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotNumber
 from groundsbot.offline.measurements import Run
-from groundsbot.offline.self_calibration.robot import Owned
+from groundsbot.offline.self_calibration.robot import OwnedParameter
 from groundsbot.offline.self_calibration.selection import DOUBTED, TELLS_LESS
 from groundsbot.offline.self_calibration.words import DRIVES
 
@@ -75,7 +75,7 @@ def verdicts(
         choices: of self-calibration, and start values of what files leave open.
     """
     robots = {run.robot_id: run.robot for run in runs}
-    chosen = {Owned(each.owner, each.name): each for each in choices}
+    chosen = {OwnedParameter(each.owner, each.name): each for each in choices}
     rows = []
     for each in calibration:
         in_file = _in_file(robots, each)
@@ -83,7 +83,7 @@ def verdicts(
             continue
         scale = in_file if each.name in _SCALES else 1.0
         is_open = each.owner.startswith(IMPORTED_BATCH) or (each.owner in robots and robots[each.owner].is_left_open)
-        verdict = _verdict(each, chosen.get(Owned(each.owner, each.name)), is_open=is_open)
+        verdict = _verdict(each, chosen.get(OwnedParameter(each.owner, each.name)), is_open=is_open)
         rows.append(
             RobotNumber(
                 owner=each.owner,

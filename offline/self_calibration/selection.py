@@ -17,7 +17,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, Owned
+from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, OwnedParameter
 
 # Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.
 _FALSE_ALARM: Final = 0.01
@@ -36,7 +36,7 @@ _NOT_ASKED: Final = "it was not asked for"
 
 
 @dataclass(frozen=True)
-class Told:
+class CalibrationInformation:
     """What S segments tell of C numbers.
 
     Attributes:
@@ -48,13 +48,13 @@ class Told:
     information: FloatArray
     vector: FloatArray
 
-    def about(self, values: Mapping[Owned, float]) -> "Told":
+    def about(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
         """The same of numbers that are so much larger, by owner and name: about the files before these were put in."""
-        shift = np.array([values.get(Owned(each.owner, each.name), 0.0) for each in self.parameters])
+        shift = np.array([values.get(OwnedParameter(each.owner, each.name), 0.0) for each in self.parameters])
         return replace(self, vector=self.vector + self.information @ shift)
 
 
-class _Estimate(NamedTuple):
+class _NumberEstimate(NamedTuple):
     """Of one number by data alone; of a variance beyond all measure where they say nothing."""
 
     value: float
@@ -62,7 +62,7 @@ class _Estimate(NamedTuple):
 
 
 def choose(
-    told: Told, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
+    told: CalibrationInformation, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
 ) -> list[CalibrationChoice]:
     """What becomes of each number that could be freed.
 
@@ -77,7 +77,7 @@ def choose(
             sees no difference between a camera that is late and one that sits elsewhere.
     """
     candidates = [i for i, each in enumerate(told.parameters) if each.name in OPEN_SIGMAS]
-    judge = _Judge(told, candidates, asked, late_s)
+    judge = _Selection(told, candidates, asked, late_s)
     by_far = [] if asked else judge.off_by_far()
     judge.open_what_contradicts()
     if not asked and not by_far and judge.is_any_by_far():
@@ -93,7 +93,7 @@ def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
     return all(each.is_freed for each in choices if each.name in OFF_BY_FAR)
 
 
-class _Judge:
+class _Selection:
     """Which numbers are open, and what is to be said of each as that is.
 
     Attributes:
@@ -102,7 +102,11 @@ class _Judge:
     """
 
     def __init__(
-        self, told: Told, candidates: Sequence[int], asked: Collection[str], late_s: Mapping[str, float]
+        self,
+        told: CalibrationInformation,
+        candidates: Sequence[int],
+        asked: Collection[str],
+        late_s: Mapping[str, float],
     ) -> None:
         self._told, self._candidates, self._asked, self._late_s = told, candidates, asked, late_s
         self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
@@ -206,7 +210,7 @@ def _plausible(choice: CalibrationChoice) -> float:
     return choice.off_sigmas**2 - (_ODDS_OF_WHEELS if choice.name == WHEEL_PARAMETERS[0] else 0.0)
 
 
-def _cross_validated_gain(told: Told, sigmas: FloatArray, index: int) -> float | None:
+def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, index: int) -> float | None:
     """Log likelihood of each segment by what all others tell of the number, over that by robot.yaml; summed.
 
     None where no two segments tell anything of it.
@@ -223,7 +227,7 @@ def _cross_validated_gain(told: Told, sigmas: FloatArray, index: int) -> float |
     return sum(gains) if gains else None
 
 
-def _estimate(told: Told, which: BoolArray, sigmas: FloatArray, index: int) -> _Estimate:
+def _estimate(told: CalibrationInformation, which: BoolArray, sigmas: FloatArray, index: int) -> _NumberEstimate:
     """By some segments (S,), the others at their sigmas about zero and this one without what holds it."""
     limit = OPEN_SIGMAS[told.parameters[index].name]
     unit = sigmas.copy()
@@ -233,8 +237,8 @@ def _estimate(told: Told, which: BoolArray, sigmas: FloatArray, index: int) -> _
     mean = (covariance @ (unit * told.vector[which].sum(axis=0)))[index]
     told_alone = 1.0 / covariance[index, index] - 1.0
     if told_alone < _NOTHING:
-        return _Estimate(0.0, limit**2 / _NOTHING)
-    return _Estimate(float(limit * mean / covariance[index, index] / told_alone), float(limit**2 / told_alone))
+        return _NumberEstimate(0.0, limit**2 / _NOTHING)
+    return _NumberEstimate(float(limit * mean / covariance[index, index] / told_alone), float(limit**2 / told_alone))
 
 
 def _log_density(off: float, variance: float) -> float:

@@ -17,13 +17,13 @@ from groundsbot.calib.robot import (
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
-from groundsbot.offline.sam import efforts_of
+from groundsbot.offline.sam import budgets_of
 from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.left_open import by_robot
 from groundsbot.offline.self_calibration.robot import (
     OPEN_SIGMAS,
-    Learnt,
-    Owned,
+    Correction,
+    OwnedParameter,
     as_if_unknown,
     correct_robot,
     open_parameters,
@@ -39,10 +39,10 @@ TIMES_MAPPED: Final = 2  # the runs are, where this comes before their map
 _ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, RANGE_OFFSET})
 
 
-_NOTHING: Final = Learnt(0.0, 0.0)
+_NOTHING: Final = Correction(0.0, 0.0)
 
 
-class Freed(NamedTuple):
+class FreedRobots(NamedTuple):
     """What became of robots' files.
 
     Attributes:
@@ -54,11 +54,13 @@ class Freed(NamedTuple):
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
-    put_in: dict[Owned, Learnt]
+    put_in: dict[OwnedParameter, Correction]
     searches: dict[str, TimeOffsetSearch]
 
 
-def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool) -> Freed:
+def free_parameters(
+    runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool
+) -> FreedRobots:
     """Frees what the drives can tell and robot.yaml has wrong.
 
     Each robot is first estimated as if nobody had measured it; what segments of its drives tell is then a quadratic
@@ -73,10 +75,10 @@ def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collecti
     """
     started, searches = _as_if_unknown(runs, noise)
     if not started:
-        return Freed(list(runs), (), {}, {})
+        return FreedRobots(list(runs), (), {}, {})
     opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
     segments = [without_unconfirmed_tracks(segment) for run in opened_runs for segment in segments_of(run, noise)]
-    efforts = efforts_of(segments, TIMES_MAPPED)
+    efforts = budgets_of(segments, TIMES_MAPPED)
     maps = [
         solve_local_map(segment, effort, noise_is_open=True).without_factors()
         for segment, effort in zip(segments, efforts, strict=True)
@@ -85,19 +87,19 @@ def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collecti
     starts = {owned: each for _, learnt in started for owned, each in learnt.items()}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
     choices = choose(told.about({owned: each.value for owned, each in starts.items()}), names, late_s)
-    freed = {Owned(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
+    freed = {OwnedParameter(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
     right = put_right(choices)
     if is_overruled(choices):
         # What pieces of drives tell of a robot that is off by metres is of different minima; all of them have a say.
         right = {owned: each for owned, each in right.items() if owned.name not in OFF_BY_ALL} | starts
-    return Freed(
+    return FreedRobots(
         [
             run
             if run.robot.is_left_open
             else replace(
-                run.shift_stamps(right.get(Owned(run.robot_id, TIME_OFFSET), _NOTHING).value),
+                run.shift_stamps(right.get(OwnedParameter(run.robot_id, TIME_OFFSET), _NOTHING).value),
                 robot=open_parameters(correct_robot(run.robot, right), freed),
-                camera=with_focal_lengths(run.camera, right.get(Owned(run.robot_id, FOCAL_SCALE))),
+                camera=with_focal_lengths(run.camera, right.get(OwnedParameter(run.robot_id, FOCAL_SCALE))),
             )
             for run in runs
         ],
@@ -109,12 +111,12 @@ def free_parameters(runs: Sequence[Run], noise: NoiseParameters, names: Collecti
 
 def _as_if_unknown(
     runs: Sequence[Run], noise: NoiseParameters
-) -> tuple[list[tuple[Run, dict[Owned, Learnt]]], dict[str, TimeOffsetSearch]]:
+) -> tuple[list[tuple[Run, dict[OwnedParameter, Correction]]], dict[str, TimeOffsetSearch]]:
     """Runs of robots that somebody measured, with time offset and track put in as their drives have them.
 
     With each run what was put in, and besides the searches for time offsets by robot. The sigmas are robot.yaml's.
     """
-    found: list[tuple[Run, dict[Owned, Learnt]]] = []
+    found: list[tuple[Run, dict[OwnedParameter, Correction]]] = []
     searches: dict[str, TimeOffsetSearch] = {}
     for own in by_robot(runs):
         robot = runs[own[0]].robot
@@ -123,12 +125,12 @@ def _as_if_unknown(
         start = estimate_start_values([replace(runs[i], robot=as_if_unknown(robot)) for i in own], noise)
         if start.searched is not None:
             searches[robot.robot_id] = start.searched
-        learnt = {Owned(robot.robot_id, name): each for name, each in start.learnt.items()}
+        learnt = {OwnedParameter(robot.robot_id, name): each for name, each in start.learnt.items()}
         found += [(with_start_values(runs[i], start.learnt), learnt) for i in own]
     return found, searches
 
 
-def with_focal_lengths(camera: CameraModel | None, focal: Learnt | None) -> CameraModel | None:
+def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> CameraModel | None:
     """The camera with the focal lengths that were found."""
     if camera is None or focal is None:
         return camera
@@ -136,24 +138,24 @@ def with_focal_lengths(camera: CameraModel | None, focal: Learnt | None) -> Came
 
 
 def about_the_files(
-    calibration: Sequence[CalibrationResult], put_in: Mapping[Owned, Learnt]
+    calibration: Sequence[CalibrationResult], put_in: Mapping[OwnedParameter, Correction]
 ) -> list[CalibrationResult]:
     """Corrections to the files as they were given: what was put in before is part of them."""
     found = []
     for each in calibration:
-        before = put_in.get(Owned(each.owner, each.name), _NOTHING).value
+        before = put_in.get(OwnedParameter(each.owner, each.name), _NOTHING).value
         found.append(replace(each, value=_one_after_the_other(each.name, before, each.value)))
     return found
 
 
-def put_right(choices: Sequence[CalibrationChoice]) -> dict[Owned, Learnt]:
+def put_right(choices: Sequence[CalibrationChoice]) -> dict[OwnedParameter, Correction]:
     """What was put into robots' files before the map was made; of a number that was twice, both together."""
-    right: dict[Owned, Learnt] = {}
+    right: dict[OwnedParameter, Correction] = {}
     for each in choices:
         if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH):
-            owned = Owned(each.owner, each.name)
+            owned = OwnedParameter(each.owner, each.name)
             before = right.get(owned, _NOTHING).value
-            right[owned] = Learnt(_one_after_the_other(each.name, before, each.value), each.sigma)
+            right[owned] = Correction(_one_after_the_other(each.name, before, each.value), each.sigma)
     return right
 
 

@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
-from groundsbot.offline.local_map import ShownNoise, first_solution, noise_of_windows
+from groundsbot.offline.local_map import WindowNoise, first_solution, noise_of_windows
 from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
-from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Learnt
+from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 
 _MOST_ROUNDS: Final = 4
@@ -27,7 +27,7 @@ _SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
 class StartValues(NamedTuple):
     """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the search that they began with."""
 
-    learnt: dict[str, Learnt]
+    learnt: dict[str, Correction]
     searched: TimeOffsetSearch | None
 
 
@@ -39,10 +39,10 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
         noise: where the noise of wheels and readings begins.
     """
     searched = search_time_offset(runs)
-    found = dict.fromkeys(_SMALL, Learnt(0.0, 0.0))
+    found = dict.fromkeys(_SMALL, Correction(0.0, 0.0))
     if searched is not None:
-        found[TIME_OFFSET] = Learnt(searched.offset_s, searched.sigma_s)
-    shown: dict[str, ShownNoise] = {}
+        found[TIME_OFFSET] = Correction(searched.offset_s, searched.sigma_s)
+    shown: dict[str, WindowNoise] = {}
     for _ in range(_MOST_ROUNDS):
         more = _estimate([with_start_values(run, found) for run in runs], noise, shown)
         if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
@@ -51,7 +51,7 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
     return StartValues(found, searched)
 
 
-def with_start_values(run: Run, learnt: dict[str, Learnt]) -> Run:
+def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
     """The run with time offset and track put into its robot's file, whose sigmas stay."""
     late_s, track = learnt[TIME_OFFSET].value, learnt[TRACK_SCALE].value
     robot = run.robot
@@ -65,7 +65,7 @@ def with_start_values(run: Run, learnt: dict[str, Learnt]) -> Run:
     return replace(run.shift_stamps(late_s), robot=changed)
 
 
-def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, ShownNoise]) -> dict[str, Learnt]:
+def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise]) -> dict[str, Correction]:
     """Time offset and track by each drive alone, the mean by their information.
 
     Args:
@@ -82,7 +82,7 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Show
                 if segment.name not in shown:
                     shown[segment.name] = noise_of_windows(coarse)
                 solved.append(first_solution(coarse, shown[segment.name]))
-    found: dict[str, Learnt] = {}
+    found: dict[str, Correction] = {}
     for name in _SMALL:
         values, informations = [], []
         for graph, solution in solved:
@@ -96,15 +96,17 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Show
                     values.append(value)
                     informations.append(1.0 / float(solution.covariance(np.array([column]))[0, 0]))
         if values:
-            found[name] = Learnt(float(np.average(values, weights=informations)), float(np.sum(informations) ** -0.5))
+            found[name] = Correction(
+                float(np.average(values, weights=informations)), float(np.sum(informations) ** -0.5)
+            )
     return found
 
 
-def _together(name: str, before: Learnt, more: Learnt | None) -> Learnt:
+def _together(name: str, before: Correction, more: Correction | None) -> Correction:
     """Two corrections, one after the other; a turn of c to first order is one of 1 / (1 - c) of the track."""
     if more is None:
         return before
     if name == TRACK_SCALE:
         turn = float(np.clip(1.0 - more.value, 0.3, 3.0))
-        return Learnt((1.0 + before.value) / turn - 1.0, more.sigma / turn**2)
-    return Learnt(before.value + more.value, more.sigma)
+        return Correction((1.0 + before.value) / turn - 1.0, more.sigma / turn**2)
+    return Correction(before.value + more.value, more.sigma)

@@ -18,7 +18,7 @@ from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.pass_model import (
     PARAMETERS,
     PRIOR_SIGMA,
-    Linearised,
+    LinearisedTracks,
     linearise,
     places_of_tags,
 )
@@ -69,14 +69,14 @@ class TimeOffsetSearch:
     cost: FloatArray
 
 
-class _Estimate(NamedTuple):
+class _OffsetEstimate(NamedTuple):
     """Where an iteration is: parameters (8,), places of tags (G, 2) and scales (2,) of the sigmas."""
 
     parameters: FloatArray
     tags_m: FloatArray
     scale: FloatArray
 
-    def at_offset(self, offset_s: float) -> "_Estimate":
+    def at_offset(self, offset_s: float) -> "_OffsetEstimate":
         return self._replace(parameters=np.concatenate([[offset_s], self.parameters[1:]]))
 
 
@@ -111,7 +111,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
     found, least = min((_iterate(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
     if not (np.isfinite(costs).all() and np.isfinite(least)):
         return None
-    offset_s, (sigma_s, repeats) = float(found.parameters[0]), _spread(passes, found)
+    offset_s, (sigma_s, repeats) = float(found.parameters[0]), _scatter(passes, found)
     cost = (costs - least) / repeats
     is_inside = abs(offset_s) < REACH_S - _STEP_S / 2
     if not (is_inside and sigma_s < _LARGEST_SIGMA_S):
@@ -122,10 +122,10 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
     return TimeOffsetSearch(offset_s, sigma_s, grid_s, cost)
 
 
-def _curve(passes: Passes) -> dict[float, tuple[_Estimate, float]]:
+def _curve(passes: Passes) -> dict[float, tuple[_OffsetEstimate, float]]:
     """By offset what is best there, and its cost; each begins where its neighbour towards zero ended."""
     zero = np.zeros(len(PARAMETERS))
-    start = _Estimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
+    start = _OffsetEstimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
     found = {0.0: _iterate(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
     for sign in (1.0, -1.0):
         last = found[0.0][0]
@@ -145,8 +145,8 @@ def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
 
 
 def _iterate(
-    passes: Passes, estimate: _Estimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
-) -> tuple[_Estimate, float]:
+    passes: Passes, estimate: _OffsetEstimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
+) -> tuple[_OffsetEstimate, float]:
     """Gauss-Newton steps under weights of Student's t; the estimate, and its cost."""
     free = slice(0 if free_offset else 1, None)
     for _ in range(most_steps):
@@ -187,7 +187,7 @@ def _weights(passes: Passes, residual: FloatArray, scale: FloatArray) -> tuple[F
     return weights / sigma**2, np.maximum(curvature.mean(axis=0) / weights.mean(axis=0), 0.1)
 
 
-def _cost(passes: Passes, estimate: _Estimate) -> float:
+def _cost(passes: Passes, estimate: _OffsetEstimate) -> float:
     """Negative log-likelihood with the priors, but for a constant."""
     residual, nu = linearise(passes, estimate.parameters, estimate.tags_m).residual, _DEGREES_OF_FREEDOM
     losses = 0.5 * (nu + 1.0) * np.log1p((residual / (passes.sigma * estimate.scale)) ** 2 / nu)
@@ -195,7 +195,7 @@ def _cost(passes: Passes, estimate: _Estimate) -> float:
     return float(losses.sum() + of_scales + 0.5 * ((estimate.parameters / PRIOR_SIGMA) ** 2).sum())
 
 
-def _pulls(passes: Passes, model: Linearised, weights: FloatArray) -> _Pulls:
+def _pulls(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _Pulls:
     """Sums of weighed squares (M, 2) over each pass, and the place of its tag eliminated by Schur's complement."""
     rows = np.concatenate([model.by_tag, model.by_parameters, model.residual[..., None]], axis=-1)
     squares = (rows * weights[..., None]).swapaxes(-1, -2) @ rows
@@ -207,7 +207,7 @@ def _pulls(passes: Passes, model: Linearised, weights: FloatArray) -> _Pulls:
     return _Pulls(left[:, :-1, :-1], left[:, :-1, -1], -solved[..., -1], -solved[..., :-1])
 
 
-def _spread(passes: Passes, found: _Estimate) -> tuple[float, float]:
+def _scatter(passes: Passes, found: _OffsetEstimate) -> tuple[float, float]:
     """Sigma of the offset, and how many times errors within blocks of the drives are repeated, at least once.
 
     By the jackknife: by how much the estimate moves when a block of passes is left out, to first order (CR3 of Bell and

@@ -52,7 +52,7 @@ class FolderCamera(Camera):
         deadline_ns = self._clock.now_ns() + round(timeout_s * _NS_PER_S)
         while True:
             begun_s = time.monotonic()
-            frames = self._look()
+            frames = self._scan()
             if frames or self._clock.now_ns() >= deadline_ns:
                 return frames
             # Names tell the time, so a full folder, which takes long to look through, can be looked at less often.
@@ -61,7 +61,7 @@ class FolderCamera(Camera):
     def close(self) -> None:
         """See Camera."""
 
-    def _look(self) -> list[Frame]:
+    def _scan(self) -> list[Frame]:
         try:
             now_ns, changed_ns = time.time_ns(), self._folder.stat().st_mtime_ns
             if changed_ns == self._changed_ns and self._settled and not self._unfinished:

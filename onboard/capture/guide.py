@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.board import DEFAULT_VIEWS, Board, SeenBoard, Spread, describe_board
+from groundsbot.calib.board import DEFAULT_VIEWS, Board, Coverage, SeenBoard, describe_board
 from groundsbot.onboard.errors import OnboardError
 
 _NS_PER_S: Final = 1_000_000_000
@@ -57,7 +57,7 @@ class CaptureGuide:
         self.board = board
         self.kept = 0
         self.wanted = wanted
-        self.spread = Spread()
+        self.spread = Coverage()
         self._detector = cv2.aruco.CharucoDetector(board.charuco())
         self._views: list[SeenBoard] = []
         self._before: tuple[SeenBoard, int] | None = None

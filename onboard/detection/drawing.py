@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.board import SeenBoard, Spread, region_shares
+from groundsbot.calib.board import Coverage, SeenBoard, region_shares
 from groundsbot.calib.foundation import atomic_write
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.log import Picture, decode, encode_jpeg
@@ -37,7 +37,7 @@ def save_drawing(picture: Picture, detections: Sequence[Detection], path: Path) 
     _save(drawn, path)
 
 
-def save_board(picture: Picture, seen: SeenBoard | None, spread: Spread, path: Path) -> None:
+def save_board(picture: Picture, seen: SeenBoard | None, spread: Coverage, path: Path) -> None:
     """Writes a JPEG: the board's corners found, and a frame around each region that the views so far do not cover.
 
     Raises:

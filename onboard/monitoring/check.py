@@ -29,7 +29,7 @@ _LINKS: Final = Path("/dev/serial/by-id")
 _OLDEST_WALL_CLOCK_NS: Final = 1_735_689_600 * _NS_PER_S  # 2025
 
 
-class CheckResult(NamedTuple):
+class DeviceCheck(NamedTuple):
     """One check."""
 
     name: str
@@ -38,7 +38,7 @@ class CheckResult(NamedTuple):
 
 
 @dataclass
-class _Found:
+class _DeviceFindings:
     """What the devices were found to give; None: not known."""
 
     lines_hz: float | None = None
@@ -46,7 +46,7 @@ class _Found:
     kept_bytes: int | None = None  # of one picture as it would be kept
 
 
-class _Look(NamedTuple):
+class _CameraProbe(NamedTuple):
     """What the camera gave."""
 
     frame: Frame  # the newest
@@ -54,7 +54,7 @@ class _Look(NamedTuple):
     refused: list[str]  # what the camera would not be set to
 
 
-def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[CheckResult]:
+def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[DeviceCheck]:
     """Runs every check that fits the robot, each result as soon as it is there.
 
     Args:
@@ -62,7 +62,7 @@ def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[Chec
         output: where recordings will go.
         picture: where to save what the camera sees, with the tags found drawn into it.
     """
-    clock, found = RunClock(), _Found()
+    clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
         yield _check_wheels(files, clock, found)
     if files.camera_settings is not None:
@@ -71,7 +71,7 @@ def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[Chec
     yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
 
-def _check_wheels(files: RobotFiles, clock: RunClock, seen: _Found) -> CheckResult:
+def _check_wheels(files: RobotFiles, clock: RunClock, seen: _DeviceFindings) -> DeviceCheck:
     devices = files.robot.devices
     port = EncoderPort(str(files.path.parent / (devices.encoder_port or "")), devices.encoder_baud)
     parser, n_bytes = EncoderParser(), 0
@@ -83,21 +83,21 @@ def _check_wheels(files: RobotFiles, clock: RunClock, seen: _Found) -> CheckResu
             n_bytes += len(data)
             parser.feed(data)
     except PortLostError as error:
-        return CheckResult("wheels", False, f"{error}; check the cable and devices.encoder_port")
+        return DeviceCheck("wheels", False, f"{error}; check the cable and devices.encoder_port")
     finally:
         port.close()
     seconds = _LISTEN_NS / _NS_PER_S
     rate_hz, expected_hz = parser.accepted / seconds, TOPICS["/wheels"].expected_rate_hz or 0.0
     found = f"{port.path}: {rate_hz:.0f} lines/s, {parser.rejected} rejected"
     if not n_bytes:
-        return CheckResult("wheels", False, f"{found}; it is silent: is the controller running, and is this its port?")
+        return DeviceCheck("wheels", False, f"{found}; it is silent: is the controller running, and is this its port?")
     if rate_hz < _LOWEST_RATE_SHARE * expected_hz:
         way_out = f"{expected_hz:.0f} lines/s expected; check devices.encoder_baud ({port.baud}) and the firmware"
-        return CheckResult("wheels", False, f"{found}; {way_out}")
+        return DeviceCheck("wheels", False, f"{found}; {way_out}")
     seen.lines_hz = rate_hz
     link = _stable_link(port.path)
     hint = f"; {link} stays the same when it is plugged in again" if link else ""
-    return CheckResult("wheels", True, f"{found}{hint}")
+    return DeviceCheck("wheels", True, f"{found}{hint}")
 
 
 def _stable_link(path: str) -> Path | None:
@@ -107,21 +107,21 @@ def _stable_link(path: str) -> Path | None:
     return next((link for link in sorted(_LINKS.iterdir()) if link.resolve() == Path(path)), None)
 
 
-def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Found) -> Iterator[CheckResult]:
+def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _DeviceFindings) -> Iterator[DeviceCheck]:
     if files.camera_settings is None or files.camera is None:
         return
     try:
-        look = _look(files.camera_settings, clock)
+        look = _probe_camera(files.camera_settings, clock)
     except CameraLostError as error:
-        yield CheckResult("camera", False, f"{error}; check devices.camera")
+        yield DeviceCheck("camera", False, f"{error}; check devices.camera")
         return
     try:
         result = _detect(files, look.frame)
     except OnboardError as error:
-        yield CheckResult("detection", False, str(error))
+        yield DeviceCheck("detection", False, str(error))
         return
     if result.error is not None:
-        yield CheckResult("camera", False, f"{result.error}; check the camera")
+        yield DeviceCheck("camera", False, f"{result.error}; check the camera")
         return
     width_px, height_px = files.camera.width_px, files.camera.height_px
     seen.pictures_hz, seen.kept_bytes = look.rate_hz, len(result.jpeg or b"") or None
@@ -129,12 +129,12 @@ def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Foun
     found = f"{files.camera_settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
     if result.size_px != (width_px, height_px):
         text = f"{found}, the calibration is for {width_px}x{height_px} px; calibrate at this size"
-        yield CheckResult("camera", False, text)
+        yield DeviceCheck("camera", False, text)
     else:
-        yield CheckResult("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
+        yield DeviceCheck("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
     tags = ", ".join(f"{each.family} {each.tag_id}" for each in result.detections)
     saved = _save(look.frame, result, picture)
-    yield CheckResult("detection", True, f"tags in view: {tags or 'none; hold one up to see it found'}; {saved}")
+    yield DeviceCheck("detection", True, f"tags in view: {tags or 'none; hold one up to see it found'}; {saved}")
 
 
 def _save(frame: Frame, result: DetectionResult, path: Path) -> str:
@@ -145,7 +145,7 @@ def _save(frame: Frame, result: DetectionResult, path: Path) -> str:
     return f"picture: {path}"
 
 
-def _look(settings: CameraSettings, clock: RunClock) -> _Look:
+def _probe_camera(settings: CameraSettings, clock: RunClock) -> _CameraProbe:
     """What comes from now on; where nothing does, as of a folder that nobody fills yet, what was there before."""
     begun_ns = clock.now_ns()
     camera = camera_for(settings, clock, since_ns=begun_ns)
@@ -157,7 +157,7 @@ def _look(settings: CameraSettings, clock: RunClock) -> _Look:
     return found
 
 
-def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _Look | None:
+def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _CameraProbe | None:
     """Pictures for some time from the first on; None: none came.
 
     Those taken before `begun_ns` do not count for the rate, which would be the disk's that gives them.
@@ -184,7 +184,7 @@ def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _
         return None
     elapsed_ns = arrived_ns[-1] - arrived_ns[0] if arrived_ns else 0
     rate_hz = (len(arrived_ns) - 1) * _NS_PER_S / elapsed_ns if elapsed_ns > _NS_PER_S else None
-    return _Look(newest, rate_hz, refused)
+    return _CameraProbe(newest, rate_hz, refused)
 
 
 def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
@@ -195,16 +195,16 @@ def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
         detector.close()
 
 
-def _check_clock(clock: RunClock) -> CheckResult:
+def _check_clock(clock: RunClock) -> DeviceCheck:
     now_ns = clock.now_ns()
     if now_ns < _OLDEST_WALL_CLOCK_NS:
-        return CheckResult("clock", False, "the wall clock lies before 2025; set it, or run names and times mislead")
+        return DeviceCheck("clock", False, "the wall clock lies before 2025; set it, or run names and times mislead")
     if not is_wall_clock_synchronised():
-        return CheckResult("clock", True, "not synchronised: fine for a map, but times of day may be off")
-    return CheckResult("clock", True, "synchronised")
+        return DeviceCheck("clock", True, "not synchronised: fine for a map, but times of day may be off")
+    return DeviceCheck("clock", True, "synchronised")
 
 
-def _load_of(files: RobotFiles, seen: _Found) -> Load:
+def _load_of(files: RobotFiles, seen: _DeviceFindings) -> Load:
     """What will be recorded: as found, or by robot.yaml where a device did not tell."""
     devices, camera = files.robot.devices, files.camera
     wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or TOPICS["/wheels"].expected_rate_hz or 0.0
@@ -215,7 +215,7 @@ def _load_of(files: RobotFiles, seen: _Found) -> Load:
     return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes)
 
 
-def _check_disk(output: Path, load: Load, keep_free_mb: int) -> CheckResult:
+def _check_disk(output: Path, load: Load, keep_free_mb: int) -> DeviceCheck:
     folder = output.absolute()
     while not folder.exists():
         folder = folder.parent
@@ -225,5 +225,5 @@ def _check_disk(output: Path, load: Load, keep_free_mb: int) -> CheckResult:
     kept = f"{load.kept_pictures_hz:.3g} pictures/s of {load.picture_bytes / 1e3:.0f} kB" if load.kept_hz else "none"
     found = f"{output}: {free_bytes / 1e9:.1f} GB free, enough for about {hours:.0f} h with pictures kept: {kept}"
     if hours < _LEAST_HOURS:
-        return CheckResult("disk", False, f"{found}; {_LEAST_HOURS:g} h needed: make room or lower picture_rate_hz")
-    return CheckResult("disk", True, found)
+        return DeviceCheck("disk", False, f"{found}; {_LEAST_HOURS:g} h needed: make room or lower picture_rate_hz")
+    return DeviceCheck("disk", True, found)

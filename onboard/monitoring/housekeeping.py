@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from groundsbot.onboard.log import Event, Severity
 from groundsbot.onboard.monitoring.disk_hours import hours_until_full
-from groundsbot.onboard.monitoring.status import DiskStatus, Look, Rates, Status, write_status
+from groundsbot.onboard.monitoring.status import DiskStatus, Rates, RecordingSnapshot, Status, write_status
 from groundsbot.onboard.process import Notifier, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import LiveRecorder, LogStatus
 
@@ -74,20 +74,20 @@ class Housekeeper(threading.Thread):
         self._notifier.ready()
         while not self._over.wait(self._period_s):
             if self._recorder.is_stopping:
-                self._say_stopping()
+                self._notify_stopping()
                 self._write("stopping")
             else:
-                self._tell_systemd(self._write("recording"))
+                self._notify_systemd(self._write("recording"))
 
     def end(self) -> None:
         """Writes the last status; the recording is closed, or never began."""
         self._over.set()
         self.join(2.0 * self._period_s)
-        self._say_stopping()
+        self._notify_stopping()
         if self._recorder.begun.is_set() and not self.is_alive():  # else its disk blocks
             self._write("stopped")
 
-    def _say_stopping(self) -> None:
+    def _notify_stopping(self) -> None:
         """Once; systemd waits for no sign of life from then on."""
         if not self._said_stopping:
             self._said_stopping = True
@@ -96,21 +96,21 @@ class Housekeeper(threading.Thread):
     def _write(self, state: Literal["recording", "stopping", "stopped"]) -> Status | None:
         """Looks and writes the status; None: that look failed, which is no reason to end a recording."""
         try:
-            status = self._look(state)
+            status = self._inspect(state)
             reason = write_status(status, self._path)
         except Exception as error:  # whatever it is, only the log's coming forward decides about the watchdog
-            self._tell(f"status: cannot be told ({type(error).__name__}: {error})")
+            self._report(f"status: cannot be told ({type(error).__name__}: {error})")
             return None
         if reason is not None:
-            self._tell(f"status: {self._path} cannot be written ({reason})")
+            self._report(f"status: {self._path} cannot be written ({reason})")
         return status
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if text not in self._told and len(self._told) < _NOTICES:
             self._told.add(text)
             self._on_notice(text)
 
-    def _tell_systemd(self, status: Status | None) -> None:
+    def _notify_systemd(self, status: Status | None) -> None:
         text = "the status cannot be told"
         if status is not None:
             rates = f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
@@ -123,12 +123,12 @@ class Housekeeper(threading.Thread):
     def _log_stalled_s(self) -> float:
         return max(self._recorder.stalled_s, self._recorder.log.stalled_s)
 
-    def _look(self, state: Literal["recording", "stopping", "stopped"]) -> Status:
+    def _inspect(self, state: Literal["recording", "stopping", "stopped"]) -> Status:
         recorder, core, log = self._recorder, self._recorder.core, self._recorder.log.status
         devices = recorder.files.robot.devices
         now_ns = recorder.now_ns()
         counts = dict(core.counts)
-        self._rates.add(Look(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
+        self._rates.add(RecordingSnapshot(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
         wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
         camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
         stalled_s = self._log_stalled_s() if state == "recording" else 0.0

@@ -65,7 +65,7 @@ class Status(_Part):
     last_events: list[str]
 
 
-class Look(NamedTuple):
+class RecordingSnapshot(NamedTuple):
     """What a recording shows of itself at one moment."""
 
     now_ns: int  # on the run's clock, like all times here
@@ -78,9 +78,9 @@ class Rates:
     """Rates from looks at growing counts."""
 
     def __init__(self) -> None:
-        self._looks: deque[Look] = deque()
+        self._looks: deque[RecordingSnapshot] = deque()
 
-    def add(self, look: Look) -> None:
+    def add(self, look: RecordingSnapshot) -> None:
         """Takes one look."""
         self._looks.append(look)
         while look.now_ns - self._looks[0].now_ns > _GROWTH_NS:

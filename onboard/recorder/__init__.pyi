@@ -1,6 +1,6 @@
 from .disk.log_keeper import LogStatus
 from .live_recorder import LiveRecorder
-from .recorder import RecorderCore, Run
+from .recorder import RecorderCore, RunIdentity
 from .robot_files import RobotFiles, capture_settings
 
 __all__ = [
@@ -8,6 +8,6 @@ __all__ = [
     "LogStatus",
     "RecorderCore",
     "RobotFiles",
-    "Run",
+    "RunIdentity",
     "capture_settings",
 ]

@@ -49,7 +49,7 @@ class CountedLog:
         self.losses["messages refused"] += 1
         self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, reason, self._writer.last_log_time_ns, 1)
 
-    def tell_notes(self, now_ns: int) -> None:
+    def report_notes(self, now_ns: int) -> None:
         """Writes what the log's disk has to say."""
         for note in self._writer.take_notes():
             self._count(note)

@@ -26,7 +26,7 @@ from groundsbot.onboard.recorder.device_threads import Act, CameraThread, Device
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import DiskRoom, one_recorder, space_policy
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.recorder.robot_files import RobotFiles
 from groundsbot.onboard.wheels import EncoderPort
 
@@ -114,7 +114,7 @@ class LiveRecorder:
             self._detector = ChildDetector(files.detector_settings, self._on_detector_restart)
         self.start_ns = self._clock.now_ns()  # only now: what came before, nobody listened to
         try:
-            run = Run(
+            run = RunIdentity(
                 files.robot,
                 files.text,
                 files.camera,

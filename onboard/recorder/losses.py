@@ -88,7 +88,7 @@ class RecordingLosses:
         text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
         self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
 
-    def tell(self, intake: WheelIntake, now_ns: int) -> None:
+    def report(self, intake: WheelIntake, now_ns: int) -> None:
         """Tells of what was counted since the last time, the lines that the intake left out included."""
         self._tallies.add_left_out(intake)
         for each in self._tallies.take():

@@ -42,7 +42,7 @@ _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S
 
 
-class Run(NamedTuple):
+class RunIdentity(NamedTuple):
     """What names and describes one run."""
 
     robot: Robot
@@ -70,7 +70,7 @@ class RecorderCore:
     def __init__(
         self,
         folder: Path,
-        run: Run,
+        run: RunIdentity,
         *,
         detector: TagDetector | None = None,
         on_event: Callable[[Event], None] | None = None,
@@ -263,7 +263,7 @@ class RecorderCore:
         self._write_waiting(now_ns)
         for alarm in self._watches.alarms(now_ns, now_ns if realtime_ns is None else realtime_ns):
             self.event(alarm.kind, Severity.SEVERITY_WARNING, alarm.text, now_ns)
-        self._log.tell_notes(now_ns)
+        self._log.report_notes(now_ns)
         if now_ns < self._next_anchor_ns:
             return
         self._next_anchor_ns = now_ns - now_ns % _ANCHOR_PERIOD_NS + _ANCHOR_PERIOD_NS
@@ -274,7 +274,7 @@ class RecorderCore:
             synchronised=synchronised,
         )
         self._log.write("/clock", anchor, now_ns, now_ns)
-        self._missing.tell(self._intake, now_ns)
+        self._missing.report(self._intake, now_ns)
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Writes one event."""
@@ -288,9 +288,9 @@ class RecorderCore:
         for each in self._intake.release_all():
             self._write_reading(each)
         self._write_detections(self._waiting.take_all())
-        self._missing.tell(self._intake, now_ns)
+        self._missing.report(self._intake, now_ns)
         self._missing.count_missing(self._watches, port_is_lost=self._port_is_lost)
-        self._log.tell_notes(now_ns)
+        self._log.report_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
         self._log.close()

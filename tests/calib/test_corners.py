@@ -8,7 +8,7 @@ from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.board.corner_fit import fit_corners
 from groundsbot.calib.board.corner_surroundings import RADIUS_PX, Surroundings, bends
 from groundsbot.calib.board.finder import BoardFinder
-from groundsbot.calib.board.finder import View as FoundView
+from groundsbot.calib.board.finder import BoardView as FoundView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of
 from groundsbot.calib.foundation.arrays import FloatArray

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.board.corner_fit import Corners
 from groundsbot.calib.board.finder import BoardFinder
-from groundsbot.calib.board.finder import View as FoundView
+from groundsbot.calib.board.finder import BoardView as FoundView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
 from groundsbot.calib.camera.planar_pose import board_pose

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
-from groundsbot.calib.board.view_spread import SeenBoard, Spread, describe_board
+from groundsbot.calib.board.view_spread import Coverage, SeenBoard, describe_board
 from groundsbot.fixtures.pictures.board_picture import View
 from tests.support.board_views import PLAIN, hold_board, project
 
@@ -47,7 +47,7 @@ def test_regions_are_those_that_corners_lie_in() -> None:
 
 
 def test_what_is_missing_is_said_until_it_is_there() -> None:
-    spread = Spread()
+    spread = Coverage()
     everything = ["show", "tilt the board, its left, right, upper, lower side", "nearer", "farther away"]
     assert all(said in text for said, text in zip(everything, spread.missing(), strict=True))
     assert spread.missing()[0].endswith(

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
-from groundsbot.calib.board.finder import BoardFinder, View
+from groundsbot.calib.board.finder import BoardFinder, BoardView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.fixtures.pictures.board_picture import BoardPainter, Glare, drawn_views
 from groundsbot.fixtures.pictures.board_picture import View as Taken
@@ -41,7 +41,7 @@ def spoilt(view: Taken, camera: CameraModel, rng: np.random.Generator) -> Taken:
     return Taken(view.T_camera_board, view.motion, glare=Glare(tuple(centre.tolist()), rng.uniform(20.0, 60.0)))
 
 
-def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.0) -> list[View]:
+def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.0) -> list[BoardView]:
     """Pictures of the default board as `drawn_views` has them, some spoilt, and the board found in them."""
     drawn, worse = _draw(camera, seed, count, spoilt_share)
     return _observe([_find(camera, worse.get(index, view), seed, index) for index, view in enumerate(drawn)])
@@ -49,7 +49,7 @@ def taken_views(camera: CameraModel, seed: int, count: int = 30, spoilt_share: f
 
 def take_with_and_without(
     camera: CameraModel, seed: int, count: int = 30, spoilt_share: float = 0.1
-) -> tuple[list[View], list[View]]:
+) -> tuple[list[BoardView], list[BoardView]]:
     """The views of a seed with none spoilt, and with some; those that are in both are taken once."""
     drawn, worse = _draw(camera, seed, count, spoilt_share)
     good = [_find(camera, view, seed, index) for index, view in enumerate(drawn)]
@@ -70,10 +70,10 @@ def _painter(camera: CameraModel) -> BoardPainter:
     return BoardPainter(camera, DEFAULT_BOARD)
 
 
-def _find(camera: CameraModel, view: Taken, seed: int, index: int) -> View | None:
+def _find(camera: CameraModel, view: Taken, seed: int, index: int) -> BoardView | None:
     picture = _painter(camera).picture(view, np.random.default_rng([seed, index]))
     return BoardFinder(DEFAULT_BOARD).find(picture, f"picture {index}")
 
 
-def _observe(views: Sequence[View | None]) -> list[View]:
+def _observe(views: Sequence[BoardView | None]) -> list[BoardView]:
     return [view for view in views if view is not None]

@@ -8,7 +8,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.planar_pose import ray_through, square_poses
 from groundsbot.offline.corners.kernels.step import turn_by
-from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, base_before, face
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, base_before, face
 from groundsbot.offline.corners.kernels.view_selection import ByTag
 from groundsbot.offline.foundation import borrowed, inline, inner, njit
 from groundsbot.offline.sam import Loss, eliminate_columns, loss_and_weight, multiply
@@ -27,7 +27,7 @@ _ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fi
 
 
 @njit
-def rays_of(looks: LookArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
+def rays_of(looks: CornerArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
     """Sets unit rays (C, 4, 3) to the corners of some looks; NaN where none was found."""
     looks = borrowed(looks)
     for i in range(len(which)):
@@ -37,14 +37,14 @@ def rays_of(looks: LookArrays, lenses: FloatArray, which: IntArray, out: FloatAr
 
 @njit
 def candidate_poses(
-    looks: LookArrays, values: SpatialValues, which: IntArray, rays: FloatArray, places: FloatArray, turns: FloatArray
+    looks: CornerArrays, values: SpatialValues, which: IntArray, rays: FloatArray, places: FloatArray, turns: FloatArray
 ) -> None:
     """Sets places (C, 4, 3) and turns (C, 4, 3, 3) in map of the tags that looks with rays (C, 4, 3) may have seen.
 
     Two planar poses, NaN where there is none, and two upright ones as far off as the tag is on the floor.
     """
     looks, values = borrowed(looks), borrowed(values)
-    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     W, place, in_map = np.empty((3, 3)), np.empty(3), np.empty(3)
     in_camera, seen = np.empty((2, 3)), np.empty((2, 3, 3))
     for i in range(len(which)):
@@ -79,7 +79,7 @@ def candidate_poses(
 
 
 @inner
-def _camera_at(eye: Eye, x: float, y: float, heading: float, W: FloatArray, place: FloatArray) -> None:
+def _camera_at(eye: CameraPose, x: float, y: float, heading: float, W: FloatArray, place: FloatArray) -> None:
     """Sets R_camera_map (3, 3) and the camera's place in map (3,) of a base."""
     cos, sin, mount = np.cos(heading), np.sin(heading), eye.mount
     for a in range(3):
@@ -91,7 +91,7 @@ def _camera_at(eye: Eye, x: float, y: float, heading: float, W: FloatArray, plac
 
 @njit
 def fit(
-    looks: LookArrays,
+    looks: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -119,7 +119,7 @@ def fit(
             total = 0.0
             normal[:] = 0.0
             for i in range(judges.begin[tags[c]], judges.begin[tags[c] + 1]):
-                total += _add_look(
+                total += _add_observation(
                     looks, lenses, loss, values.calibration, judges.order[i], axes[i], eyes[i], p, R, rows, normal
                 )
             if not total < losses[c]:
@@ -169,17 +169,19 @@ def _back(R: FloatArray, step: FloatArray) -> float:
 
 
 @inner
-def _eyes(looks: LookArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
+def _eyes(looks: CornerArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
     """R_camera_map (J, 4, 3, 3) and the camera's places (J, 4, 3) when each corner's row was read out."""
     axes, places = np.empty((len(which), 4, 3, 3)), np.empty((len(which), 4, 3))
-    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for i in range(len(which)):
         eyes_of(looks, values, which[i], eye, axes[i], places[i])
     return axes, places
 
 
 @inline
-def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: FloatArray, places: FloatArray) -> None:
+def eyes_of(
+    looks: CornerArrays, values: SpatialValues, m: int, eye: CameraPose, axes: FloatArray, places: FloatArray
+) -> None:
     """Sets R_camera_map (4, 3, 3) and the camera's places (4, 3) when each corner's row of one look was read out.
 
     `eye` is for looks by the same one, as in `face`.
@@ -207,8 +209,8 @@ def eyes_of(looks: LookArrays, values: SpatialValues, m: int, eye: Eye, axes: Fl
 
 
 @inner
-def _add_look(
-    looks: LookArrays,
+def _add_observation(
+    looks: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     calibration: FloatArray,

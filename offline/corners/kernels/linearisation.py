@@ -5,12 +5,12 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.corners.kernels.view import Eye, LookArrays, SpatialValues, face, look_factor
-from groundsbot.offline.corners.multifrontal.kernels import Kind, System, add_matrix, add_vector
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, corner_factor, face
+from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem, Kind, add_matrix, add_vector
 from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam import (
     Loss,
-    Odometry,
+    OdometryArrays,
     Values,
     error_by_wheels,
     error_of,
@@ -27,14 +27,14 @@ _WIDTH: Final = 20  # of a look's rows, with a zero at the end: columns go in pa
 
 
 @njit
-def add_looks(
-    looks: LookArrays,
+def add_corners(
+    looks: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
     kind: Kind,
     order: IntArray,
-    system: System,
+    system: FrontalSystem,
 ) -> float:
     """Adds J^T W J and J^T W r of all looks; returns the sum of their losses.
 
@@ -42,13 +42,13 @@ def add_looks(
     has nothing to do with the pose is summed up first for those in a row that have all else in common.
     """
     looks, values, kind, system = borrowed(looks), borrowed(values), borrowed(kind), borrowed(system)
-    r, J, B, normal, vector = _look_room()
-    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    r, J, B, normal, vector = _corner_scratch()
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     total, is_whole, last = 0.0, len(system.entries) > 0, -1
     free, place = np.empty(N_LOOK, dtype=np.uint64), np.empty(N_LOOK, dtype=np.uint64)
     for m in order:
         face(looks, m, values.calibration, eye)
-        look_factor(looks, lenses, m, values, eye, r, J, B)
+        corner_factor(looks, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
@@ -72,7 +72,7 @@ def add_looks(
 
 
 @inner
-def _look_room() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def _corner_scratch() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """For a look's residual, derivatives by all columns and by how the picture stands, normal matrix and gradient."""
     return np.empty(8), np.zeros((8, _WIDTH)), np.empty((8, 3)), np.zeros((_WIDTH, _WIDTH)), np.zeros(_WIDTH)
 
@@ -102,8 +102,8 @@ def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
 
 
 @njit
-def add_wobble(
-    looks: LookArrays,
+def add_attitude_noise(
+    looks: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -114,16 +114,16 @@ def add_wobble(
     force: FloatArray,
     coupled: FloatArray,
 ) -> None:
-    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 19); B as in `look_factor`.
+    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 19); B as in `corner_factor`.
 
     Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
     """
     looks, values = borrowed(looks), borrowed(values)
-    r, J, B, _, vector = _look_room()
-    eye = Eye(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    r, J, B, _, vector = _corner_scratch()
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for m in range(len(looks.pose)):
         face(looks, m, values.calibration, eye)
-        look_factor(looks, lenses, m, values, eye, r, J, B)
+        corner_factor(looks, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
@@ -141,7 +141,7 @@ def add_wobble(
 
 
 @njit
-def add_motions(odometry: Odometry, loss: Loss, values: Values, kind: Kind, system: System) -> float:
+def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind, system: FrontalSystem) -> float:
     """Adds J^T W J and J^T W r of all motions, by both poses and the wheels; returns the sum of their losses.
 
     Where the system has no room for matrices only gradients are added.

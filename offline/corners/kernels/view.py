@@ -14,7 +14,7 @@ from groundsbot.offline.foundation import inline, inner
 from groundsbot.offline.sam import series
 
 
-class LookArrays(NamedTuple):
+class CornerArrays(NamedTuple):
     """`factors.Looks`, for compiled functions."""
 
     pose: IntArray
@@ -44,7 +44,7 @@ class SpatialValues(NamedTuple):
     turns: FloatArray
 
 
-class Eye(NamedTuple):
+class CameraPose(NamedTuple):
     """A camera on its base: its place, the rotation from its axes, and the axes about which its mount turns."""
 
     mount: FloatArray  # (6,)
@@ -53,7 +53,7 @@ class Eye(NamedTuple):
 
 
 @inner
-def face(looks: LookArrays, m: int, calibration: FloatArray, eye: Eye) -> None:
+def face(looks: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) -> None:
     """Sets the eye as the calibration has it, unless it is so already: most looks are by the same one."""
     is_same = True
     for k in range(6):
@@ -80,12 +80,12 @@ def face(looks: LookArrays, m: int, calibration: FloatArray, eye: Eye) -> None:
 
 
 @inner
-def look_factor(
-    looks: LookArrays,
+def corner_factor(
+    looks: CornerArrays,
     lenses: FloatArray,
     m: int,
     values: SpatialValues,
-    eye: Eye,
+    eye: CameraPose,
     r: FloatArray,
     J: FloatArray,
     B: FloatArray,

@@ -18,7 +18,7 @@ class ByTag(NamedTuple):
     begin: IntArray
 
 
-def looks_by_tag(tag: IntArray, n_tags: int) -> ByTag:
+def observations_by_tag(tag: IntArray, n_tags: int) -> ByTag:
     """Looks at tags (M,), those of each in their order."""
     n_looks = np.bincount(tag, minlength=n_tags)
     return ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_looks)]))

@@ -15,9 +15,9 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.multifrontal.kernels import (
     Factors,
+    FrontalSystem,
     Kind,
     Nodes,
-    System,
     add_vectors,
     assemble,
     factorise,
@@ -40,7 +40,7 @@ class NotPositiveError(ValueError):
 
 
 @dataclass(frozen=True)
-class Fronts:
+class EliminationFronts:
     """The order of elimination, and where each entry of each factor's normal matrix goes.
 
     Attributes:
@@ -74,7 +74,7 @@ class Fronts:
         at[self.nodes.columns[is_own]] = positions[is_own]
         return at
 
-    def diagonal_of(self, system: System) -> FloatArray:
+    def diagonal_of(self, system: FrontalSystem) -> FloatArray:
         """(n,) of the whole matrix, of which each front has what its factors add."""
         total: FloatArray = np.bincount(self.nodes.columns, system.entries[self._diagonals[0]], self.n).astype(
             np.float64
@@ -86,11 +86,11 @@ class Fronts:
         """What the entries of a matrix take, or of its factor."""
         return 8 * int(self.nodes.offset[-1])
 
-    def empty(self, *, is_whole: bool = True) -> System:
+    def empty(self, *, is_whole: bool = True) -> FrontalSystem:
         """Zeros for factors to be added to; without room for matrices unless all is wanted."""
-        return System(self.nodes, np.zeros(self.nodes.offset[-1] if is_whole else 0), np.zeros(self.n))
+        return FrontalSystem(self.nodes, np.zeros(self.nodes.offset[-1] if is_whole else 0), np.zeros(self.n))
 
-    def add(self, system: System, first: int, normals: Sequence[Normal]) -> None:
+    def add(self, system: FrontalSystem, first: int, normals: Sequence[Normal]) -> None:
         """Adds the normal equations of kinds of factors, from the first of these on; no matrices without room."""
         for kind, normal in zip(self.kinds[first:], normals, strict=False):
             if not len(normal.gradient):
@@ -99,7 +99,7 @@ class Fronts:
             if len(system.entries):
                 assemble(kind, normal.matrix, system)
 
-    def factorise(self, system: System, raised: FloatArray | None = None) -> "FrontFactor":
+    def factorise(self, system: FrontalSystem, raised: FloatArray | None = None) -> "FrontFactor":
         """R with R^T R the matrix; R takes the place of the system's entries.
 
         Args:
@@ -121,7 +121,7 @@ class Fronts:
 class FrontFactor:
     """R with R^T R = H: in each front the rows of its own columns."""
 
-    order: Fronts
+    order: EliminationFronts
     entries: FloatArray
 
     def solve(self, vector: FloatArray) -> FloatArray:
@@ -166,7 +166,7 @@ class FrontFactor:
         return covariance
 
 
-def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[IntArray]) -> Fronts:
+def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[IntArray]) -> EliminationFronts:
     """Settles the fronts.
 
     Args:
@@ -195,7 +195,7 @@ def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[In
     bounds = np.cumsum([columns.size for columns in kinds])[:-1]
     places = np.split(factors.place, bounds)
     found = [Kind(own, at, each.reshape(own.shape)) for own, at, each in zip(kinds, node, places, strict=True)]
-    return Fronts(n, nodes, tuple(found))
+    return EliminationFronts(n, nodes, tuple(found))
 
 
 def _begins(node: IntArray, n_nodes: int) -> IntArray:

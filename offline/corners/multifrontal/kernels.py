@@ -60,7 +60,7 @@ class Kind(NamedTuple):
     place: IntArray
 
 
-class System(NamedTuple):
+class FrontalSystem(NamedTuple):
     """Normal equations by fronts: all entries, and the gradient (n,)."""
 
     nodes: Nodes
@@ -121,7 +121,7 @@ def _take(
 
 
 @njit
-def assemble(kind: Kind, normal: FloatArray, system: System) -> None:
+def assemble(kind: Kind, normal: FloatArray, system: FrontalSystem) -> None:
     """Adds normal matrices (M, k, k) of a kind of factor."""
     kind, system = borrowed(kind), borrowed(system)
     width = kind.place.shape[1]
@@ -137,7 +137,7 @@ def add_matrix(
     normal: FloatArray,
     first: int,
     last: int,
-    system: System,
+    system: FrontalSystem,
     free: Unsigned,
     place: Unsigned,
 ) -> None:

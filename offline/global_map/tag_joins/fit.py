@@ -29,7 +29,7 @@ _COVERED: Final = 0.5
 
 
 @dataclass(frozen=True)
-class HungTags:
+class PlacedTags:
     """K tags of a component about one of its poses.
 
     Attributes:
@@ -68,11 +68,11 @@ class TagFit:
         nats: minus the log likelihood, up to a constant that all ways of the same tags share.
     """
 
-    a: HungTags
-    b: HungTags
+    a: PlacedTags
+    b: PlacedTags
     T_anchors: FloatArray
     covariance: FloatArray
-    rise: float
+    cost_increase: float
     freedom: int
     nats: float
 
@@ -89,7 +89,7 @@ class TagFit:
     @property
     def closes(self) -> bool:
         """Whether chance explains how the tags differ."""
-        return self.rise < float(chi2.isf(FALSE_ALARM, self.freedom))
+        return self.cost_increase < float(chi2.isf(FALSE_ALARM, self.freedom))
 
     def covers(self, other: "TagFit") -> bool:
         """Whether this covariance will do for both ways, whichever is true."""
@@ -98,7 +98,9 @@ class TagFit:
         return float(off @ np.linalg.solve(self.covariance, off)) < _COVERED
 
 
-def placed_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float) -> HungTags:
+def placed_tags(
+    solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float
+) -> PlacedTags:
     """Some tags of a converged solution about a pose.
 
     Args:
@@ -106,7 +108,7 @@ def placed_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_
         tags: (K,) indices.
         anchor: index of the pose.
         variance_factor: the covariance's.
-        nats: see `HungTags`.
+        nats: see `PlacedTags`.
     """
     state, columns = solution.state, solution.problem.columns
     pose = state.poses[anchor]
@@ -124,7 +126,7 @@ def placed_tags(solution: CornerSolution, tags: IntArray, anchor: int, variance_
         by[k, 5, 2] = -1.0
     rows = by.reshape(-1, 3 + six.size)
     straight = _straightness(solution, int(tags[0]), anchor)
-    return HungTags(pose, place, turn, variance_factor * rows @ joint @ rows.T, nats, straight)
+    return PlacedTags(pose, place, turn, variance_factor * rows @ joint @ rows.T, nats, straight)
 
 
 def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
@@ -145,7 +147,7 @@ def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
     return min(rises) / (0.5 * _STRAIGHT_SIGMAS**2)
 
 
-def fit_transform_of_tags(a: HungTags, b: HungTags) -> TagFit:
+def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
     """The transform that brings the tags of b onto those of a."""
     k = len(a.place_m)
     relative = a.turn @ b.turn.swapaxes(-1, -2)
@@ -168,7 +170,7 @@ def fit_transform_of_tags(a: HungTags, b: HungTags) -> TagFit:
     return TagFit(a, b, T, np.linalg.inv(information), rise, 6 * k - 3, nats)
 
 
-def _linearise(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _linearise(a: PlacedTags, b: PlacedTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
     k = len(a.place_m)
     turned = Rotation.from_euler("z", T[2]).as_matrix()
@@ -184,7 +186,7 @@ def _linearise(a: HungTags, b: HungTags, T: FloatArray) -> tuple[FloatArray, Flo
     return np.concatenate([apart, tilted], axis=1).ravel(), by_transform.reshape(-1, 3), S
 
 
-def _unmodelled(a: HungTags, b: HungTags) -> FloatArray:
+def _unmodelled(a: PlacedTags, b: PlacedTags) -> FloatArray:
     """(6 K,) sigmas beyond what covariances say, of each difference: a centimetre, and what moves a tag by that.
 
     What a mount's pitch or a lens's remains shift by a centimetre at its range, they turn by that over the range.

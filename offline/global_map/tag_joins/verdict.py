@@ -14,7 +14,7 @@ from groundsbot.offline.alignment import MARGIN_NATS, variance_factor
 from groundsbot.offline.corners import CornerSolution, NotPositiveError, Refined, alternative_states, solve_corners
 from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.fit import (
-    HungTags,
+    PlacedTags,
     TagFit,
     fit_transform_of_tags,
     placed_tags,
@@ -50,7 +50,7 @@ class Verdict:
         head = f"{b} shares only tag{'s' * (len(tags) > 1)} {ids} with {a}"
         fit = self.best
         if not fit.closes:
-            off = f"{fit.rise:.0f} squared sigmas, where chance explains {fit.freedom}"
+            off = f"{fit.cost_increase:.0f} squared sigmas, where chance explains {fit.freedom}"
             if len(tags) > 1:
                 return f"{head}, each run one of them, and they contradict each other ({off}): were tags moved?"
             return f"{head}, which hangs at another height there or leans another way ({off}): was it moved?"
@@ -96,13 +96,13 @@ def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, ta
     return Verdict(best, tuple(rivals), min(_most_heading_sigma(each, tags[0]) for each in (a, b)))
 
 
-def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[TagKey]) -> list[HungTags]:
+def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[TagKey]) -> list[PlacedTags]:
     """How the tags may hang in a component; of several only as they hang in its map: a wrong one would not fit."""
     refined = component.refined
     if refined is None:
         return []
     which = _indices(component, tags)
-    if not refined.corners.is_hung[which].all():
+    if not refined.corners.has_pose[which].all():
         return []
     factor = _variance_factor(maps, component, refined)
     anchor = int(component.graph.problem.anchor[which[0]])

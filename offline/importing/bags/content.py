@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.bags.frames import FixedFrames
 from groundsbot.offline.importing.bags.reader import Bag, BagMessage, BagTopic
-from groundsbot.offline.importing.bags.tags import Look, left_out_lines, read_look
+from groundsbot.offline.importing.bags.tags import BagPicture, left_out_lines, read_picture
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     CAMERA_INFO,
@@ -39,7 +39,7 @@ class BagContent:
 
     frames: FixedFrames
     odometry: list[tuple[int, Any]] = field(default_factory=list)
-    looks: list[Look] = field(default_factory=list)
+    pictures: list[BagPicture] = field(default_factory=list)
     sent_transforms: list[tuple[int, Any]] = field(default_factory=list)
     camera_infos: dict[str, Any] = field(default_factory=dict)
     left_out: Counter[str] = field(default_factory=Counter)
@@ -48,7 +48,7 @@ class BagContent:
     @property
     def camera_frames(self) -> set[str]:
         """The frames that detections name."""
-        return {look.frame for look in self.looks if look.sightings}
+        return {look.frame for look in self.pictures if look.tags}
 
     @property
     def base_frame(self) -> str:
@@ -81,17 +81,17 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
         elif (stamp_ns := clock.stamp_ns(each)) is None:
             continue
         elif each.msgtype in TAGS:
-            look, left_out = read_look(each.msgtype, each.content, stamp_ns, family)
-            content.looks.append(look)
+            look, left_out = read_picture(each.msgtype, each.content, stamp_ns, family)
+            content.pictures.append(look)
             content.left_out += left_out
         else:
             content.odometry.append((stamp_ns, each.content))
     clock.check([chosen.odometry] if chosen.has_pictures else [chosen.odometry, chosen.tags])
     content.odometry, n_odometry = _each_time_once(content.odometry, _odometry_keys(content.odometry))
-    content.looks, n_looks = _each_time_once(content.looks, [(look.stamp_ns,) for look in content.looks])
-    if not chosen.has_pictures and not any(look.sightings for look in content.looks):
+    content.pictures, n_looks = _each_time_once(content.pictures, [(look.stamp_ns,) for look in content.pictures])
+    if not chosen.has_pictures and not any(look.tags for look in content.pictures):
         told = "; ".join(
-            [f"no tag was seen in {plural(len(content.looks), 'picture')}", *left_out_lines(content.left_out)]
+            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *left_out_lines(content.left_out)]
         )
         raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
     content.remarks = clock.remarks()

@@ -35,7 +35,7 @@ class FixedFrames:
             if old_parent != parent or not np.allclose(values, old, rtol=0.0, atol=_SAME):
                 self._moving.add(child)
 
-    def knows(self, frame: str) -> bool:
+    def has(self, frame: str) -> bool:
         """Whether a transform names it."""
         return frame in self._links or any(parent == frame for parent, _ in self._links.values())
 

@@ -94,4 +94,4 @@ def _the_base(frames: FixedFrames, of_odometry: str, options: BagOptions) -> str
         return frame_name(options.base_frame)
     if of_odometry:
         return frame_name(of_odometry)
-    return next((each for each in _BASES if frames.knows(each)), _BASES[0])
+    return next((each for each in _BASES if frames.has(each)), _BASES[0])

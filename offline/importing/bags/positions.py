@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation import FloatArray, plural
-from groundsbot.offline.importing.bags.tags import Look, Sighting
+from groundsbot.offline.importing.bags.tags import BagPicture, BagTag
 from groundsbot.offline.importing.run_writer import Entry
 from groundsbot.onboard.log import TagObservation, TagObservations
 
@@ -17,7 +17,9 @@ _LEAST_SIGMA_M: Final = 1e-5
 _ASYMMETRY: Final = 1e-6
 
 
-def position_entries(looks: Sequence[Look], R_planar_frame: Rotation, frame: str) -> tuple[list[Entry], list[str]]:
+def position_entries(
+    looks: Sequence[BagPicture], R_planar_frame: Rotation, frame: str
+) -> tuple[list[Entry], list[str]]:
     """Messages for `/tags/observations`, and what a person should know of their covariances.
 
     Args:
@@ -29,7 +31,7 @@ def position_entries(looks: Sequence[Look], R_planar_frame: Rotation, frame: str
     n, n_sane, n_zero = 0, 0, 0
     for look in looks:
         observations = []
-        for each in look.sightings:
+        for each in look.tags:
             if each.position_m is None:
                 continue
             covariance = planar_covariance(each, R_planar_frame)
@@ -42,7 +44,7 @@ def position_entries(looks: Sequence[Look], R_planar_frame: Rotation, frame: str
     return entries, _covariance_sentence(n, n_sane, n_zero)
 
 
-def planar_covariance(sighting: Sighting, R_planar_frame: Rotation) -> FloatArray | None:
+def planar_covariance(sighting: BagTag, R_planar_frame: Rotation) -> FloatArray | None:
     """(2, 2) covariance of the position on the floor; None where the message's is none that a reading can have.
 
     It must be finite, symmetric and positive definite, with sigmas between a hundredth of a millimetre and the tag's
@@ -61,7 +63,7 @@ def planar_covariance(sighting: Sighting, R_planar_frame: Rotation) -> FloatArra
 
 
 def _observation(
-    each: Sighting, position_m: FloatArray, R_planar_frame: Rotation, covariance: FloatArray | None
+    each: BagTag, position_m: FloatArray, R_planar_frame: Rotation, covariance: FloatArray | None
 ) -> TagObservation:
     message = TagObservation(family=each.family, tag_id=each.tag_id)
     x_m, y_m, z_m = R_planar_frame.apply(position_m).tolist()

@@ -18,7 +18,7 @@ from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.pictures import camera_of
 from groundsbot.offline.importing.bags.positions import position_entries
 from groundsbot.offline.importing.bags.reader import Bag, BagTopic
-from groundsbot.offline.importing.bags.tags import Look, left_out_lines, with_tf_positions
+from groundsbot.offline.importing.bags.tags import BagPicture, left_out_lines, with_tf_positions
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     APRILTAG_ROS,
@@ -124,7 +124,7 @@ def tag_entries(
         if chosen.has_pictures:
             entries, remarks = detect_in_bag(bag, chosen.tags, camera.model, robot, options, progress)
         else:
-            entries, remarks = _corner_entries(content.looks, camera.model, chosen.tags), []
+            entries, remarks = _corner_entries(content.pictures, camera.model, chosen.tags), []
         found = TagEntries(entries, camera.model, [f"camera: {camera.said}", *remarks])
     elif chosen.has_pictures or options.tag_size_m is not None:
         missing = "their size; give --tag-size-m, or --robot with `tags`" if camera else "a CameraInfo; record it"
@@ -141,7 +141,7 @@ def tag_entries(
     return TagEntries(found.entries, found.camera, [*said, *found.remarks])
 
 
-def _corner_entries(looks: Sequence[Look], camera: CameraModel, topic: BagTopic) -> list[Entry]:
+def _corner_entries(looks: Sequence[BagPicture], camera: CameraModel, topic: BagTopic) -> list[Entry]:
     return [
         (
             look.stamp_ns,
@@ -155,7 +155,7 @@ def _corner_entries(looks: Sequence[Look], camera: CameraModel, topic: BagTopic)
                     tag_message(
                         Detection(each.family, each.tag_id, each.hamming, each.decision_margin, each.corners_px)
                     )
-                    for each in look.sightings
+                    for each in look.tags
                     if each.corners_px is not None
                 ],
                 detector=topic.short_type.partition("/")[0],
@@ -167,11 +167,11 @@ def _corner_entries(looks: Sequence[Look], camera: CameraModel, topic: BagTopic)
 
 def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Robot, in_camera: bool) -> TagEntries:
     """Where the detector put the tags itself."""
-    looks: Sequence[Look] = content.looks
+    looks: Sequence[BagPicture] = content.pictures
     if chosen.tags.msgtype == APRILTAG_MSGS:
         looks = with_tf_positions(looks, content.sent_transforms)
-    n = sum(len(look.sightings) for look in looks)
-    n_placed = sum(each.position_m is not None for look in looks for each in look.sightings)
+    n = sum(len(look.tags) for look in looks)
+    n_placed = sum(each.position_m is not None for look in looks for each in look.tags)
     if not n_placed:
         raise OfflineError(
             f"{where}: has corners but no positions, nor has tf; to place tags by their corners, give --tag-size-m or "

@@ -29,7 +29,7 @@ _PIXEL_CENTRE_PX: Final = 0.5
 
 
 @dataclass(frozen=True)
-class Sighting:
+class BagTag:
     """One tag in one picture, by its corners, its place, or both.
 
     Attributes:
@@ -50,15 +50,15 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class Look:
+class BagPicture:
     """One picture's tags. `frame` is the camera's optical frame."""
 
     stamp_ns: int
     frame: str
-    sightings: tuple[Sighting, ...]
+    tags: tuple[BagTag, ...]
 
 
-def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[Look, Counter[str]]:  # noqa: ANN401 - made by rosbags
+def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[BagPicture, Counter[str]]:  # noqa: ANN401 - made by rosbags
     """One message of detections.
 
     Args:
@@ -77,9 +77,9 @@ def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[L
                 left_out["a bundle of several tags"] += 1
                 continue
             frame = frame_name(detection.pose.header.frame_id) or frame
-            sighting = _with_pose(Sighting(family, int(detection.id[0])), detection.pose.pose, with_rotation=True)
+            sighting = _with_pose(BagTag(family, int(detection.id[0])), detection.pose.pose, with_rotation=True)
         elif msgtype == APRILTAG_MSGS:
-            sighting = Sighting(
+            sighting = BagTag(
                 _family(detection.family),
                 detection.id,
                 detection.hamming,
@@ -87,7 +87,7 @@ def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[L
                 _corners(detection.corners)[::-1] - _PIXEL_CENTRE_PX,
             )
         else:
-            sighting = Sighting(
+            sighting = BagTag(
                 _family(detection.family), detection.id, corners_px=_corners(detection.corners) - _PIXEL_CENTRE_PX
             )
             sighting = _with_pose(sighting, detection.pose.pose, with_rotation=False)
@@ -96,7 +96,7 @@ def read_look(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[L
             found.append(sighting)
         else:
             left_out[why_not] += 1
-    return Look(stamp_ns, frame, tuple(found)), left_out
+    return BagPicture(stamp_ns, frame, tuple(found)), left_out
 
 
 def left_out_lines(left_out: Mapping[str, int]) -> list[str]:
@@ -104,7 +104,7 @@ def left_out_lines(left_out: Mapping[str, int]) -> list[str]:
     return [f"{plural(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
 
 
-def with_tf_positions(looks: Sequence[Look], transforms: Iterable[tuple[int, Any]]) -> list[Look]:
+def with_tf_positions(looks: Sequence[BagPicture], transforms: Iterable[tuple[int, Any]]) -> list[BagPicture]:
     """Looks whose tags have the places that the detector sent as tf: same stamp, same camera, a name with their number.
 
     Args:
@@ -121,16 +121,15 @@ def with_tf_positions(looks: Sequence[Look], transforms: Iterable[tuple[int, Any
     return [
         replace(
             look,
-            sightings=tuple(
-                replace(each, position_m=places.get((look.stamp_ns, look.frame, each.tag_id)))
-                for each in look.sightings
+            tags=tuple(
+                replace(each, position_m=places.get((look.stamp_ns, look.frame, each.tag_id))) for each in look.tags
             ),
         )
         for look in looks
     ]
 
 
-def _with_pose(sighting: Sighting, pose_with_covariance: Any, *, with_rotation: bool) -> Sighting:  # noqa: ANN401
+def _with_pose(sighting: BagTag, pose_with_covariance: Any, *, with_rotation: bool) -> BagTag:  # noqa: ANN401
     p, q = pose_with_covariance.pose.position, pose_with_covariance.pose.orientation
     return replace(
         sighting,
@@ -151,7 +150,7 @@ def _family(name: str) -> str:
     return name if name.startswith("tag") else f"tag{name}"
 
 
-def _why_not(sighting: Sighting) -> str | None:
+def _why_not(sighting: BagTag) -> str | None:
     if sighting.family not in families():
         return f"family {sighting.family!r} is not known"
     if not 0 <= sighting.tag_id < family_size(sighting.family):

@@ -10,7 +10,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
 from groundsbot.offline.local_map import run_without_log, segment_from_arrays
-from groundsbot.offline.localization.online.kernels import Motions, Sights
+from groundsbot.offline.localization.online.kernels import Motions, PresentObservations
 from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam import (
     NO_PARAMETER,
@@ -47,7 +47,7 @@ class TagReading:
     in_camera: bool = True
 
 
-class Table:
+class GrowingArrays:
     """Rows of named arrays that grow: copied when they double, so an hour's drive is copied in under a millisecond."""
 
     def __init__(self, **columns: tuple[tuple[int, ...], type]) -> None:
@@ -70,7 +70,7 @@ class Table:
         return self._columns[name][: self.n]
 
 
-class Drive:
+class DriveHistory:
     """Motions and readings in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
 
     def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
@@ -87,12 +87,12 @@ class Drive:
         self._of_camera = [index[each] for each in parameters_of_camera(robot)]
         self._none = index[NO_PARAMETER]
         square, n_camera = ((3, 3), float), len(CAMERA_PARAMETERS)
-        self._motions = Table(
+        self._motions = GrowingArrays(
             motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
         )
-        self._poses = Table(T=((3,), float))
+        self._poses = GrowingArrays(T=((3,), float))
         self._poses.append(T=np.zeros(3))
-        self._readings = Table(
+        self._readings = GrowingArrays(
             keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
             in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, n_camera), float),
             parameters=((4 + n_camera,), int),
@@ -145,10 +145,13 @@ class Drive:
         """The motions to the keyframes after `begin` up to `end`."""
         return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
 
-    def sights(self, begin: int, end: int, keyframe: int) -> Sights:
+    def sights(self, begin: int, end: int, keyframe: int) -> PresentObservations:
         """Some readings, poses counted from a keyframe."""
         table = self._readings
-        return Sights(table["keyframe"][begin:end] - keyframe, *(table[name][begin:end] for name in Sights._fields[1:]))
+        return PresentObservations(
+            table["keyframe"][begin:end] - keyframe,
+            *(table[name][begin:end] for name in PresentObservations._fields[1:]),
+        )
 
     def segment(self, tags: Mapping[TagKey, int]) -> Segment:
         """All of it, as from a log; the tags by their indices."""

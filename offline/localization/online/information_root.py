@@ -14,10 +14,10 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.localization.online.drive import Drive
-from groundsbot.offline.localization.online.kernels import BY_POINTS, Border, Motions, Sights, sweep
+from groundsbot.offline.localization.online.drive import DriveHistory
+from groundsbot.offline.localization.online.kernels import BY_POINTS, Border, Motions, PresentObservations, sweep
 from groundsbot.offline.localization.online.moving_frame import (
-    Known,
+    BorderPrior,
     minimise_on_arcs,
     pose_among,
     rotate_step,
@@ -47,7 +47,7 @@ _LEAST_COSTS: Final = 2
 _MOST_COSTS: Final = 24
 
 
-class Lifted(NamedTuple):
+class LeaveOneOut(NamedTuple):
     """A tag of the map whose place there does not count: all else moves by `by_shift` (3 + n, 2) times its shift.
 
     Attributes:
@@ -166,9 +166,9 @@ class OnlineRoot:
         return Border(self._root, self._right, self.prior.columns, self._at_tags)
 
     @property
-    def _prior(self) -> Known:
+    def _prior(self) -> BorderPrior:
         prior = self.prior
-        return Known(*prior.whole)
+        return BorderPrior(*prior.whole)
 
     # Tags.
 
@@ -196,7 +196,7 @@ class OnlineRoot:
         off = self.offsets - prior.off
         return leave_one_out_test(self._border, self._pose, self._prior.root, off, prior.n, at, UNMODELLED_SIGMA_M**2)
 
-    def leave_one_out(self, tag: int) -> Lifted:
+    def leave_one_out(self, tag: int) -> LeaveOneOut:
         """What comes of all if one tag that holds the robot did not: its shift is one more unknown."""
         prior, at = self.prior, self.prior.first_tag + 2 * tag
         ways = prior.root[:, at : at + 2].T @ prior.root  # of the prior's information
@@ -204,9 +204,9 @@ class OnlineRoot:
         checked = ways[:, at : at + 2] - taken @ taken.T
         covariance = np.asarray(np.linalg.pinv(checked, rcond=1e-9, hermitian=True), dtype=np.float64)
         by_shift = np.column_stack([self.through(each.copy()) for each in taken])
-        return Lifted(at, by_shift, covariance @ ways @ (self.offsets - prior.off), covariance)
+        return LeaveOneOut(at, by_shift, covariance @ ways @ (self.offsets - prior.off), covariance)
 
-    def free_squares(self, free: Sequence[tuple[int, TagKey]], lifted: Lifted | None = None) -> float:
+    def free_squares(self, free: Sequence[tuple[int, TagKey]], lifted: LeaveOneOut | None = None) -> float:
         """Likewise of tags that do not hold the robot, against where the map has them; as if another did not."""
         prior = self.prior
         tags, of_map = [tag for tag, _ in free], [each for _, each in free]
@@ -226,11 +226,11 @@ class OnlineRoot:
 
     # Motions and readings.
 
-    def is_at_end_of(self, drive: Drive) -> bool:
+    def is_at_end_of(self, drive: DriveHistory) -> bool:
         """Whether all motions and readings are taken."""
         return self.keyframe == len(drive.poses) - 1 and self.n_readings == len(drive.keyframe)
 
-    def advance(self, drive: Drive) -> None:
+    def advance(self, drive: DriveHistory) -> None:
         """Takes motions and readings of the drive, as many as make a slice, weighed by what they leave at its poses."""
         keyframes, last = drive.keyframe, len(drive.poses) - 1
         until = min(len(keyframes), self.n_readings + max(1, SLICE // (4 * self.prior.n**2 + 1)))
@@ -241,7 +241,7 @@ class OnlineRoot:
         points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
         self._take(drive, points, sights, np.full(until - self.n_readings, BY_POINTS))
 
-    def take_last(self, drive: Drive) -> None:
+    def take_last(self, drive: DriveHistory) -> None:
         """Takes what came last, one motion or one reading, all else being taken; weighed by what it leaves over."""
         end, until = len(drive.poses) - 1, len(drive.keyframe)
         points = self.point[None]
@@ -255,26 +255,26 @@ class OnlineRoot:
         pose = propagate(self.pose, motion, 0, self.calibration)
         return pose_among(self.prior.places_m, self.places_m, pose)
 
-    def surprise(self, sights: Sights, unmodelled_m: float) -> float:
+    def normalised_innovation_squared(self, sights: PresentObservations, unmodelled_m: float) -> float:
         """Squared sigmas of the first reading from what is foretold, its tag being off by as much besides."""
         residual, rows, by_tag = self._predict(sights)
         spread = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
         return float(residual @ np.linalg.solve(spread, residual))
 
-    def _weight(self, sights: Sights) -> float:
+    def _weight(self, sights: PresentObservations) -> float:
         at = self.prior.first_tag + 2 * int(sights.tag[0])
         if not (self.is_determined and self._root[at, at] > 0.0 and self._root[at + 1, at + 1] > 0.0):
             return 1.0  # nothing tells of its tag yet
         residual, rows, _ = self._predict(sights)
         return huber_weight(residual, self.variance_of(rows), HUBER_THRESHOLD)
 
-    def _predict(self, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _predict(self, sights: PresentObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
         return predict(self._border, self.prior.n, sights, self._values(self.point[None]), self.step)
 
     def _values(self, poses: FloatArray) -> Values:
         return Values(poses, self.prior.places_m, self.prior.calibration)
 
-    def _take(self, drive: Drive, points: FloatArray, sights: Sights, weights: FloatArray) -> None:
+    def _take(self, drive: DriveHistory, points: FloatArray, sights: PresentObservations, weights: FloatArray) -> None:
         n, end = self.prior.n, self.keyframe + len(points) - 1
         left = np.empty((end - self.keyframe, 3, 7 + n))
         motions, values = drive.motions(self.keyframe, end), self._values(points)

@@ -41,7 +41,7 @@ class Motions(NamedTuple):
     parameters: IntArray
 
 
-class Sights(NamedTuple):
+class PresentObservations(NamedTuple):
     """`sam.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
 
     pose: IntArray
@@ -75,7 +75,7 @@ def sweep(
     pose: FloatArray,
     n: int,
     motions: Motions,
-    sights: Sights,
+    sights: PresentObservations,
     weights: FloatArray,
     values: Values,
     threshold: float,
@@ -109,7 +109,7 @@ def sweep(
                 weight = threshold / length if length > threshold else 1.0
             root = np.sqrt(weight)
             for i in range(2):
-                spread_out(border, sights, k, J[i], row)
+                inflate(border, sights, k, J[i], row)
                 row *= root
                 row[3] = -root * r[i]
                 _take_row(border, pose, n, row)
@@ -117,7 +117,7 @@ def sweep(
 
 
 @inner
-def spread_out(border: Border, sights: Sights, k: int, derivative: FloatArray, row: FloatArray) -> None:
+def inflate(border: Border, sights: PresentObservations, k: int, derivative: FloatArray, row: FloatArray) -> None:
     """A reading's derivative by pose, tag and calibration as a row (pose, d, border)."""
     row[:] = 0.0
     row[:3] = derivative[:3]

@@ -16,9 +16,9 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
 from groundsbot.offline.alignment import GROUP_MARGIN, reason_not_joined
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.localization.map_prior import KnownMap, prior_from_map
+from groundsbot.offline.localization.map_prior import MapPrior, prior_from_map
 from groundsbot.offline.localization.online.drive import TagReading
-from groundsbot.offline.localization.online.prior import Numbers
+from groundsbot.offline.localization.online.prior import CalibrationNumbers
 from groundsbot.offline.localization.online.settle import localize_drive, solve_again
 from groundsbot.offline.localization.online.smoother import Smoother
 from groundsbot.offline.localization.online.start_search import SeenTags, StartSearch
@@ -172,14 +172,14 @@ class OnlineLocalizer:
         front, tags = self._smoother.front, list(self._index)
         if front is None:
             return
-        start = self._search.look(SeenTags(tuple(tags), front.places_m, front.tags_covariance()))
+        start = self._search.search(SeenTags(tuple(tags), front.places_m, front.tags_covariance()))
         if start is not None:
             held = dict(start.tags)
             maybe = {i: self._known.instances.get(tag, ()) for tag, i in self._index.items() if i not in held}
             self._smoother.place(start.T_map_start, held, maybe)
 
 
-def _warm_up(smoother: Smoother, known: KnownMap, scales: dict[Parameter, int]) -> None:
+def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) -> None:
     """Calls all that is compiled once, in a drive that nobody drives: compiling or loading takes its time."""
     if not known.tags:
         return
@@ -196,7 +196,7 @@ def _warm_up(smoother: Smoother, known: KnownMap, scales: dict[Parameter, int]) 
         smoother.front.pose_covariance()
 
 
-def _numbers(parameters: list[Parameter], known: KnownMap) -> Numbers:
+def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers:
     """As robot.yaml says, and as the map found it where it did."""
     in_known = known.numbers_among(parameters)
     mean, covariance = np.zeros(len(parameters)), np.diag([p.sigma**2 for p in parameters])
@@ -206,10 +206,10 @@ def _numbers(parameters: list[Parameter], known: KnownMap) -> Numbers:
     mean[own] = known.calibration.values[in_map]
     covariance[np.ix_(own, own)] = known.covariance[np.ix_(rows[own], rows[own])]
     free = np.diag(covariance) > 0.0
-    return Numbers(mean, covariance, np.where(free, np.cumsum(free) - 1, -1), rows)
+    return CalibrationNumbers(mean, covariance, np.where(free, np.cumsum(free) - 1, -1), rows)
 
 
-def _parameters(robot: Robot, known: KnownMap) -> list[Parameter]:
+def _parameters(robot: Robot, known: MapPrior) -> list[Parameter]:
     """All that readings of the map's tags, and of others of the same batches, depend on."""
     scales = {parameter_of_scale(robot, tag) for tag in known.tags}
     return [

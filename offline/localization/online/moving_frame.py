@@ -23,7 +23,7 @@ _LEAST_SHARE: Final = 1e-3  # of a step: shorter ones are rounding
 _NEAR_M: Final = 1.0
 
 
-class Known(NamedTuple):
+class BorderPrior(NamedTuple):
     """What the map tells of a border, see `OnlinePrior`, of which as many rows and columns count as it is long.
 
     Attributes:
@@ -37,7 +37,7 @@ class Known(NamedTuple):
 
 
 @njit
-def rotate_step(known: Known, step: FloatArray, first: int) -> FloatArray:
+def rotate_step(known: BorderPrior, step: FloatArray, first: int) -> FloatArray:
     """(n,) how far a step (n,) of the border, tags from column `first` on, moves it, when its tags turn along arcs."""
     moved = step.copy()
     _turn(known, step, first, moved)
@@ -45,13 +45,13 @@ def rotate_step(known: Known, step: FloatArray, first: int) -> FloatArray:
 
 
 @njit
-def twist_of(known: Known, step: FloatArray, first: int) -> FloatArray:
+def twist_of(known: BorderPrior, step: FloatArray, first: int) -> FloatArray:
     """(5,) what is common to the steps of all tags: a twist (turn and motion, as of a pose), and their middle."""
     return _twist(known, step, first)[0]
 
 
 @inner
-def _twist(known: Known, step: FloatArray, first: int) -> tuple[FloatArray, float]:
+def _twist(known: BorderPrior, step: FloatArray, first: int) -> tuple[FloatArray, float]:
     """And the tags' lever (m^2) about their middle."""
     twist, lever, m = np.zeros(5), 0.0, (len(step) - first) // 2
     for t in range(m):
@@ -67,7 +67,7 @@ def _twist(known: Known, step: FloatArray, first: int) -> tuple[FloatArray, floa
 
 
 @inner
-def _turn(known: Known, step: FloatArray, first: int, moved: FloatArray) -> tuple[FloatArray, float]:
+def _turn(known: BorderPrior, step: FloatArray, first: int, moved: FloatArray) -> tuple[FloatArray, float]:
     """Has all tags move by the exponential of their twist, and what is left of each step turn with them."""
     twist, lever = _twist(known, step, first)
     turn = twist[0]
@@ -83,7 +83,9 @@ def _turn(known: Known, step: FloatArray, first: int, moved: FloatArray) -> tupl
 
 
 @inner
-def _turn_back(known: Known, step: FloatArray, first: int, told: tuple[FloatArray, float], slope: FloatArray) -> None:
+def _turn_back(
+    known: BorderPrior, step: FloatArray, first: int, told: tuple[FloatArray, float], slope: FloatArray
+) -> None:
     """Makes a slope (n,) by where the border is one by the step."""
     twist, lever = told
     turn = twist[0]
@@ -111,7 +113,7 @@ def _turn_back(known: Known, step: FloatArray, first: int, told: tuple[FloatArra
 
 
 @inner
-def _cost(border: Border, known: Known, z: FloatArray, slope: FloatArray) -> float:
+def _cost(border: Border, known: BorderPrior, z: FloatArray, slope: FloatArray) -> float:
     """Half the squared sigmas of S^-1 (d + z), less a constant; takes the slope by z."""
     n, first, root = len(z), border.first_tag[0], known.root
     step, straight, bent = np.empty(n), np.empty(n), np.empty(n)
@@ -156,7 +158,7 @@ def _substitute_transpose(border: Border, slope: FloatArray) -> None:
 
 
 @njit
-def minimise_on_arcs(border: Border, known: Known, begin: FloatArray, most: int) -> FloatArray:
+def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, most: int) -> FloatArray:
     """(n,) z with the cost of S^-1 (d + z) least, tags turning along arcs.
 
     Limited-memory quasi-Newton (Nocedal and Wright, "Numerical Optimization", 2006, 7.2) in the coordinates in which

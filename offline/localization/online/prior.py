@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.localization.map_prior import KnownMap
+from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import whitening
 
@@ -20,7 +20,7 @@ _ROOM: Final = 64
 
 
 @dataclass(frozen=True)
-class Numbers:
+class CalibrationNumbers:
     """The calibration.
 
     Attributes:
@@ -45,7 +45,7 @@ class OnlinePrior:
         first_tag: column of the first tag.
     """
 
-    def __init__(self, known: KnownMap, numbers: Numbers, calibration: FloatArray) -> None:
+    def __init__(self, known: MapPrior, numbers: CalibrationNumbers, calibration: FloatArray) -> None:
         """Without tags.
 
         Args:

@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import njit
-from groundsbot.offline.localization.online.kernels import Border, Motions, Sights, spread_out
+from groundsbot.offline.localization.online.kernels import Border, Motions, PresentObservations, inflate
 from groundsbot.offline.sam import N_READING, Values, motion_at, reading_factor, series, wheel_correction, wrap
 
 # Of what is checked of a tag, below which rounding is all there is.
@@ -100,13 +100,13 @@ def leave_one_out_test(
 
 @njit
 def predict(
-    border: Border, n: int, sights: Sights, values: Values, step: FloatArray
+    border: Border, n: int, sights: PresentObservations, values: Values, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What the first reading leaves over as of now (2,), its derivatives (2, 3 + n), and those by its tag (2, 2)."""
     r, J, row, rows = np.empty(2), np.empty((2, N_READING)), np.empty(4 + n), np.empty((2, 3 + n))
     reading_factor(sights, 0, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
     for i in range(2):
-        spread_out(border, sights, 0, J[i], row)
+        inflate(border, sights, 0, J[i], row)
         rows[i, :3], rows[i, 3:] = row[:3], row[4:]
         for j in range(3 + n):
             r[i] += rows[i, j] * step[j]

@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.local_map import Goodness, LocalMap, solve_local_map
-from groundsbot.offline.localization.map_prior import KnownMap
+from groundsbot.offline.local_map import GoodnessOfFit, LocalMap, solve_local_map
+from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.localization.online.smoother import Smoother
 from groundsbot.offline.localization.placement import Located, locate
 from groundsbot.offline.localization.solve_in_map import solve_in_map
@@ -15,10 +15,10 @@ from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import Parameter, Solution, build_graph
 
 _COMPONENT: Final = 0  # there is one only
-_UNJUDGED: Final = Goodness(0.0, 0, 0.0, 1.0, 1.0)
+_UNJUDGED: Final = GoodnessOfFit(0.0, 0, 0.0, 1.0, 1.0)
 
 
-def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: KnownMap) -> Located | None:
+def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: MapPrior) -> Located | None:
     """Where a drive lies in the map as `localize` would say, whatever holds it; None without tags of the map.
 
     Args:
@@ -35,7 +35,7 @@ def solve_again(
     smoother: Smoother,
     tags: Mapping[TagKey, int],
     parameters: Sequence[Parameter],
-    known: KnownMap,
+    known: MapPrior,
     placed: Located | None,
 ) -> None:
     """Solves it all, tags that were moved apart, and has the smoother go on from there.

@@ -16,12 +16,12 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.alignment import TAG_GATE
-from groundsbot.offline.localization.map_prior import KnownMap
-from groundsbot.offline.localization.online.drive import Drive, TagReading
+from groundsbot.offline.localization.map_prior import MapPrior
+from groundsbot.offline.localization.online.drive import DriveHistory, TagReading
 from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
-from groundsbot.offline.localization.online.kernels import Sights
+from groundsbot.offline.localization.online.kernels import PresentObservations
 from groundsbot.offline.localization.online.moving_frame import pose_among
-from groundsbot.offline.localization.online.prior import Numbers, OnlinePrior
+from groundsbot.offline.localization.online.prior import CalibrationNumbers, OnlinePrior
 from groundsbot.offline.localization.online.queries import back_substitute, move, propagate
 from groundsbot.offline.localization.online.tag_test import CALLED, TagJudge
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
@@ -33,10 +33,10 @@ _POSES_A_SLICE: Final = 256
 class Smoother:
     """Poses, tags and calibration of one drive, in the frame of its start or, once that is placed, of the map."""
 
-    def __init__(self, known: KnownMap, robot: Robot, parameters: list[Parameter], numbers: Numbers) -> None:
+    def __init__(self, known: MapPrior, robot: Robot, parameters: list[Parameter], numbers: CalibrationNumbers) -> None:
         """Stands at the start."""
         self._known, self._numbers = known, numbers
-        self.drive = Drive(robot, parameters)
+        self.drive = DriveHistory(robot, parameters)
         self._judge = TagJudge({}, {})
         self.is_placed = False
         self._calibration = numbers.mean.copy()
@@ -71,7 +71,7 @@ class Smoother:
         """Of a tag by its index; the map's tags that it may be."""
         self.drive.add_reading(tag, reading, scale)
         if tag == len(self._places):
-            self._first_sight(tag, instances)
+            self._add_first_observation(tag, instances)
         self._take_last()
 
     def _take_last(self) -> None:
@@ -88,7 +88,7 @@ class Smoother:
         """Some more of the present round."""
         next(self._work)
 
-    def _first_sight(self, tag: int, instances: tuple[TagKey, ...]) -> None:
+    def _add_first_observation(self, tag: int, instances: tuple[TagKey, ...]) -> None:
         """A tag comes in where the map foretells it, or where the reading puts it."""
         drive, front = self.drive, self.front
         last = len(drive.keyframe) - 1
@@ -97,7 +97,7 @@ class Smoother:
         if front is not None and self.is_placed:
             for of_map in instances:
                 front.add_tag(_place_m(sights, front.point, front.prior.calibration), of_map)
-                if front.surprise(sights, UNMODELLED_SIGMA_M) < TAG_GATE:
+                if front.normalised_innovation_squared(sights, UNMODELLED_SIGMA_M) < TAG_GATE:
                     self.map_tags[tag] = of_map
                     return
                 front.drop_last_tag()
@@ -172,7 +172,7 @@ class Smoother:
         yield
 
 
-def _place_m(sights: Sights, pose: FloatArray, calibration: FloatArray) -> FloatArray:
+def _place_m(sights: PresentObservations, pose: FloatArray, calibration: FloatArray) -> FloatArray:
     """(2,) where the first reading puts its tag; see `sam.ReadingFactors`."""
     numbers = calibration[sights.parameters[0]]
     first, second = sights.value[0] + sights.by_camera[0] @ numbers[4:]

@@ -15,18 +15,18 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import (
     CHANCE_NATS,
-    Bend,
     Explanation,
-    Linear,
-    Rivalry,
+    FitState,
+    HypothesisTest,
+    LinearisedFit,
     distances,
+    gate_ratio,
     hold,
-    ill_fitting,
     is_same_distance,
     rotate_quarter,
     through,
 )
-from groundsbot.offline.localization.map_prior import KnownMap
+from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 
 _STEPS: Final = 4
@@ -65,14 +65,14 @@ class Start:
 class StartSearch:
     """Goes through the pairs of tags seen, one a call, and begins anew when there is another tag, or no verdict."""
 
-    def __init__(self, known: KnownMap) -> None:
+    def __init__(self, known: MapPrior) -> None:
         self._known = known
         self._pairs: list[tuple[int, TagKey]] = []
         self._left: list[tuple[int, int]] | None = None  # pairs to look at; None when it begins anew
         self._found: list[Explanation] = []
         self.reason = "no tag of the map was seen yet"
 
-    def look(self, seen: SeenTags) -> Start | None:
+    def search(self, seen: SeenTags) -> Start | None:
         """Looks a little further; the start when that is sure, else None and `reason`."""
         pairs = [(i, tag) for i, own in enumerate(seen.tags) for tag in self._known.instances.get(own, ())]
         if len({i for i, _ in pairs}) < 2:
@@ -98,10 +98,10 @@ class StartSearch:
         if not self._found:
             self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
             return None
-        rivalry = Rivalry(fit.places_a, fit.places_b)
+        rivalry = HypothesisTest(fit.places_a, fit.places_b)
         found = sorted(((rivalry.evidence(each), each) for each in self._found), key=lambda f: -f[0])
         evidence, best = found[0]
-        if rivalry.rivals(best, found, [each for _, each in found]):
+        if rivalry.alternatives(best, found, [each for _, each in found]):
             self.reason = "ambiguous, because two groups of tags put the start in different places"
             return None
         fitting = {self._pairs[i][0] for i in np.flatnonzero(best.members)}
@@ -118,7 +118,7 @@ class StartSearch:
 class _RigidFit:
     """The map's tags against those seen, taken as pairs."""
 
-    def __init__(self, known: KnownMap, seen: SeenTags, pairs: Sequence[tuple[int, TagKey]]) -> None:
+    def __init__(self, known: MapPrior, seen: SeenTags, pairs: Sequence[tuple[int, TagKey]]) -> None:
         own = np.array([i for i, _ in pairs], dtype=np.int64)
         rows: IntArray = (2 * own[:, None] + np.arange(2)).reshape(-1)
         in_map = known.rows([tag for _, tag in pairs])
@@ -145,14 +145,14 @@ class _RigidFit:
             held = hold(self._linear(T), members)
             T = held.T_a_b
             off, spread = held.others()
-            fitting = members | (ill_fitting(off, spread) < 1.0)
+            fitting = members | (gate_ratio(off, spread) < 1.0)
             if (fitting == members).all():
                 break
             members = fitting
         held = hold(self._linear(T), members)
         return Explanation(members, held.linear, held) if held.closes else None
 
-    def _linear(self, T: FloatArray) -> Linear:
+    def _linear(self, T: FloatArray) -> LinearisedFit:
         cos, sin = np.cos(T[2]), np.sin(T[2])
         R = np.array([[cos, -sin], [sin, cos]])
         n = self.n
@@ -164,8 +164,8 @@ class _RigidFit:
         by_transform[:, :, 2] = -rotate_quarter(in_a - centre)
         covariance = self._covariance_a + turned
         covariance[np.diag_indices(2 * n)] += UNMODELLED_SIGMA_M**2
-        unbent = Bend(T, _NONE, _NONE)
+        unbent = FitState(T, _NONE, _NONE)
         none = np.zeros((2 * n, 0))
-        return Linear(
+        return LinearisedFit(
             unbent, centre, (self.places_a - in_a).reshape(-1), covariance, by_transform.reshape(-1, 3), none, none
         )

@@ -6,7 +6,7 @@ from typing import Final
 
 from scipy.stats import chi2
 
-from groundsbot.offline.localization.online.information_root import SLICE, Lifted, OnlineRoot
+from groundsbot.offline.localization.online.information_root import SLICE, LeaveOneOut, OnlineRoot
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers import FALSE_ALARM
 
@@ -74,7 +74,7 @@ class TagJudge:
             self._changed = {}  # by a tag that did not stay
             self._let_go(outvoted, n_readings)
 
-    def _fit(self, root: OnlineRoot, tags: dict[int, TagKey], lifted: Lifted) -> bool:
+    def _fit(self, root: OnlineRoot, tags: dict[int, TagKey], lifted: LeaveOneOut) -> bool:
         squares = root.free_squares(list(tags.items()), lifted)
         return squares < _chi_square_bound(root.prior.n_tags, len(tags))
 

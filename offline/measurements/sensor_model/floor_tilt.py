@@ -65,7 +65,7 @@ def floor_tilt_rad(found: TagReadings, tag: IntArray, keyframe: IntArray, camera
     return float(np.sqrt(high))
 
 
-def spread_by_tilt(found: TagReadings, tilt_rad: float) -> TagReadings:
+def inflate_by_tilt(found: TagReadings, tilt_rad: float) -> TagReadings:
     """Readings by the upright model with residuals whitened by what a floor that tilts adds to their covariance.
 
     With B = U S V^T their derivative by roll and pitch, I + tilt^2 B B^T has the inverse root

@@ -94,7 +94,7 @@ class Readings:
         """The same readings under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
-    def spread(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Readings":
+    def inflate(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Readings":
         """The same readings with the sigmas of their whitened components (M, 2) so many times as large.
 
         Those of the corners (M,) grow by what is given for them, else like the larger of the two.

@@ -12,7 +12,7 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, RANGE_OFFSET, TIME_OFFSET,
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
-from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, reading_by_tilt
 from groundsbot.offline.measurements.sensor_model.readings import Readings, no_readings
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.stationary_corners import average_corners
@@ -21,7 +21,7 @@ from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     FALSE_ALARM,
     UPRIGHT_DOF,
     are_tilted,
-    askew,
+    find_tilted,
     level_of,
     with_common_turn,
 )
@@ -78,7 +78,7 @@ def read_detections(
     at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
     bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros((len(tag), 2))
     sigmas_px = np.hypot(noise.sigma_corner_px, bias_px[:, 0])
-    found, is_askew, level, tilt_rad = _upright_or_askew(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
+    found, is_askew, level, tilt_rad = _upright_or_tilted(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
     good = _good(found, is_askew, level)
     n, kept = int(good.sum()), found.where(good)
     by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
@@ -126,7 +126,7 @@ def _warnings(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
     return told
 
 
-def _upright_or_askew(
+def _upright_or_tilted(
     run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigmas_px: FloatArray
 ) -> tuple[TagReadings, BoolArray, FloatArray, float]:
     """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
@@ -141,7 +141,7 @@ def _upright_or_askew(
     level, camera_m = max(level_of(upright.chi2), 1.0), np.array([mount.x_m, mount.y_m])
     tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
     if tilt_rad:
-        upright = spread_by_tilt(upright, tilt_rad)
+        upright = inflate_by_tilt(upright, tilt_rad)
     sigma = np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
     chi2 = with_common_turn(upright, tag, _mount_axes(run.robot), sigma)
     level = level_of(chi2)
@@ -150,7 +150,7 @@ def _upright_or_askew(
         is_doubted,
         general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
     )
-    is_askew = np.isin(tag, askew(tag, chi2, general.chi2, is_doubted))
+    is_askew = np.isin(tag, find_tilted(tag, chi2, general.chi2, is_doubted))
     spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
     found = upright.replace(is_askew, general.where(is_askew))
     least_px = sigmas_px.min()

@@ -25,7 +25,7 @@ def average_corners(
     pictures, in_picture = np.unique(np.column_stack([group, stamps_ns]), axis=0, return_counts=True)
     for pair in np.unique(pictures[in_picture > 1, 0]).tolist():
         own = np.flatnonzero(group == pair)
-        twin[own] = _twins(corners_px[own], stamps_ns[own])
+        twin[own] = _duplicates(corners_px[own], stamps_ns[own])
     pairs = pairs[group] * (int(twin.max()) + 1) + twin
     pairs, first, group, count = np.unique(pairs, return_index=True, return_inverse=True, return_counts=True)
     total = np.zeros((len(pairs), 4, 2))
@@ -33,7 +33,7 @@ def average_corners(
     return keyframe[first], tag[first], total / count[:, None, None]
 
 
-def _twins(corners_px: FloatArray, stamps_ns: IntArray) -> IntArray:
+def _duplicates(corners_px: FloatArray, stamps_ns: IntArray) -> IntArray:
     """(M,) which of several tags with one id each set of corners from one standing pose is of.
 
     Printed squares do not overlap, so that centres nearer than half a side are one tag read twice.

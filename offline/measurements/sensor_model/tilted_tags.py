@@ -73,7 +73,7 @@ def are_tilted(tag: IntArray, chi2: FloatArray) -> IntArray:
     return np.flatnonzero((count > 0) & (mean > limit))
 
 
-def askew(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, is_doubted: BoolArray) -> IntArray:
+def find_tilted(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArray, is_doubted: BoolArray) -> IntArray:
     """Those of the doubted tags that hanging askew explains far better: bad corners alone spoil both poses."""
     if not is_doubted.any():
         return np.zeros(0, dtype=np.int64)

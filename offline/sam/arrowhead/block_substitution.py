@@ -11,10 +11,10 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
-class Pieces(NamedTuple):
+class SubstitutionArrays(NamedTuple):
     """What of tree, blocks and rows is needed here: tuples of few arrays compile in a fraction of the time."""
 
     level: IntArray
@@ -37,10 +37,10 @@ class Pieces(NamedTuple):
     inner: FloatArray
 
 
-def pieces_of(tree: Tree, system: System, rows: Rows) -> Pieces:
+def pieces_of(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> SubstitutionArrays:
     """Of a factorisation."""
     n_slots = np.diff(tree.slot_start)[tree.segment]
-    return Pieces(
+    return SubstitutionArrays(
         tree.level, tree.first, tree.end, tree.right, tree.front_start, tree.front, tree.calibration_at, n_slots,
         tree.n_eliminated, tree.rows_start, tree.reading_start, tree.reading_at,
         system.pose_next, system.pose_calibration, system.pose_tag, rows.pose, rows.pose_next, rows.inner,
@@ -48,7 +48,9 @@ def pieces_of(tree: Tree, system: System, rows: Rows) -> Pieces:
 
 
 @njit
-def substitute(pieces: Pieces, vectors: FloatArray, outwards: bool, inside: FloatArray, outside: FloatArray) -> None:
+def substitute(
+    pieces: SubstitutionArrays, vectors: FloatArray, outwards: bool, inside: FloatArray, outside: FloatArray
+) -> None:
     """Substitutes forward (outwards) or backward, all but the top.
 
     Forward vectors (n, k) become what is left of them for the top, and R^-T vectors elsewhere, but for poses in leaves,
@@ -74,7 +76,7 @@ def substitute(pieces: Pieces, vectors: FloatArray, outwards: bool, inside: Floa
 
 
 @inner
-def _through_front(pieces: Pieces, node: int, vectors: FloatArray, outwards: bool) -> None:
+def _through_front(pieces: SubstitutionArrays, node: int, vectors: FloatArray, outwards: bool) -> None:
     start, n = pieces.front_start[node], pieces.n_eliminated[node]
     size = pieces.front_start[node + 1] - start
     for own in range(n):
@@ -93,7 +95,9 @@ def _through_front(pieces: Pieces, node: int, vectors: FloatArray, outwards: boo
 
 
 @inner
-def _out_of_leaf(pieces: Pieces, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray) -> None:
+def _out_of_leaf(
+    pieces: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
+) -> None:
     start, end = pieces.front_start[leaf], pieces.front_start[leaf + 1]
     first, last = pieces.first[leaf], pieces.end[leaf]
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
@@ -108,7 +112,9 @@ def _out_of_leaf(pieces: Pieces, leaf: int, vectors: FloatArray, inside: FloatAr
 
 
 @inner
-def _into_leaf(pieces: Pieces, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray) -> None:
+def _into_leaf(
+    pieces: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
+) -> None:
     start, end = pieces.front_start[leaf], pieces.front_start[leaf + 1]
     first, last = pieces.first[leaf], pieces.end[leaf]
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
@@ -173,7 +179,9 @@ def _leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end
 
 
 @inner
-def _add_coupling(pieces: Pieces, leaf: int, inside: FloatArray, outside: FloatArray, outwards: bool) -> None:
+def _add_coupling(
+    pieces: SubstitutionArrays, leaf: int, inside: FloatArray, outside: FloatArray, outwards: bool
+) -> None:
     """Adds B^T inside to outside (w, k), or takes B outside from inside (3 K, k).
 
     B are the blocks of H between the leaf's poses and its front.

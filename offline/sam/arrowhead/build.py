@@ -15,8 +15,8 @@ from groundsbot.offline.sam.factors.odometry_and_readings import (
     OdometryFactors,
     ReadingFactors,
 )
-from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED, Measured
-from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Readings
+from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
+from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays
 
 
 def build_arrowhead(
@@ -24,7 +24,7 @@ def build_arrowhead(
     readings: ReadingFactors,
     prior: CalibrationPrior,
     columns: Columns,
-    measured: Measured = NOTHING_MEASURED,
+    measured: Priors = NO_PRIORS,
 ) -> Arrowhead:
     """Sorts factors by pose and settles the order of elimination.
 
@@ -72,10 +72,10 @@ def build_arrowhead(
     )
 
 
-def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> Odometry:
+def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryArrays:
     """For compiled functions, in an order (M,); without slots."""
     first, motion = odometry.first[in_order], odometry.motion[in_order]
-    motions = Odometry(
+    motions = OdometryArrays(
         first=first,
         motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
         information=np.empty((len(first), 3, 3)),
@@ -113,7 +113,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     # From each kept pose to the next, but for the last of a segment; the parameters are those of its motions.
     first = np.delete(np.arange(n), segment_start[1:] - 1)
     begins = np.searchsorted(odometry.first, np.flatnonzero(is_kept)[first])
-    composed = Odometry(
+    composed = OdometryArrays(
         first=first,
         motion=np.empty((len(first), 5)),
         information=np.empty((len(first), 3, 3)),
@@ -124,7 +124,7 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     )
     compose(odometry, index, composed)
     places = _as_places(readings)._replace(pose=index[readings.pose])
-    measured = NOTHING_MEASURED if whole.measured is None else whole.measured.factors.among(index)
+    measured = NO_PRIORS if whole.measured is None else whole.measured.factors.among(index)
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     own_tree = build_tree(
         Couplings(
@@ -152,11 +152,11 @@ def build_skeleton(whole: Arrowhead) -> Skeleton:
     return Skeleton(own, whole, index)
 
 
-def _sorted_readings(readings: ReadingFactors) -> Readings:
+def _sorted_readings(readings: ReadingFactors) -> ObservationArrays:
     """By rising pose; slots are still missing."""
     order = np.argsort(readings.pose, kind="stable")
     parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter, readings.camera_parameters])
-    return Readings(
+    return ObservationArrays(
         pose=readings.pose[order],
         tag=readings.tag[order],
         value=readings.value[order],
@@ -169,7 +169,7 @@ def _sorted_readings(readings: ReadingFactors) -> Readings:
     )
 
 
-def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Readings) -> Free:
+def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: ObservationArrays) -> Free:
     held_pose, held_tag = np.any(~poses, axis=1), np.any(~tags, axis=1)
     return Free(
         poses=poses.astype(np.float64),
@@ -181,7 +181,7 @@ def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Re
     )
 
 
-def _as_places(readings: Readings) -> Readings:
+def _as_places(readings: ObservationArrays) -> ObservationArrays:
     """The same as places (x, y), with the covariance that the reading had there."""
     first, second = readings.value.T
     range_m, cos, sin = np.maximum(first, 1e-6), np.cos(second), np.sin(second)

@@ -14,7 +14,7 @@ from scipy import linalg, sparse
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 _AT_ONCE: Final = 1024
 # Numbers are kept with their zeros, which makes products ten times quicker, where there are few, and where what is
@@ -58,7 +58,9 @@ class SquareRoot(NamedTuple):
         return product + (self.below.T @ other.below).toarray() if self.below.shape[0] else product
 
 
-def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: IntArray) -> FloatArray:
+def joint_covariance(
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: IntArray
+) -> FloatArray:
     """(k, k) block of H^-1.
 
     Args:
@@ -86,7 +88,7 @@ def joint_covariance(tree: Tree, system: System, rows: Rows, top: FloatArray, wa
     return square
 
 
-def square_root(tree: Tree, rows: Rows, top: FloatArray, wanted: IntArray) -> SquareRoot:
+def square_root(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: IntArray) -> SquareRoot:
     """Of the block of H^-1 of columns that are no pose's; for very many of them smaller than the block.
 
     Args:
@@ -152,7 +154,7 @@ class _Sent(NamedTuple):
     values: FloatArray
 
 
-def _to_the_top(tree: Tree, rows: Rows, top: FloatArray, sent: list[_Sent]) -> Iterator[_Sent]:
+def _to_the_top(tree: Tree, rows: SquareRootFactor, top: FloatArray, sent: list[_Sent]) -> Iterator[_Sent]:
     """Each node's rows (n_eliminated, q) of Z, children first."""
     waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
     for each in sent:
@@ -211,7 +213,9 @@ def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
     return list(zip(nodes.tolist(), np.split(order, first[1:]), strict=True))
 
 
-def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, wanted: IntArray) -> tuple[FloatArray, FloatArray]:
+def _through_leaf(
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, leaf: int, wanted: IntArray
+) -> tuple[FloatArray, FloatArray]:
     """The block of A^-1 of columns in a leaf's poses, and what they leave in the parent's front."""
     first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
     start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
@@ -229,7 +233,7 @@ def _through_leaf(tree: Tree, system: System, rows: Rows, leaf: int, wanted: Int
     return solved.reshape(k, 3 * n)[:, own].T, values
 
 
-def _through_front(tree: Tree, rows: Rows, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _through_front(tree: Tree, rows: SquareRootFactor, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Z (n_eliminated, q), and what it leaves in the parent's front, of right-hand sides (front, q)."""
     start, end, n = int(tree.front_start[node]), int(tree.front_start[node + 1]), int(tree.n_eliminated[node])
     R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * (end - start)].reshape(n, end - start)

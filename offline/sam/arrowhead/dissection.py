@@ -13,7 +13,7 @@ _MIDDLES_IN_LARGE: Final = 4
 LEVELS: Final = 4  # leaf, middle, large, top
 
 
-class Pieces(NamedTuple):
+class DissectionPieces(NamedTuple):
     """The tree before tags.
 
     Attributes:
@@ -31,7 +31,7 @@ class Pieces(NamedTuple):
     pose_level: IntArray
 
 
-def cut(segment_start: IntArray, top_segments: IntArray) -> Pieces:
+def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
     """Cuts each segment evenly into leaves, and joins these; the first poses of some segments become separators too."""
     n_poses = int(segment_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
@@ -56,7 +56,7 @@ def cut(segment_start: IntArray, top_segments: IntArray) -> Pieces:
         above = np.flatnonzero(level == lower + 1)
         children = np.flatnonzero(level == lower)
         parent[children] = above[np.searchsorted(above, children)]
-    return Pieces(
+    return DissectionPieces(
         level=np.append(level, LEVELS - 1),
         parent=np.append(parent, top),
         segment=np.append(segment_of, -1),

@@ -12,11 +12,11 @@ from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.leaf_elimination import eliminate_leaf
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
 @njit
-def eliminate(tree: Tree, system: System, damping: float, rows: Rows) -> int:
+def eliminate(tree: Tree, system: NormalEquations, damping: float, rows: SquareRootFactor) -> int:
     """Eliminates all nodes but the top, whose front is left in the workspace.
 
     Args:
@@ -57,7 +57,7 @@ def _front_of(tree: Tree, node: int, workspace: FloatArray) -> FloatArray:
 
 
 @inner
-def _add_separators(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
+def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
     """The separators' own entries of H."""
     is_top = tree.level[node] == LEVELS - 1
     for k in range(tree.separator_start[node], tree.separator_start[node + 1]):
@@ -79,7 +79,7 @@ def _add_separators(tree: Tree, system: System, damping: float, node: int, front
 
 
 @inner
-def _add_tags(tree: Tree, system: System, damping: float, node: int, front: FloatArray) -> None:
+def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
     """The own entries of H of the tags that a node eliminates."""
     is_top = tree.level[node] == LEVELS - 1
     row = 3 * (tree.separator_start[node + 1] - tree.separator_start[node])
@@ -97,7 +97,7 @@ def _add_tags(tree: Tree, system: System, damping: float, node: int, front: Floa
 
 
 @inner
-def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArray) -> None:
+def _add_calibration(tree: Tree, system: NormalEquations, damping: float, front: FloatArray) -> None:
     first = tree.calibration_at[-1]
     for a in range(tree.n_calibration):
         for b in range(a, tree.n_calibration):
@@ -106,7 +106,7 @@ def _add_calibration(tree: Tree, system: System, damping: float, front: FloatArr
 
 
 @inner
-def _eliminate_front(tree: Tree, node: int, rows: Rows, front: FloatArray) -> int:
+def _eliminate_front(tree: Tree, node: int, rows: SquareRootFactor, front: FloatArray) -> int:
     """Partial Cholesky: the first columns become rows of R, the rest loses what they explain."""
     n, size = tree.n_eliminated[node], front.shape[0]
     failed = eliminate_columns(front, n)

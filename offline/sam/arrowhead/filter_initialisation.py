@@ -16,7 +16,7 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.foundation import borrowed, inline, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.linearisation.kernels import Odometry, Readings, Values, wrap
+from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, OdometryArrays, Values, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
 
 # A reading farther off than this many sigmas is passed over.
@@ -45,7 +45,12 @@ class _Filter(NamedTuple):
 
 
 def starting_pass(
-    tree: Tree, odometry: Odometry, readings: Readings, start: Values, start_variance: FloatArray, out: Values
+    tree: Tree,
+    odometry: OdometryArrays,
+    readings: ObservationArrays,
+    start: Values,
+    start_variance: FloatArray,
+    out: Values,
 ) -> None:
     """Runs all segments side by side, some poses of each at a time.
 
@@ -72,8 +77,8 @@ def starting_pass(
 @njit
 def _run(
     tree: Tree,
-    odometry: Odometry,
-    readings: Readings,
+    odometry: OdometryArrays,
+    readings: ObservationArrays,
     start: Values,
     start_variance: FloatArray,
     known: _Filter,
@@ -121,7 +126,7 @@ def rotate_covariance(C: _Covariance, cos: float, sin: float) -> _Covariance:
 
 @inline
 def _predict(
-    odometry: Odometry,
+    odometry: OdometryArrays,
     m: int,
     calibration: FloatArray,
     before: FloatArray,
@@ -148,7 +153,7 @@ def _predict(
 
 @inline
 def _read(
-    readings: Readings,
+    readings: ObservationArrays,
     m: int,
     calibration: FloatArray,
     pose: FloatArray,
@@ -182,7 +187,7 @@ def _read(
 
 @inline
 def _read_from_pose(
-    readings: Readings, m: int, calibration: FloatArray, cos: float, sin: float
+    readings: ObservationArrays, m: int, calibration: FloatArray, cos: float, sin: float
 ) -> tuple[float, float, _Covariance]:
     """From the pose to where a reading puts its tag, and the covariance of that, in map axes."""
     parameters, mount = readings.parameters[m], readings.mount[m]

@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.foundation import inner, njit
-from groundsbot.offline.sam.arrowhead.dissection import LEVELS, Pieces
+from groundsbot.offline.sam.arrowhead.dissection import LEVELS, DissectionPieces
 
 
 class Lists(NamedTuple):
@@ -27,7 +27,7 @@ class Fronts(NamedTuple):
 
 @njit
 def fronts_of(
-    pieces: Pieces,
+    pieces: DissectionPieces,
     separators: Lists,
     tags: Lists,
     shared_tags: Lists,

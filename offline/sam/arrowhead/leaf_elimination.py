@@ -3,11 +3,13 @@
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import inner
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
 @inner
-def eliminate_leaf(tree: Tree, system: System, damping: float, leaf: int, rows: Rows, front: FloatArray) -> int:
+def eliminate_leaf(
+    tree: Tree, system: NormalEquations, damping: float, leaf: int, rows: SquareRootFactor, front: FloatArray
+) -> int:
     """Pose by pose; `now` (3, w) couples the pose to the border seen so far.
 
     U^T D U = H, Y = U^-T now, Z = U^-T next.
@@ -41,7 +43,9 @@ def eliminate_leaf(tree: Tree, system: System, damping: float, leaf: int, rows: 
 
 
 @inner
-def _begin_leaf(system: System, first: int, n_left: int, width: int, now: FloatArray, carried: FloatArray) -> None:
+def _begin_leaf(
+    system: NormalEquations, first: int, n_left: int, width: int, now: FloatArray, carried: FloatArray
+) -> None:
     """Before a leaf's first pose: nothing is carried, and only the separator on the left is coupled."""
     for i in range(3):
         for j in range(3):
@@ -84,7 +88,7 @@ def _carry_on(
 
 
 @inner
-def _add_readings(tree: Tree, system: System, pose: int, coupled: FloatArray, width: int) -> int:
+def _add_readings(tree: Tree, system: NormalEquations, pose: int, coupled: FloatArray, width: int) -> int:
     """Adds a pose's coupling to tags; tags come in the order of first reading, so a new one is always the next."""
     for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
         at = tree.reading_at[m]

@@ -17,10 +17,12 @@ from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
-def pose_marginals(tree: Tree, system: System, rows: Rows, top: FloatArray, wanted: BoolArray) -> FloatArray:
+def pose_marginals(
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: BoolArray
+) -> FloatArray:
     """(P, 3, 3) diagonal blocks of H^-1 of the poses; zero for those that are not wanted.
 
     Args:
@@ -64,7 +66,7 @@ def _inverse(top: FloatArray) -> FloatArray:
     return lower + np.tril(lower, -1).T
 
 
-def _of_front(tree: Tree, rows: Rows, node: int, left: FloatArray) -> FloatArray:
+def _of_front(tree: Tree, rows: SquareRootFactor, node: int, left: FloatArray) -> FloatArray:
     """Covariance of a node's whole front, from that of what it leaves to others."""
     n, size = int(tree.n_eliminated[node]), int(tree.front_start[node + 1] - tree.front_start[node])
     R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape(n, size)
@@ -83,8 +85,8 @@ def _of_front(tree: Tree, rows: Rows, node: int, left: FloatArray) -> FloatArray
 @njit
 def _add_leaf(
     tree: Tree,
-    system: System,
-    rows: Rows,
+    system: NormalEquations,
+    rows: SquareRootFactor,
     leaf: int,
     front: FloatArray,
     wanted: BoolArray,

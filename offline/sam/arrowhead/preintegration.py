@@ -9,12 +9,12 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrowed, inner, njit
-from groundsbot.offline.sam.linearisation.kernels import Odometry, multiply, wrap
+from groundsbot.offline.sam.linearisation.kernels import OdometryArrays, multiply, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
 
 
 @njit
-def add_moments(odometry: Odometry, whitening: FloatArray) -> None:
+def add_moments(odometry: OdometryArrays, whitening: FloatArray) -> None:
     """Sets information W^T W and covariance (M, 3, 3) of each motion."""
     for m in range(len(whitening)):
         W = whitening[m]
@@ -38,7 +38,7 @@ def _invert(A: FloatArray, out: FloatArray) -> None:
 
 
 @njit
-def compose(odometry: Odometry, index: IntArray, out: Odometry) -> None:
+def compose(odometry: OdometryArrays, index: IntArray, out: OdometryArrays) -> None:
     """Composes the motions from each kept pose to the next: M_1 o M_2 o ... with covariance and derivatives.
 
     Args:
@@ -75,7 +75,7 @@ def _copy(block: FloatArray, out: FloatArray) -> None:
 
 
 @inner
-def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, scratch: FloatArray) -> None:
+def _append(odometry: OdometryArrays, m: int, motion: FloatArray, blocks: FloatArray, scratch: FloatArray) -> None:
     """M <- M o M_m, C <- A C A^T + C_m, K <- A K + K_m, with A the adjoint of M_m^-1."""
     x, y, turn, cos, sin = odometry.motion[m]
     A, product = scratch[0], scratch[1]
@@ -100,7 +100,12 @@ def _append(odometry: Odometry, m: int, motion: FloatArray, blocks: FloatArray, 
 
 @njit
 def expand(
-    odometry: Odometry, index: IntArray, composed: Odometry, kept: FloatArray, calibration: FloatArray, out: FloatArray
+    odometry: OdometryArrays,
+    index: IntArray,
+    composed: OdometryArrays,
+    kept: FloatArray,
+    calibration: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Lays the poses that were left out between those that were kept, where they are likeliest.
 
@@ -146,7 +151,7 @@ def expand(
 
 
 @inner
-def _pull(composed: Odometry, at: int, kept: FloatArray, calibration: FloatArray) -> tuple[float, float, float]:
+def _pull(composed: OdometryArrays, at: int, kept: FloatArray, calibration: FloatArray) -> tuple[float, float, float]:
     """Force and moment at the end of a composed motion: its information times what it is off by; the force in map."""
     x, y, turn, cos, sin = motion_at(composed, at, wheel_correction(composed, at, calibration))
     before, after = kept[composed.first[at]], kept[composed.first[at] + 1]

@@ -14,15 +14,15 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_readings import Columns, State
-from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured
-from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free
 
 _NONE: Final = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
-class MeasuredBlocks:
+class PriorBlocks:
     """Measured starts and distances, and where they go.
 
     Attributes:
@@ -34,7 +34,7 @@ class MeasuredBlocks:
         known_at: (2 K,) places of a map's tags there.
     """
 
-    factors: Measured
+    factors: Priors
     columns: Columns
     ends: IntArray
     at: IntArray
@@ -55,7 +55,7 @@ class MeasuredBlocks:
         across.reshape(n // 2, 2, n // 2, 2)[each, :, each, :] = 0.0
         return across
 
-    def add(self, state: State, system: System) -> float:
+    def add(self, state: State, system: NormalEquations) -> float:
         """Adds all of them to the blocks; returns the sum of their squares."""
         starts = self.factors.starts.linearise(state, self.columns)
         ((columns, derivative),) = starts.blocks
@@ -72,7 +72,7 @@ class MeasuredBlocks:
         _add_gradient(system, self.ends.reshape(-1, 10), system.distance.reshape(-1, 1, 10), distances.residual)
         return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_map_prior(state, system)
 
-    def _add_map_prior(self, state: State, system: System) -> float:
+    def _add_map_prior(self, state: State, system: NormalEquations) -> float:
         """Adds a map's tags and calibration but for what couples tags; returns the sum of squares."""
         known, information = self.factors.known, self.map_information
         n, each = 2 * len(known.tags), np.arange(len(known.tags))
@@ -87,7 +87,7 @@ class MeasuredBlocks:
         system.gradient[at] += information @ known.off(state)
         return float((known.residual(state) ** 2).sum())
 
-    def add_to_top(self, system: System, front: FloatArray) -> None:
+    def add_to_top(self, system: NormalEquations, front: FloatArray) -> None:
         """Adds what distances couple to the top's front, whose upper triangle counts."""
         first, second = self.at[:, 0, :, None], self.at[:, 1, None, :]
         products = system.distance[:, 0, :, None] * system.distance[:, 1, None, :]
@@ -95,7 +95,7 @@ class MeasuredBlocks:
         row, column = np.nonzero(self.known_at[:, None] < self.known_at)
         front[self.known_at[row], self.known_at[column]] += self.coupling_of_tags[row, column]
 
-    def add_product(self, system: System, x: FloatArray, y: FloatArray) -> None:
+    def add_product(self, system: NormalEquations, x: FloatArray, y: FloatArray) -> None:
         """Adds to y what distances couple, times x."""
         along = (system.distance * x[self.ends]).sum(axis=-1)
         np.add.at(y, self.ends, system.distance * along[:, ::-1, None])
@@ -103,7 +103,7 @@ class MeasuredBlocks:
         y[tags] += self.coupling_of_tags @ x[tags]
 
 
-def prior_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | None:
+def prior_blocks(factors: Priors, tree: Tree, free: Free) -> PriorBlocks | None:
     """Lays out what was measured; None where nothing was."""
     if not len(factors):
         return None
@@ -119,10 +119,10 @@ def prior_blocks(factors: Measured, tree: Tree, free: Free) -> MeasuredBlocks | 
     place = np.full(columns.n + 1, -1)
     top = tree.front[tree.front_start[-2] :]
     place[top] = np.arange(len(top))
-    return MeasuredBlocks(factors, columns, ends, place[ends], place[columns.tags[factors.known.tags].reshape(-1)])
+    return PriorBlocks(factors, columns, ends, place[ends], place[columns.tags[factors.known.tags].reshape(-1)])
 
 
-def ends_in_top(factors: Measured, segment_start: IntArray) -> tuple[IntArray, IntArray]:
+def ends_in_top(factors: Priors, segment_start: IntArray) -> tuple[IntArray, IntArray]:
     """Segments at whose first pose a distance ends, and tags at which one does or that a map holds.
 
     Raises:
@@ -155,7 +155,7 @@ def _add_squares(diagonal: FloatArray, index: IntArray, derivative: FloatArray) 
     np.add.at(diagonal, index[there], J.swapaxes(-1, -2) @ J)
 
 
-def _add_gradient(system: System, columns: IntArray, derivative: FloatArray, residual: FloatArray) -> None:
+def _add_gradient(system: NormalEquations, columns: IntArray, derivative: FloatArray, residual: FloatArray) -> None:
     """J^T r of (M, n, k) and (M, n)."""
     by_column = np.einsum("mnk,mn->mk", derivative, residual)
     free = columns >= 0

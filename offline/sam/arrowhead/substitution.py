@@ -5,11 +5,11 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
 @njit
-def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
+def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
     """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
     inside, outside = rows.inside, rows.border[0, 0]
@@ -33,7 +33,7 @@ def forward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
 
 
 @njit
-def backward(tree: Tree, system: System, rows: Rows, vector: FloatArray) -> None:
+def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
     """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
     tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
     inside, outside = rows.inside, rows.border[0, 0]
@@ -68,13 +68,13 @@ def _take_leaf(tree: Tree, leaf: int, vector: FloatArray, inside: FloatArray) ->
 
 
 @inner
-def _rows_of(tree: Tree, node: int, rows: Rows) -> FloatArray:
+def _rows_of(tree: Tree, node: int, rows: SquareRootFactor) -> FloatArray:
     n, size = tree.n_eliminated[node], tree.front_start[node + 1] - tree.front_start[node]
     return rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape((n, size))
 
 
 @njit
-def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
+def solve_leaf(tree: Tree, rows: SquareRootFactor, leaf: int, inside: FloatArray) -> None:
     """Takes inside (K, 3) to A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
     first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
     x0, x1, x2 = 0.0, 0.0, 0.0
@@ -105,7 +105,7 @@ def solve_leaf(tree: Tree, rows: Rows, leaf: int, inside: FloatArray) -> None:
 
 
 @njit
-def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
+def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
     """Adds to outside (w,) B^T inside, with B the blocks of H between the leaf's poses and its front."""
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
@@ -130,7 +130,7 @@ def leaf_to_front(tree: Tree, system: System, leaf: int, inside: FloatArray, out
 
 
 @inner
-def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, inside: FloatArray) -> None:
+def _front_to_leaf(tree: Tree, system: NormalEquations, leaf: int, outside: FloatArray, inside: FloatArray) -> None:
     """Takes B outside from inside (K, 3)."""
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
@@ -155,7 +155,7 @@ def _front_to_leaf(tree: Tree, system: System, leaf: int, outside: FloatArray, i
 
 
 @njit
-def product(tree: Tree, system: System, x: FloatArray) -> FloatArray:
+def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
     """H x, in the arrowhead's order."""
     y = np.zeros(len(x))
     first_tag = 3 * tree.n_poses

@@ -18,7 +18,7 @@ from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.preintegration import expand
-from groundsbot.offline.sam.arrowhead.prior_blocks import MeasuredBlocks
+from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_readings import State
@@ -26,8 +26,8 @@ from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation import readings as linearise_readings
-from groundsbot.offline.sam.linearisation.blocks import Rows, System
-from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Readings, Values
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
+from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays, Values
 
 
 class UnderDeterminedError(ValueError):
@@ -47,16 +47,20 @@ class Arrowhead:
     """
 
     tree: Tree
-    odometry: Odometry
-    readings: Readings
+    odometry: OdometryArrays
+    readings: ObservationArrays
     prior_sigma: FloatArray
     free: Free
     tangent: IntArray
-    measured: MeasuredBlocks | None = None
+    measured: PriorBlocks | None = None
 
     def linearise(
-        self, state: State, odometry_loss: Loss = SQUARES, reading_loss: Loss = SQUARES, out: System | None = None
-    ) -> tuple[System, float]:
+        self,
+        state: State,
+        odometry_loss: Loss = SQUARES,
+        reading_loss: Loss = SQUARES,
+        out: NormalEquations | None = None,
+    ) -> tuple[NormalEquations, float]:
         """H = J^T J and g = J^T r in blocks, and the cost: half the sum of all losses.
 
         Args:
@@ -95,7 +99,7 @@ class Arrowhead:
         return State(*out)
 
     @cached_property
-    def scratch(self) -> tuple[System, System, Rows]:
+    def scratch(self) -> tuple[NormalEquations, NormalEquations, SquareRootFactor]:
         """Room for a solve, kept for the next: new memory costs as much as filling it. For one at a time."""
         return self.empty_system(), self.empty_system(), self.empty_rows()
 
@@ -103,10 +107,10 @@ class Arrowhead:
         """Lets go of that room, for who keeps the problem but solves it no more."""
         vars(self).pop("scratch", None)
 
-    def empty_system(self) -> System:
+    def empty_system(self) -> NormalEquations:
         """Blocks without values."""
         tree = self.tree
-        return System(
+        return NormalEquations(
             pose=np.empty((tree.n_poses, 3, 3)),
             pose_next=np.empty((tree.n_poses, 3, 3)),
             pose_calibration=np.empty((tree.n_poses, 3, tree.n_slots)),
@@ -118,10 +122,10 @@ class Arrowhead:
             distance=np.empty((0 if self.measured is None else len(self.measured.ends), 2, 5)),
         )
 
-    def empty_rows(self) -> Rows:
+    def empty_rows(self) -> SquareRootFactor:
         """Room for a factorisation."""
         tree = self.tree
-        return Rows(
+        return SquareRootFactor(
             pose=np.zeros((tree.n_poses, 3, 3)),
             pose_next=np.zeros((tree.n_poses, 3, 3)),
             inner=np.empty(int(tree.rows_start[-1])),
@@ -131,7 +135,9 @@ class Arrowhead:
             inside=np.empty((int((tree.end - tree.first)[tree.level == 0].max(initial=0)), 3)),
         )
 
-    def factorise(self, system: System, damping: float = 0.0, out: Rows | None = None) -> "Factorisation":
+    def factorise(
+        self, system: NormalEquations, damping: float = 0.0, out: SquareRootFactor | None = None
+    ) -> "Factorisation":
         """R with R^T R = H + damping diag(H).
 
         Args:
@@ -165,7 +171,7 @@ class Arrowhead:
         out[self.tangent] = tangent
         return out
 
-    def product(self, system: System, x: FloatArray) -> FloatArray:
+    def product(self, system: NormalEquations, x: FloatArray) -> FloatArray:
         """H x, in the arrowhead's order."""
         y = substitution.product(self.tree, system, x)
         if self.measured is not None:
@@ -185,8 +191,8 @@ class Factorisation:
     """
 
     arrowhead: Arrowhead
-    system: System = field(repr=False)
-    rows: Rows = field(repr=False)
+    system: NormalEquations = field(repr=False)
+    rows: SquareRootFactor = field(repr=False)
     top: FloatArray = field(repr=False)
 
     def solve_in_order(self, vector: FloatArray) -> FloatArray:

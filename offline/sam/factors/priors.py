@@ -75,7 +75,7 @@ class DistanceFactors:
 
 
 @dataclass(frozen=True)
-class KnownPlaces:
+class JointPrior:
     """Tags and calibration as a finished map has them, jointly: r = W (x - mean).
 
     Attributes:
@@ -105,16 +105,16 @@ class KnownPlaces:
 
 
 _NONE: Final = np.zeros(0, dtype=np.int64)
-NOTHING_KNOWN: Final = KnownPlaces(_NONE, _NONE, np.zeros(0), np.zeros((0, 0)))
+NO_JOINT_PRIOR: Final = JointPrior(_NONE, _NONE, np.zeros(0), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
-class Measured:
+class Priors:
     """All that somebody measured, or that a map holds."""
 
     starts: StartFactors
     distances: DistanceFactors
-    known: KnownPlaces = NOTHING_KNOWN
+    known: JointPrior = NO_JOINT_PRIOR
 
     def __len__(self) -> int:
         """How many measurements there are, a map being one."""
@@ -140,7 +140,7 @@ class Measured:
         ends = np.concatenate([self.distances.tag_a, self.distances.tag_b, self.known.tags])
         return np.unique(ends[ends >= 0])
 
-    def among(self, index: IntArray) -> "Measured":
+    def among(self, index: IntArray) -> "Priors":
         """The same of a part of the poses, which all ends are among: (P,) the index of each there."""
         ends = {
             name: np.where(pose >= 0, index[pose], -1)
@@ -153,7 +153,7 @@ class Measured:
         )
 
 
-NOTHING_MEASURED: Final = Measured(
+NO_PRIORS: Final = Priors(
     StartFactors(_NONE, np.zeros((0, 3)), np.zeros((0, 3, 3))),
     DistanceFactors(_NONE, _NONE, _NONE, _NONE, np.zeros(0), np.zeros(0)),
 )

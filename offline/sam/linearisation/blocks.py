@@ -5,7 +5,7 @@ from typing import NamedTuple
 from groundsbot.calib.foundation import FloatArray
 
 
-class System(NamedTuple):
+class NormalEquations(NamedTuple):
     """H = J^T J and g = J^T r in blocks. Columns that are held have a one on the diagonal and nothing else.
 
     Attributes:
@@ -30,7 +30,7 @@ class System(NamedTuple):
     distance: FloatArray
 
 
-class Rows(NamedTuple):
+class SquareRootFactor(NamedTuple):
     """What elimination leaves.
 
     Attributes:

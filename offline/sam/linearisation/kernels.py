@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.foundation import inline, inner, njit
-from groundsbot.offline.sam.linearisation.blocks import System
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 
 
 class Values(NamedTuple):
@@ -38,7 +38,7 @@ class Free(NamedTuple):
     held_readings: IntArray
 
 
-class Odometry(NamedTuple):
+class OdometryArrays(NamedTuple):
     """`factors.planar.OdometryFactors` by rising pose.
 
     Attributes:
@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
     slots: IntArray
 
 
-class Readings(NamedTuple):
+class ObservationArrays(NamedTuple):
     """`factors.planar.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
 
     pose: IntArray
@@ -71,7 +71,7 @@ class Readings(NamedTuple):
 
 
 @njit
-def clear(system: System) -> None:
+def clear(system: NormalEquations) -> None:
     """All zero, but for what is overwritten anyway."""
     for blocks in (system.pose, system.pose_next, system.pose_calibration, system.tag, system.tag_calibration):
         blocks[:] = 0.0
@@ -80,7 +80,7 @@ def clear(system: System) -> None:
 
 
 @njit
-def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: System) -> None:
+def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: NormalEquations) -> None:
     """What is held gets a one on the diagonal and nothing else: its step is zero."""
     n_poses = len(free.poses)
     for pose in free.held_poses:
@@ -202,7 +202,7 @@ def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> 
 
 
 @njit
-def diagonal_square(system: System, step: FloatArray) -> float:
+def diagonal_square(system: NormalEquations, step: FloatArray) -> float:
     """step^T diag(H) step."""
     total = 0.0
     n_poses, n_tags = len(system.pose), len(system.tag)

@@ -10,8 +10,15 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import borrowed, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
-from groundsbot.offline.sam.linearisation.blocks import System
-from groundsbot.offline.sam.linearisation.kernels import Free, Odometry, Values, half_angle_cotangent, series, wrap
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations
+from groundsbot.offline.sam.linearisation.kernels import (
+    Free,
+    OdometryArrays,
+    Values,
+    half_angle_cotangent,
+    series,
+    wrap,
+)
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]
@@ -20,7 +27,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @njit
-def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, system: System) -> float:
+def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
     """Adds all odometry factors to the blocks; returns the sum of their losses."""
     odometry, values, free, system = borrowed(odometry), borrowed(values), borrowed(free), borrowed(system)
     scratch = np.empty((6, 3, 3))
@@ -56,7 +63,7 @@ def add_odometry(odometry: Odometry, loss: Loss, values: Values, free: Free, sys
 
 
 @inner
-def wheel_correction(odometry: Odometry, m: int, calibration: FloatArray) -> _Three:
+def wheel_correction(odometry: OdometryArrays, m: int, calibration: FloatArray) -> _Three:
     """T = K c, what calibration c puts at the end of a motion."""
     c0 = calibration[odometry.parameters[m, 0]]
     c1 = calibration[odometry.parameters[m, 1]]
@@ -72,7 +79,7 @@ def wheel_correction(odometry: Odometry, m: int, calibration: FloatArray) -> _Th
 
 
 @inner
-def motion_at(odometry: Odometry, m: int, t: _Three) -> tuple[float, float, float, float, float]:
+def motion_at(odometry: OdometryArrays, m: int, t: _Three) -> tuple[float, float, float, float, float]:
     """X, y, heading of motion o exp(t), and the heading's cosine and sine."""
     motion = odometry.motion[m]
     x, y, theta, cos, sin = motion[0], motion[1], motion[2], motion[3], motion[4]
@@ -151,7 +158,7 @@ def _times_jacobian(M: _Square, J: _Four) -> _Upper:
 
 
 @inner
-def _add_blocks(system: System, i: int, H: _Upper, A: _Four) -> None:
+def _add_blocks(system: NormalEquations, i: int, H: _Upper, A: _Four) -> None:
     """Adds H to pose j = i + 1, sets -A^T H between, and adds A^T H A to pose i.
 
     A has the rows (cos, sin, u), (-sin, cos, v), (0, 0, 1).
@@ -240,7 +247,7 @@ def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> 
 
 
 @inner
-def _add_wheels(odometry: Odometry, m: int, free: Free, scratch: FloatArray, system: System) -> None:
+def _add_wheels(odometry: OdometryArrays, m: int, free: Free, scratch: FloatArray, system: NormalEquations) -> None:
     """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for what is free of the wheel parameters."""
     M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
     first, base = odometry.first[m], len(system.gradient) - len(system.calibration)

@@ -8,8 +8,8 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import borrowed, inline, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
-from groundsbot.offline.sam.linearisation.blocks import System
-from groundsbot.offline.sam.linearisation.kernels import Free, Readings, Values
+from groundsbot.offline.sam.linearisation.blocks import NormalEquations
+from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, Values
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
 _N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
@@ -17,7 +17,7 @@ N_READING: Final = 5 + _N_PARAMETERS  # what a reading depends on: pose and tag 
 
 
 @njit
-def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, system: System) -> float:
+def add_readings(readings: ObservationArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
     """Adds all tag readings to the blocks; returns the sum of their losses.
 
     The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
@@ -68,7 +68,13 @@ def add_readings(readings: Readings, loss: Loss, values: Values, free: Free, sys
 
 @inner
 def _add_calibration(
-    readings: Readings, m: int, weight: float, free: Free, r: FloatArray, J: FloatArray, system: System
+    readings: ObservationArrays,
+    m: int,
+    weight: float,
+    free: Free,
+    r: FloatArray,
+    J: FloatArray,
+    system: NormalEquations,
 ) -> None:
     pose, tag = readings.pose[m], readings.tag[m]
     base = len(system.gradient) - len(system.calibration)
@@ -90,7 +96,7 @@ def _add_calibration(
 
 @inline
 def reading_factor(
-    readings: Readings, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
+    readings: ObservationArrays, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
     """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `ReadingFactors`."""
     pose, tag = readings.pose[m], readings.tag[m]
@@ -137,7 +143,7 @@ def reading_factor(
 
 
 @inline
-def _correct(readings: Readings, m: int, values: Values) -> tuple[float, float]:
+def _correct(readings: ObservationArrays, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
     first, second = readings.value[m, 0], readings.value[m, 1]
     for k in range(_N_CAMERA):
@@ -149,7 +155,7 @@ def _correct(readings: Readings, m: int, values: Values) -> tuple[float, float]:
 
 
 @njit
-def add_priors(sigma: FloatArray, values: Values, free: Free, system: System) -> float:
+def add_priors(sigma: FloatArray, values: Values, free: Free, system: NormalEquations) -> float:
     """Adds r = c / sigma for all free calibration; returns the sum of squares, held ones included."""
     base = len(system.gradient) - len(system.calibration)
     total = 0.0

@@ -97,7 +97,7 @@ class ChunkReader:
         """Yields each whole chunk's records."""
         offset = trusted = len(MCAP0_MAGIC)  # trusted: up to here the form has been proved by checksums
         if not self._starts_well:
-            self._tell(0, len(MCAP0_MAGIC), "the file's first bytes are not MCAP's")
+            self._offset(0, len(MCAP0_MAGIC), "the file's first bytes are not MCAP's")
         while True:
             try:
                 record = self._record_at(offset)
@@ -122,9 +122,9 @@ class ChunkReader:
         self._crc = None
         start = offset if found is None or found > offset else trusted
         until = self._end if found is None else found
-        self._tell(start, until - start, str(bad))
+        self._offset(start, until - start, str(bad))
 
-    def _tell(self, offset: int, n_bytes: int, reason: str) -> None:
+    def _offset(self, offset: int, n_bytes: int, reason: str) -> None:
         self._on_damage(Damage(self._path, offset, n_bytes, reason))
 
     def _record_at(self, offset: int) -> _Record | None:
@@ -133,7 +133,7 @@ class ChunkReader:
         head = self._stream.read(RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
             if head:
-                self._tell(offset, len(head), "torn")
+                self._offset(offset, len(head), "torn")
             self.end_offset = offset
             return None
         opcode, length = RECORD_HEAD.unpack(head)
@@ -174,11 +174,11 @@ class ChunkReader:
         if self.summary is None:
             if self._next_chunk(offset + RECORD_HEAD.size) is not None:
                 raise _BadRecordError("an end mark where the data do not end")
-            self._tell(offset, 0, "the index at the end is missing or damaged; no message is lost by that")
+            self._offset(offset, 0, "the index at the end is missing or damaged; no message is lost by that")
         self.is_finished = True
         (crc,) = U32.unpack(self._stream_at(offset + RECORD_HEAD.size, U32.size))
         if crc and self._crc is not None and crc != self._crc:
-            self._tell(offset, 0, "the checksum over the whole data does not fit, though each chunk's own does")
+            self._offset(offset, 0, "the checksum over the whole data does not fit, though each chunk's own does")
 
     def _stream_at(self, offset: int, n_bytes: int) -> bytes:
         self._stream.seek(offset)

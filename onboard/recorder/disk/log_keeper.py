@@ -136,12 +136,12 @@ class LogKeeper:
         Args:
             now_s: monotonic time; the call itself may take long where the disk does.
         """
-        self._look_at_room(now_s)
+        self._check_room(now_s)
         if self._problem is None or now_s >= self._retry_at_s:
             with self._lock:
                 batch, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
             self._put_on_disk(batch, now_s)
-        self._tell_losses()
+        self._report_losses()
 
     def finish(self, now_s: float) -> None:
         """Writes what waits and finishes the files; tells by a note what could not be."""
@@ -162,7 +162,7 @@ class LogKeeper:
         with self._lock:
             self._lost.update(record.topic for record in self._waiting)
             self._waiting, self._waiting_bytes = deque(), 0
-        self._tell_losses()
+        self._report_losses()
 
     def _put_on_disk(self, batch: deque[Record], now_s: float) -> None:
         try:
@@ -226,7 +226,7 @@ class LogKeeper:
             self._retry_at_s = now_s + _RETRY_S
         self._problem = text
 
-    def _look_at_room(self, now_s: float) -> None:
+    def _check_room(self, now_s: float) -> None:
         if now_s < self._next_look_s:
             return
         self._next_look_s = now_s + _LOOK_AT_ROOM_S
@@ -246,7 +246,7 @@ class LogKeeper:
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
         return len(removed)
 
-    def _tell_losses(self) -> None:
+    def _report_losses(self) -> None:
         with self._lock:
             new = self._lost - self._lost_told
             self._lost_told.update(new)

@@ -29,9 +29,9 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.robot.robot_yaml import Mount
 from groundsbot.fixtures.drives.calibration import true_tag_sizes_m
-from groundsbot.fixtures.drives.true_motion import Drive
+from groundsbot.fixtures.drives.true_motion import TrueMotion
 from groundsbot.fixtures.pictures.render import Renderer
-from groundsbot.fixtures.pictures.visibility import Eye
+from groundsbot.fixtures.pictures.visibility import CameraView
 from groundsbot.fixtures.recording.session import Options, prepare
 from groundsbot.fixtures.worlds.scene import Tags, faces_of, tags_of
 from groundsbot.fixtures.worlds.world import Pictures, Wall, World, WorldTag, load_world
@@ -116,7 +116,7 @@ def pictures_of(case: Case, n: int, seed: int = 0) -> tuple[CameraModel, list[tu
     """The camera, and n pictures with the true corners (4, 2)."""
     settings = Pictures().model_copy(update=case.settings)
     camera = _camera(case)
-    eye = Eye(camera, Mount(z_m=0.4).T_base_camera.as_matrix(), 0.0, settings.exposure_s)
+    eye = CameraView(camera, Mount(z_m=0.4).T_base_camera.as_matrix(), 0.0, settings.exposure_s)
     ray = camera.unproject(np.array([camera.width_px / 2.0, camera.height_px / 2.0]))
     towards = eye.T_base_camera[:3, :3] @ ray
     world = _world(case, towards)
@@ -162,17 +162,17 @@ def _world(case: Case, towards: FloatArray) -> World:
     return load_world("room").model_copy(update=update)
 
 
-def _drive(case: Case, rng: np.random.Generator, exposure_s: float) -> Drive:
+def _drive(case: Case, rng: np.random.Generator, exposure_s: float) -> TrueMotion:
     """A robot that stands, or turns so fast that the picture smears, near the origin."""
     turn_rad_s = case.smear_px / (FOCAL_PX * exposure_s)
     pose = rng.uniform(-1.0, 1.0, 3) * [0.02, 0.02, 4.0 / FOCAL_PX]
     half = np.array([0.0, 0.0, 0.5 * turn_rad_s])
     stamps_ns: FloatArray = np.array([0, _NS])
     none = np.zeros(2)
-    return Drive(stamps_ns.astype(np.int64), np.stack([pose - half, pose + half]), none, none)
+    return TrueMotion(stamps_ns.astype(np.int64), np.stack([pose - half, pose + half]), none, none)
 
 
-def _true_corners(tags: Tags, eye: Eye, drive: Drive) -> FloatArray:
+def _true_corners(tags: Tags, eye: CameraView, drive: TrueMotion) -> FloatArray:
     rotation, place = eye.world_poses(drive.at(np.array(_NS // 2, dtype=np.int64)))
     return eye.model.project((tags.corners_m[0] - place) @ rotation)
 

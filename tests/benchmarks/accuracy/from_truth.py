@@ -11,7 +11,7 @@ from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.global_map.joint_solve import component_of
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.sam.factors.odometry_and_readings import State
@@ -33,7 +33,7 @@ def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParame
     Raises:
         ValueError: the map is in several parts, or the solve from the truth comes to no end.
     """
-    workings = Workings()
+    workings = Diagnostics()
     result = build_map(runs, noise, workings=workings)
     if len(result.components) > 1:
         raise ValueError(f"{len(result.components)} components; {'; '.join(result.warnings)}")

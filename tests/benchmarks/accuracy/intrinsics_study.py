@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
-from groundsbot.calib.board.finder import BoardFinder, View
+from groundsbot.calib.board.finder import BoardFinder, BoardView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, undistorted_camera, with_parameters
 from groundsbot.calib.errors import CalibError
@@ -54,7 +54,7 @@ class Outcome:
     corner_sigma_px: float
 
 
-def judge(truth: CameraModel, views: Sequence[View]) -> Outcome:
+def judge(truth: CameraModel, views: Sequence[BoardView]) -> Outcome:
     """One calibration with the model given."""
     lens = calibrate_camera(views, BoardFinder(DEFAULT_BOARD), truth.name, [truth.distortion_model]).lens
     covariance, off = lens.covariance(), parameters_of(lens.fit.model) - parameters_of(truth)
@@ -76,7 +76,7 @@ def map_ratio(outcomes: Sequence[Outcome]) -> FloatArray:
         return np.asarray(np.sqrt(np.nanmean(found, axis=0) / np.nanmean(said, axis=0)))
 
 
-def plain_error_px(truth: CameraModel, views: Sequence[View]) -> float:
+def plain_error_px(truth: CameraModel, views: Sequence[BoardView]) -> float:
     """The error of OpenCV's way with its defaults on all views, corners as the detector gives them; NaN: it refuses.
 
     A fisheye has a way of its own there. Its defaults start from poses that they never look at again, and fit a skew
@@ -122,7 +122,7 @@ class Beside:
         return not np.isnan(self.ours_px) and not self.ours_px >= self.plain_px
 
 
-def beside(truth: CameraModel, views: Sequence[View]) -> Beside:
+def beside(truth: CameraModel, views: Sequence[BoardView]) -> Beside:
     """Both ways on the same views."""
     plain_px = plain_error_px(truth, views)
     try:
@@ -161,7 +161,7 @@ def study(case: str, seeds: Sequence[int], parts: Sequence[str]) -> None:
         print(f"{case}: ours lower in {better} of {len(against)}", flush=True)  # noqa: T201
 
 
-def _views(truth: CameraModel, seed: int, parts: Sequence[str]) -> tuple[list[View], list[View]]:
+def _views(truth: CameraModel, seed: int, parts: Sequence[str]) -> tuple[list[BoardView], list[BoardView]]:
     if "plain" not in parts:
         return taken_views(truth, seed), []
     return take_with_and_without(truth, seed) if "given" in parts else ([], taken_views(truth, seed, spoilt_share=0.1))

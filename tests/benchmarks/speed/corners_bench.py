@@ -27,7 +27,7 @@ from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.measurements.run import Run
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say
@@ -60,9 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
     """Processor seconds of each part, the floor's solve, and how many of these the whole comes to."""
-    floor, workings = [], Workings()
+    floor, workings = [], Diagnostics()
     for _ in range(1 + repeats):
-        stages, workings = Stages(), Workings()
+        stages, workings = Stages(), Diagnostics()
         build_map(runs, stages=stages, workings=workings)
         floor.append(sum(each.cpu_seconds for each in stages.costs if each.name == SOLVE))
     solved = workings.solved[0]

@@ -24,7 +24,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.advice.advice import Candidates, best_candidates, candidates_of, joint_covariance_of
-from groundsbot.offline.advice.new_tags import Place, is_in_view, place_beside
+from groundsbot.offline.advice.new_tags import TagSite, is_in_view, place_beside
 from groundsbot.offline.advice.passes import Pass, most_length_m
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
@@ -83,7 +83,7 @@ def largest_sigma_m(scene: Scene, maps: Sequence[LocalMap]) -> float:
     return max(float(sigmas_m.get(tag, np.inf)) for tag in scene.graph.tags)
 
 
-def with_candidate(scene: Scene, wanted: Pass | Place, seed: int) -> list[LocalMap]:
+def with_candidate(scene: Scene, wanted: Pass | TagSite, seed: int) -> list[LocalMap]:
     """The local maps after what was wanted has been done."""
     rng = np.random.default_rng([seed, 7])
     if isinstance(wanted, Pass):
@@ -97,12 +97,12 @@ def with_candidate(scene: Scene, wanted: Pass | Place, seed: int) -> list[LocalM
     ]
 
 
-def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pass | Place]:
+def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pass | TagSite]:
     """N passes, and n places of tags."""
     found = scene.candidates
-    ways, sightings = found.drives.ways, found.sightings
+    ways, sightings = found.drives.ways, found.passages
     length_m = most_length_m(ways)
-    passes: list[Pass | Place] = []
+    passes: list[Pass | TagSite] = []
     while len(passes) < n:
         begin = sightings[rng.integers(len(sightings))]
         way = ways[begin.segment]
@@ -117,7 +117,7 @@ def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pa
         if reached:
             end = max(reached, key=lambda each: each.last)
             passes.append(Pass(begin.segment, begin.first, end.last, begin.tag, end.tag))
-    places: list[Pass | Place] = []
+    places: list[Pass | TagSite] = []
     while len(places) < n:
         segment = int(rng.integers(len(ways)))
         keyframe = int(np.searchsorted(ways[segment], rng.uniform(0.0, float(ways[segment][-1]))))
@@ -178,13 +178,13 @@ def _past_new_tag(
     )
 
 
-def _sensor(scene: Scene, place: Place) -> FloatArray:
+def _sensor(scene: Scene, place: TagSite) -> FloatArray:
     """Where the camera is, by the map, at the keyframe beside which a place lies."""
     pose = scene.graph.poses_of(scene.solution.state, place.segment)[place.keyframe]
     return se2.compose(pose, scene.graph.segments[place.segment].T_base_camera)
 
 
-def _T_town_map_at(scene: Scene, place: Place) -> FloatArray:
+def _T_town_map_at(scene: Scene, place: TagSite) -> FloatArray:
     """A person goes by what is near: the map laid over the town at that keyframe."""
     drive = scene.drive(place.segment)
     T_town_base = se2.compose(drive.T_town_start, drive.T_start_base[place.keyframe])

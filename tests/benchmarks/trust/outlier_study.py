@@ -29,9 +29,9 @@ from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps.fit_results import SuspectTag
 from groundsbot.offline.noise.reweighing import fit_and_weigh
-from groundsbot.offline.outliers.outliers import Searched, split_alone, split_together, with_outliers_apart
+from groundsbot.offline.outliers.outliers import OutlierSearch, split_alone, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import minimise_places
-from groundsbot.offline.outliers.report import suspect_tags
+from groundsbot.offline.outliers.report import outlier_report
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say
@@ -80,7 +80,7 @@ class Counts:
         return float(np.sqrt(np.sum(self.squares_m2) / np.sum(self.squares_without_m2)))
 
 
-def map_runs(maps: Sequence[LocalMap]) -> Searched | None:
+def map_runs(maps: Sequence[LocalMap]) -> OutlierSearch | None:
     """The map under fitted noise and what was found in it; None where the runs do not hang together."""
     alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
     merged = merge(alone)
@@ -98,7 +98,7 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
         counts.n_apart += 1
         counts.told += [Told(0.0, named=False, right=False) for _ in scene.ids]
         return []
-    suspects = suspect_tags(searched)
+    suspects = outlier_report(searched)
     named = {each.tag_id: each for each in suspects}
     partner = dict(zip(scene.ids, np.roll(scene.ids, len(scene.ids) // 2).tolist(), strict=True))
     sigmas = foretold_sigmas(scene, searched)
@@ -118,13 +118,13 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
     return suspects
 
 
-def foretold_sigmas(scene: Scene, searched: Searched) -> dict[int, float]:
+def foretold_sigmas(scene: Scene, searched: OutlierSearch) -> dict[int, float]:
     """The shift of each tag in question by the covariance of splitting it as it truly was, the others being split.
 
     0 where the readings are not of both places; for doubles unless the one seen first was seen again after the other,
     for moving tags unless one run saw both: else nobody can tell them from tags that were moved between runs.
     """
-    sightings, evidence = searched.sightings, searched.evidence
+    sightings, evidence = searched.tracks, searched.evidence
     truly_other = _truly_other(scene, searched)[evidence.which]
     own_id = np.array([sightings.ids[i].tag_id for i in sightings.id[evidence.which]])
     place = sightings.id[evidence.which]
@@ -145,7 +145,7 @@ def foretold_sigmas(scene: Scene, searched: Searched) -> dict[int, float]:
     return found
 
 
-def _truly_other(scene: Scene, searched: Searched) -> BoolArray:
+def _truly_other(scene: Scene, searched: OutlierSearch) -> BoolArray:
     """(S,) which sightings are of the other place of their tag."""
     other: list[BoolArray] = []
     for run, segment in enumerate(searched.graph.segments):
@@ -154,26 +154,26 @@ def _truly_other(scene: Scene, searched: Searched) -> BoolArray:
         for tag_id in set(scene.ids) & set(ids.tolist()):
             mask[ids == tag_id] = scene.is_other(run, tag_id)
         other.append(mask)
-    share = np.bincount(searched.sightings.of_reading, np.concatenate(other)) / searched.sightings.n_readings
+    share = np.bincount(searched.tracks.of_reading, np.concatenate(other)) / searched.tracks.n_readings
     return np.asarray(share > 0.5)
 
 
-def _can_be_told(scene: Scene, searched: Searched, of_tag: IntArray, members: IntArray) -> bool:
+def _can_be_told(scene: Scene, searched: OutlierSearch, of_tag: IntArray, members: IntArray) -> bool:
     """Whether sightings of a tag, some of its other place, show what was done to it."""
     if not 0 < len(members) < len(of_tag):
         return False
-    segment = searched.sightings.segment[searched.evidence.which]
+    segment = searched.tracks.segment[searched.evidence.which]
     if scene.kind == MOVING:
         return bool(set(segment[members]) & set(segment[np.setdiff1d(of_tag, members)]))
     return scene.kind != DUPLICATED or _came_back(searched, of_tag, members)
 
 
-def _came_back(searched: Searched, of_tag: IntArray, members: IntArray) -> bool:
+def _came_back(searched: OutlierSearch, of_tag: IntArray, members: IntArray) -> bool:
     """Whether a tag was seen at one place, at the other, and at the first again."""
     which = searched.evidence.which
-    rank = {s: i for i, s in enumerate(searched.sightings.in_time.tolist())}
+    rank = {s: i for i, s in enumerate(searched.tracks.in_time.tolist())}
     ordered = np.array(sorted(of_tag.tolist(), key=lambda k: rank[int(which[k])]))
-    return searched.sightings.came_back(which[ordered], np.isin(ordered, members))
+    return searched.tracks.came_back(which[ordered], np.isin(ordered, members))
 
 
 def map_error_m2(scene: Scene, graph: Graph, solution: Solution) -> float:

@@ -7,8 +7,8 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.advice.advice import advise, best_candidates, candidates_of, joint_covariance_of
-from groundsbot.offline.advice.information_gain import Known
-from groundsbot.offline.advice.new_tags import Place, gain_of_place, place_beside
+from groundsbot.offline.advice.information_gain import JointCovariance
+from groundsbot.offline.advice.new_tags import TagSite, gain_of_place, place_beside
 from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
 from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
 from groundsbot.offline.measurements.segment import Segment
@@ -50,7 +50,7 @@ def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
 
 def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
     found = candidates_of(scene.graph, scene.solution.state)
-    place = max(found.places, key=lambda each: each.n_sightings)
+    place = max(found.places, key=lambda each: each.n_passages)
     gain = gain_of_place(found.drives, found.view, place)
     foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
     state, segments = scene.solution.state, list(scene.graph.segments)
@@ -60,7 +60,7 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
         if not len(keyframe):
             continue
         like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
-        n_each = max(found.view.n_a_sighting * place.n_sightings / len(place.viewers), 1.0)
+        n_each = max(found.view.n_a_passage * place.n_passages / len(place.viewers), 1.0)
         new = replace(
             like,
             keyframe=keyframe,
@@ -90,7 +90,7 @@ def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
     assert not len(place_beside(drives, found.view, place.segment, place.keyframe, 1.0).viewers)
 
 
-def _tags_seen(sensors: FloatArray, place: Place) -> FloatArray:
+def _tags_seen(sensors: FloatArray, place: TagSite) -> FloatArray:
     away = place.position_m - sensors[:, :2]
     return np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0]) - sensors[:, 2]])
 
@@ -145,7 +145,7 @@ def _strangers(scene: Scene) -> list[Segment]:
 
 
 def test_a_pass_and_a_tag_that_tell_nothing_change_nothing() -> None:
-    known = Known(np.arange(4), np.diag([1.0, 4.0, 9.0, 16.0]), 2)
+    known = JointCovariance(np.arange(4), np.diag([1.0, 4.0, 9.0, 16.0]), 2)
     np.testing.assert_allclose(known.sigmas_m(), [2.0, 4.0])
 
 

@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from groundsbot.offline.alignment.model_selection import chance_nats
-from groundsbot.offline.alignment.tag_gate import TAG_GATE, ill_fitting, log_wrong, squared_sigmas, worth_nats
+from groundsbot.offline.alignment.tag_gate import TAG_GATE, gate_ratio, log_likelihood_ratio, log_wrong, squared_sigmas
 
 
 def test_a_wrong_tag_is_somewhere_and_each_order_of_magnitude_is_as_likely() -> None:
@@ -21,7 +21,7 @@ def test_a_tag_is_worth_what_the_normal_density_is_over_that_of_a_wrong_one() ->
     covariance = np.array([[0.5, 0.2], [0.2, 0.3]])
     off_m = np.array([[0.4, -0.9]])
     by_chance = log_wrong(np.array([0.4**2 + 0.9**2 + 0.8]))
-    worth = worth_nats(off_m, covariance[None])
+    worth = log_likelihood_ratio(off_m, covariance[None])
     assert worth == pytest.approx(multivariate_normal(np.zeros(2), covariance).logpdf(off_m[0]) - by_chance)
 
 
@@ -29,15 +29,15 @@ def test_a_tag_is_worth_what_the_normal_density_is_over_that_of_a_wrong_one() ->
 def test_it_fits_as_far_as_chance_takes_it_and_being_wrong_explains_it_less(sigma_m: float) -> None:
     off_m = sigma_m * np.column_stack([np.linspace(0.0, 6.0, 200), np.zeros(200)])
     covariance = np.tile(sigma_m**2 * np.eye(2), (200, 1, 1))
-    fits = ill_fitting(off_m, covariance) < 1.0
+    fits = gate_ratio(off_m, covariance) < 1.0
     inside = squared_sigmas(off_m, covariance) < TAG_GATE
-    assert (fits == (inside & (worth_nats(off_m, covariance) > 0.0))).all()
+    assert (fits == (inside & (log_likelihood_ratio(off_m, covariance) > 0.0))).all()
     assert 0 < fits.sum() < 200
 
 
 def test_a_tag_foretold_to_metres_proves_next_to_nothing() -> None:
     """Less than a factor of 20 however far that is, and more than 1,000 where it is foretold to centimetres."""
-    worth = worth_nats(np.zeros((3, 2)), np.array([30.0, 3.0, 0.03])[:, None, None] ** 2 * np.eye(2))
+    worth = log_likelihood_ratio(np.zeros((3, 2)), np.array([30.0, 3.0, 0.03])[:, None, None] ** 2 * np.eye(2))
     assert (worth[:2] < np.log(20.0)).all()
     assert worth[2] > np.log(1000.0)
 

@@ -19,7 +19,7 @@ from groundsbot.offline.corners import bundle_adjustment
 from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import SpatialState
-from groundsbot.offline.corners.floor_noise import fit_attitude_sigmas, initial_attitude_sigmas, with_wobble
+from groundsbot.offline.corners.floor_noise import fit_attitude_sigmas, initial_attitude_sigmas, with_attitude_sigmas
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.initial_tag_poses import alternative_states, tags_rehung
 from groundsbot.offline.corners.problem import CornerProblem
@@ -30,7 +30,7 @@ from groundsbot.offline.global_map.edges import edges_of
 from groundsbot.offline.global_map.joint_solve import component_of
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.result import FloorSigmas, MapResult
@@ -161,8 +161,8 @@ def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
 
     def unfit(problem: CornerProblem, start: SpatialState) -> CornerSolution:
         found = solve_corners(problem, start)
-        off = replace(problem.corners.looks, corners_px=problem.corners.looks.corners_px + 20.0)
-        return replace(found, problem=replace(problem, corners=replace(problem.corners, looks=off)))
+        off = replace(problem.corners.observations, corners_px=problem.corners.observations.corners_px + 20.0)
+        return replace(found, problem=replace(problem, corners=replace(problem.corners, observations=off)))
 
     monkeypatch.setattr(bundle_adjustment, "solve_corners", {"no end": stopped, "no fit": unfit}[what])
     result = build_map([short], noise=NOISE, corners=True)
@@ -174,13 +174,13 @@ def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Workings]:
-    folder, workings = tmp_path_factory.mktemp("drives") / "room", Workings()
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Diagnostics]:
+    folder, workings = tmp_path_factory.mktemp("drives") / "room", Diagnostics()
     simulate("room", 3, folder, render=False)
     return folder, build_map(read_runs(find_logs([folder])), corners=True, workings=workings), workings
 
 
-def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Workings]) -> None:
+def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Chi-square of one map's joint errors, 99.9 %; and every start better known than on the floor."""
     folder, result, workings = room
     (component,) = result.components
@@ -195,7 +195,7 @@ def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path
     np.testing.assert_array_equal(workings.solved[0].poses_of(1), component.runs[1].T_map_base)
 
 
-def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Workings]) -> None:
+def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Six numbers each against the truth, 99.99 %: what turns them is the map's heading, about the vertical of map."""
     folder, result, _ = room
     told = json.loads((folder / TRUTH_FILE).read_text())
@@ -212,7 +212,7 @@ def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Working
         assert tag.pose.covariance[5, 5] > 2.0 * max(tag.pose.covariance[3, 3], tag.pose.covariance[4, 4])
 
 
-def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, Workings]) -> None:
+def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, Diagnostics]) -> None:
     _, result, workings = room
     solved = workings.solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
@@ -235,7 +235,7 @@ def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, 
     np.testing.assert_allclose(result.components[0].tag_covariance, expected[tags, tags], rtol=1e-2, atol=1e-8)
 
 
-def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult, Workings]) -> None:
+def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult, Diagnostics]) -> None:
     _, result, workings = room
     component, edges = result.components[0], result.components[0].edges
     assert edges is not None
@@ -248,7 +248,7 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
 
 
 def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
-    room: tuple[Path, MapResult, Workings], monkeypatch: pytest.MonkeyPatch
+    room: tuple[Path, MapResult, Diagnostics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved = room[2].solved[0]
     assert refine(solved.graph, solved.solution)[0] is not None
@@ -260,21 +260,21 @@ def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
     assert "the map is that of tag positions on the floor" in sentence
 
 
-def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Workings]) -> None:
+def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """As seen they would be some sigma_corner_px over a side's length askew."""
     solved = room[2].solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
-    looks = corners.problem.corners.looks
-    expected = with_predicted_facings(corners.problem.corners, start).looks.outward
+    looks = corners.problem.corners.observations
+    expected = with_predicted_facings(corners.problem.corners, start).observations.outward
     np.testing.assert_array_equal(looks.outward, expected)
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
 
 
-def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Workings]) -> None:
+def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
     solved = room[2].solved[0]
 
     def sigmas_px(graph: Graph) -> FloatArray:
-        return corner_graph(graph, solved.solution.state)[0].problem.corners.looks.sigma_px
+        return corner_graph(graph, solved.solution.state)[0].problem.corners.observations.sigma_px
 
     biased = [
         replace(segment.readings, corner_bias_px=refined_bias_px(segment.readings.corners_px))
@@ -288,7 +288,7 @@ def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResu
     assert bias_px.max() > 1.5 * bias_px.min()
 
 
-def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Path, MapResult, Workings]) -> None:
+def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Path, MapResult, Diagnostics]) -> None:
     solved = room[2].solved[0]
     problem = corner_graph(solved.graph, solved.solution.state)[0].problem
     own = compiled_motions(problem.odometry, np.arange(len(problem.odometry.first)))
@@ -302,21 +302,21 @@ def on_uneven_floor(problem: CornerProblem, state: SpatialState, sigma: FloatArr
     _, wobble = problem.corners.linearise(state, problem.columns)
     picture, n = problem.pictures
     stood = np.random.default_rng(seed).standard_normal((n, 3)) * sigma
-    looks = problem.corners.looks
+    looks = problem.corners.observations
     moved_px = np.einsum("mij,mj->mi", wobble, stood[picture]).reshape(-1, 4, 2) * looks.sigma_px[:, None, None]
-    tilted = replace(problem.corners, looks=replace(looks, corners_px=looks.corners_px + moved_px))
+    tilted = replace(problem.corners, observations=replace(looks, corners_px=looks.corners_px + moved_px))
     return replace(problem, corners=tilted)
 
 
 def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
-    room: tuple[Path, MapResult, Workings],
+    room: tuple[Path, MapResult, Diagnostics],
 ) -> None:
     """Pictures tilted by half a degree: each tag is turned round in turn, and costs its pictures more."""
     solved = room[2].solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
     tilt = np.radians([0.5, 0.5, 0.0])
-    problem = with_wobble(on_uneven_floor(corners.problem, found.state, tilt, 6), tilt)
+    problem = with_attitude_sigmas(on_uneven_floor(corners.problem, found.state, tilt, 6), tilt)
     n_turned = 0
     for tag in range(len(solved.graph.tags)):
         for other in alternative_states(problem, found.state, tag):
@@ -328,7 +328,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
     assert n_turned > 0
 
 
-def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Workings]) -> None:
+def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (some 300 pictures tell)."""
     solved = room[2].solved[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
@@ -338,11 +338,11 @@ def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapRe
     level = solve_corners(problem, found.state)
     guess = initial_attitude_sigmas(level.problem, level.state)
     assert guess.any()
-    uneven = solve_corners(with_wobble(problem, guess), level.state)
+    uneven = solve_corners(with_attitude_sigmas(problem, guess), level.state)
     sigma = fit_attitude_sigmas(uneven.problem, uneven.state)
     assert np.degrees(sigma[:2]) == pytest.approx(0.5, rel=0.2)
     assert sigma[2] < 0.003
-    again = solve_corners(with_wobble(uneven.problem, sigma), uneven.state)
+    again = solve_corners(with_attitude_sigmas(uneven.problem, sigma), uneven.state)
     assert again.converged
     assert again.pictures.outliers < 0.05 < level.pictures.outliers
 

@@ -20,16 +20,16 @@ def make_scene(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
 def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
     """What the factors hold the seen corners against, of a camera that sees sides where they are."""
     sharp = replace(state, calibration=np.append(state.calibration[:-1], 0.0))  # the shift is the last one
-    off = factors.residual(sharp).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
-    return np.asarray(off + factors.looks.corners_px)
+    off = factors.residual(sharp).reshape(-1, 4, 2) * factors.observations.sigma_px[:, None, None]
+    return np.asarray(off + factors.observations.corners_px)
 
 
 @pytest.mark.parametrize("model", CAMERAS)
 def test_sides_face_as_the_state_has_them(model: str) -> None:
     factors, state = make_scene(model)
     faced = with_predicted_facings(factors, state)
-    np.testing.assert_allclose(faced.looks.outward, outward(predicted_px(factors, state)), atol=1e-9)
-    np.testing.assert_array_equal(faced.looks.corners_px, factors.looks.corners_px)
+    np.testing.assert_allclose(faced.observations.outward, outward(predicted_px(factors, state)), atol=1e-9)
+    np.testing.assert_array_equal(faced.observations.corners_px, factors.observations.corners_px)
 
 
 def test_noise_of_seen_corners_turns_no_side() -> None:
@@ -37,7 +37,9 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
     seen = predicted_px(factors, state)
     noise = np.random.default_rng(4).standard_normal(seen.shape)
     clean, noisy = (
-        with_predicted_facings(replace(factors, looks=replace(factors.looks, corners_px=each)), state).looks.outward
+        with_predicted_facings(
+            replace(factors, observations=replace(factors.observations, corners_px=each)), state
+        ).observations.outward
         for each in (seen, seen + noise)
     )
     np.testing.assert_array_equal(clean, noisy)
@@ -46,7 +48,7 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
 def test_where_a_lens_has_no_image_sides_face_as_they_were_seen() -> None:
     factors, state = make_scene()
     behind = replace(state, tags=np.where(np.arange(len(state.tags))[:, None] == 1, -state.tags, state.tags))
-    faced, hidden = with_predicted_facings(factors, behind), factors.looks.tag == 1
-    np.testing.assert_array_equal(faced.looks.outward[hidden], factors.looks.outward[hidden])
-    assert (faced.looks.outward[~hidden] != factors.looks.outward[~hidden]).any()
-    assert np.isfinite(faced.looks.outward).all()
+    faced, hidden = with_predicted_facings(factors, behind), factors.observations.tag == 1
+    np.testing.assert_array_equal(faced.observations.outward[hidden], factors.observations.outward[hidden])
+    assert (faced.observations.outward[~hidden] != factors.observations.outward[~hidden]).any()
+    assert np.isfinite(faced.observations.outward).all()

@@ -10,21 +10,21 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.corners.factors import CornerFactors, Looks, SpatialColumns, SpatialState
+from groundsbot.offline.corners.factors import CornerFactors, CornerObservations, SpatialColumns, SpatialState
 from groundsbot.offline.corners.floor_noise import initial_attitude_sigmas
 from groundsbot.offline.corners.multifrontal.fronts import (
-    Fronts,
+    EliminationFronts,
     Normal,
     NotPositiveError,
     build_fronts,
     common_ancestor,
 )
-from groundsbot.offline.corners.multifrontal.kernels import System
+from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.picture_tilt import pictures_at
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, OdometryFactors, ReadingFactors
-from groundsbot.offline.sam.factors.priors import NOTHING_MEASURED
+from groundsbot.offline.sam.factors.priors import NO_PRIORS
 
 CAMERAS = {
     "plumb_bob": (-0.18, 0.07, 0.0006, -0.0004, 0.01),
@@ -51,7 +51,7 @@ def make_state(rng: np.random.Generator) -> SpatialState:
 def make_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFactors:
     """Looks by two cameras at once, each row read out from elsewhere."""
     camera = CameraModel("one", 1280, 720, 902.4, 901.1, 643.2, 356.7, model, CAMERAS[model])
-    looks = Looks(
+    looks = CornerObservations(
         pose=np.sort(np.concatenate([np.arange(N_POSES), rng.integers(0, N_POSES, N_LOOKS - N_POSES)])),
         tag=np.arange(N_LOOKS) % N_TAGS,
         corners_px=rng.uniform(0, 700, (N_LOOKS, 4, 2)),
@@ -78,7 +78,10 @@ def make_problem(
     rng = np.random.default_rng(seed)
     state, factors = make_state(rng), make_factors(rng, model)
     state = replace(state, poses=np.concatenate([np.zeros((1, 3)), state.poses[1:]]))
-    seen = factors.looks.corners_px + factors.residual(state).reshape(-1, 4, 2) * factors.looks.sigma_px[:, None, None]
+    seen = (
+        factors.observations.corners_px
+        + factors.residual(state).reshape(-1, 4, 2) * factors.observations.sigma_px[:, None, None]
+    )
     noisy = seen + 0.5 * rng.standard_normal(seen.shape)
     none = np.zeros(0, dtype=np.int64)
     steps = np.arange(N_POSES - 1)
@@ -90,7 +93,7 @@ def make_problem(
             np.zeros((N_POSES - 1, 3, 3)),
             np.zeros((N_POSES - 1, 3), dtype=np.int64),
         ),
-        corners=replace(factors, looks=replace(factors.looks, corners_px=noisy)),
+        corners=replace(factors, observations=replace(factors.observations, corners_px=noisy)),
         readings=ReadingFactors(
             none,
             none,
@@ -104,10 +107,10 @@ def make_problem(
             np.zeros((0, len(CAMERA_PARAMETERS)), dtype=int),
         ),
         prior=CalibrationPrior(SIGMAS),
-        measured=NOTHING_MEASURED,
+        measured=NO_PRIORS,
         columns=columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS),
         anchor=np.arange(N_TAGS),
-        wobble_sigma=np.array(wobble_sigma),
+        attitude_sigmas=np.array(wobble_sigma),
     )
     return problem, state
 
@@ -154,8 +157,8 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
     """Roll, pitch and height of base, put into the mount: the camera rises and turns about base's axes, not its own."""
     rng = np.random.default_rng(2)
     state, factors = make_state(rng), make_factors(rng)
-    looks = replace(factors.looks, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
-    factors = replace(factors, looks=looks)
+    looks = replace(factors.observations, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
+    factors = replace(factors, observations=looks)
     _, wobble = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
     step = 1e-6
 
@@ -165,7 +168,7 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
         tilt = Rotation.from_rotvec([off[0], off[1], 0.0])
         risen = tilt.apply(mount[0, :3]) + np.array([0.0, 0.0, off[2]])
         tilted = np.concatenate([risen, (tilt * level).as_euler("ZYX")[::-1]]) - state.calibration[1:7]
-        return replace(factors, looks=replace(looks, mount=np.tile(tilted, (N_LOOKS, 1)))).residual(state)
+        return replace(factors, observations=replace(looks, mount=np.tile(tilted, (N_LOOKS, 1)))).residual(state)
 
     numeric = np.stack([(stood(e) - stood(-e)) / (2 * step) for e in step * np.eye(3)], axis=-1)
     np.testing.assert_allclose(wobble, numeric, atol=1e-5)
@@ -179,20 +182,20 @@ def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance(
     linearised, wobble = problem.corners.linearise(state, problem.columns)
     ((own, blocks),) = linearised.blocks
     jacobian = dense(problem.columns, own, blocks)
-    level, _ = replace(problem, wobble_sigma=np.zeros(3)).linearise(state)
+    level, _ = replace(problem, attitude_sigmas=np.zeros(3)).linearise(state)
     expected, gradient = as_dense(problem, level[:-2])
     looks_cost = 0.0
-    for pose in np.unique(problem.corners.looks.pose):
-        of = problem.corners.looks.pose == pose
+    for pose in np.unique(problem.corners.observations.pose):
+        of = problem.corners.observations.pose == pose
         J, W, r = (np.concatenate(list(each[of])) for each in (jacobian, wobble, linearised.residual))
-        whole = np.linalg.inv(np.eye(len(r)) + W @ np.diag(problem.wobble_sigma**2) @ W.T)
+        whole = np.linalg.inv(np.eye(len(r)) + W @ np.diag(problem.attitude_sigmas**2) @ W.T)
         expected += J.T @ whole @ J
         gradient += J.T @ whole @ r
         looks_cost += float(r @ whole @ r)
     assert len(problem.pairs) > 3
     np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     np.testing.assert_allclose(g, gradient, rtol=1e-8, atol=1e-9 * np.abs(gradient).max())
-    others = replace(problem, wobble_sigma=np.zeros(3)).linearise(state)[1] - 0.5 * (linearised.residual**2).sum()
+    others = replace(problem, attitude_sigmas=np.zeros(3)).linearise(state)[1] - 0.5 * (linearised.residual**2).sum()
     assert cost == pytest.approx(others + 0.5 * looks_cost)
 
 
@@ -206,7 +209,7 @@ def as_dense(problem: CornerProblem, normals: list[Normal]) -> tuple[FloatArray,
     return H[:n, :n], g[:n]
 
 
-def as_built(problem: CornerProblem, system: System) -> FloatArray:
+def as_built(problem: CornerProblem, system: FrontalSystem) -> FloatArray:
     """H (n, n) from the fronts."""
     nodes, H = problem.order.nodes, np.zeros((problem.columns.n, problem.columns.n))
     for i in range(len(nodes.parent)):
@@ -271,13 +274,13 @@ def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
 def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> None:
     problem, state = make_problem(6)
     without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
-    few = problem.corners.looks.where(problem.corners.looks.pose < N_POSES - 1)
-    found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, looks=few)), state)
+    few = problem.corners.observations.where(problem.corners.observations.pose < N_POSES - 1)
+    found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, observations=few)), state)
     assert (found.reason, found.factor) == ("something is not tied down", None)
     assert not initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures).any()
 
 
-def assemble(order: Fronts, matrices: list[FloatArray]) -> System:
+def assemble(order: EliminationFronts, matrices: list[FloatArray]) -> FrontalSystem:
     system = order.empty()
     order.add(system, 0, [Normal(each, np.zeros(each.shape[:2])) for each in matrices])
     return system

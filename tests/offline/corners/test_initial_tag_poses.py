@@ -11,7 +11,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.corners.factors import spatial_values
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, candidate_poses, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, looks_by_tag, select_views
+from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, observations_by_tag, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
 from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_problem
@@ -20,7 +20,7 @@ from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS
 @pytest.mark.parametrize("model", CAMERAS)
 def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str) -> None:
     problem, state = make_problem(11, model=model)
-    looks, which = problem.corners.looks, np.arange(N_LOOKS)
+    looks, which = problem.corners.observations, np.arange(N_LOOKS)
     rays = np.empty((N_LOOKS, 4, 3))
     rays_of(problem.corners.arrays, problem.corners.lenses, which, rays)
     places, turns = np.empty((N_LOOKS, POSES, 3)), np.empty((N_LOOKS, POSES, 3, 3))
@@ -55,7 +55,7 @@ def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str
 def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_number() -> None:
     problem, state = make_problem(12)
     factors, which = problem.corners, np.arange(2)
-    far = factors.looks.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
+    far = factors.observations.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
     rays = np.empty((2, 4, 3))
     rays_of(factors.arrays._replace(corners_px=far), factors.lenses, which, rays)
     assert np.isnan(rays[0]).all()
@@ -79,7 +79,7 @@ def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_anothe
 
 def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
     tag = np.array([2, 0] * 3 + [0] * 12)
-    few = judges(looks_by_tag(tag, 3))
+    few = judges(observations_by_tag(tag, 3))
     assert [few.order[few.begin[t] : few.begin[t + 1]].tolist() for t in range(3)] == [
         [1, 5, 7, 9, 11, 13, 15, 17],
         [],
@@ -93,7 +93,7 @@ def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
     factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
     turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])
     places = np.repeat(np.append(state.tags[0], state.heights_m[0])[None], 5, axis=0)
-    few = judges(looks_by_tag(factors.looks.tag, N_TAGS))
+    few = judges(observations_by_tag(factors.observations.tag, N_TAGS))
     tags = np.array([0, 0, 0, 0, 1])
     losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, spatial_values(state), few, tags, places, turns)
     np.testing.assert_array_equal(np.isfinite(losses), [True, False, True, False, True])
@@ -112,7 +112,9 @@ def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> N
 def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
     problem, state = make_problem(5)
     free = np.arange(N_TAGS) > 0
-    corners = replace(problem.corners, looks=problem.corners.looks.where(problem.corners.looks.tag > 0))
+    corners = replace(
+        problem.corners, observations=problem.corners.observations.where(problem.corners.observations.tag > 0)
+    )
     problem = replace(problem, corners=corners, columns=columns_of(N_POSES, free, SIGMAS))
     found = initial_calibration(problem, replace(state, calibration=state.calibration + 2.0 * SIGMAS))
     np.testing.assert_allclose(found.tags[0], state.tags[0], atol=1e-14)

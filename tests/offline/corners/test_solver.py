@@ -7,7 +7,7 @@ from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.onboard.log.reading.reader import find_logs
 
 
@@ -17,7 +17,7 @@ def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part(tmp_path: Pa
     With damping instead, this took more than 40 steps and the map stayed on the floor.
     """
     simulate("nsh_flat", 2, tmp_path / "drives", render=False)
-    workings = Workings()
+    workings = Diagnostics()
     build_map(read_runs(find_logs([tmp_path / "drives"])), workings=workings)
     (solved,) = workings.solved
     corners, start = corner_graph(solved.graph, solved.solution.state)

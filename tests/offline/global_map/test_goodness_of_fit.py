@@ -10,7 +10,7 @@ from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows
+from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, fit_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.sam.solver import Solution
@@ -27,7 +27,7 @@ def map_runs(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
     return maps, solution
 
 
-def by_windows(solution: Solution, least_factor: float = 0.0) -> Goodness:
+def by_windows(solution: Solution, least_factor: float = 0.0) -> GoodnessOfFit:
     return fit_windows(solution.problem, least_factor=least_factor).judge(solution.state)
 
 

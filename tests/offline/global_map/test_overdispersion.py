@@ -16,14 +16,14 @@ from groundsbot.offline.global_map.pass_scatter import scatter_of_passes, scatte
 from groundsbot.offline.global_map.scale_checks import checks_of
 from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.mapping.findings import Found
+from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.maps.result import Component
 from groundsbot.offline.maps.widening import inflate_covariances
 from groundsbot.offline.measurements.passes import passes_of
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
 from groundsbot.offline.noise.reweighing import fit_and_weigh
-from groundsbot.offline.outliers.sightings import instances, sightings_of, with_instances
+from groundsbot.offline.outliers.sightings import instances, tracks_of, with_instances
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
@@ -117,7 +117,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
 def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
     """A drive's own solve has one place for a tag to which the joint solve gives two: it is solved again with both."""
     maps, graph, solution = solve_drives(CLEAN, 0, 3.0)
-    sightings = sightings_of([maps[1].segment])
+    sightings = tracks_of([maps[1].segment])
     apart = with_instances([maps[1].segment], sightings, instances(sightings, np.arange(len(sightings)), "second "))[0]
     again = build_graph([graph.segments[0], apart])
     start = again.start(solution.state.poses, {}, graph.calibration_of(solution.state))
@@ -132,7 +132,7 @@ def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
 def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     maps, graph, solution = solve_drives(MOVED, 4)
     (group,) = merge(maps).groups
-    found, misfit = Found(), misfit_of(maps, graph, solution)
+    found, misfit = Findings(), misfit_of(maps, graph, solution)
     assert misfit is not None
     nothing = parse_measurements(TapeOptions(), [segment.name for segment in graph.segments], list(graph.tags))
     found.take(maps, SolvedComponent(group, graph, solution, []), nothing, Stages())

@@ -11,7 +11,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.scale_checks import check_warnings
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.warnings import calibration_warnings
-from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult
+from groundsbot.offline.maps.parameter_results import CalibrationResult, ConsistencyCheck
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
@@ -47,7 +47,7 @@ def map_it(size: float = 1.0, track: float = 1.0, seed: int | None = None, dista
     return build_map([run], NoiseParameters(), Stages(), tape, calibrate=Calibrate())
 
 
-def check(result: MapResult, name: str) -> CheckResult:
+def check(result: MapResult, name: str) -> ConsistencyCheck:
     (found,) = [each for each in result.checks if each.name == name]
     return found
 
@@ -102,14 +102,14 @@ def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
 
 
 def test_sigmas_count_both_what_readings_and_what_robot_yaml_leave_open() -> None:
-    checks = [CheckResult("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
+    checks = [ConsistencyCheck("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
     assert checks[0].sigmas == pytest.approx(0.05 / np.hypot(0.003, 0.01))
     assert len(check_warnings(checks)) == 1
 
 
 def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
     """What a check tells of is not told twice; another robot's wheels and other prints are another matter."""
-    told = CheckResult("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
+    told = ConsistencyCheck("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
     corrections = [
         CalibrationResult(owner, name, 0, value=0.05, sigma=0.001, prior_sigma=0.005)
         for owner, name in (

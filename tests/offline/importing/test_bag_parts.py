@@ -19,7 +19,7 @@ from groundsbot.offline.importing.bags.importer import import_bag
 from groundsbot.offline.importing.bags.pictures import picture_of
 from groundsbot.offline.importing.bags.positions import planar_covariance
 from groundsbot.offline.importing.bags.reader import BagTopic, open_bag
-from groundsbot.offline.importing.bags.tags import Sighting, read_look
+from groundsbot.offline.importing.bags.tags import BagTag, read_picture
 from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.importing.run_writer import ImportReport
@@ -234,8 +234,8 @@ def test_corners_of_the_older_definition_are_eight_numbers() -> None:
     unknown = SimpleNamespace(**{**vars(detection), "family": "tagStandard41h12"})
     beyond = SimpleNamespace(**{**vars(detection), "id": 587})
     content = SimpleNamespace(header=SimpleNamespace(frame_id="/cam"), detections=[detection, unknown, beyond, beyond])
-    look, left_out = read_look(APRILTAG_MSGS, content, 5, "tag36h11")
-    (seen,) = look.sightings
+    look, left_out = read_picture(APRILTAG_MSGS, content, 5, "tag36h11")
+    (seen,) = look.tags
     assert seen.corners_px is not None
     assert (look.stamp_ns, look.frame, seen.tag_id, seen.hamming) == (5, "cam", 3, 1)
     np.testing.assert_allclose(seen.corners_px, [[10.5, 9.5], [40.5, 10.5], [39.5, 40.5], [9.5, 39.5]])
@@ -295,7 +295,7 @@ def test_a_mount_is_the_transform_it_came_from() -> None:
     ],
 )
 def test_covariances_are_used_where_they_are_some(covariance: np.ndarray, is_sane: bool) -> None:
-    seen = Sighting("tag36h11", 1, position_m=np.array([0.1, 0.2, 4.0]), covariance=covariance)
+    seen = BagTag("tag36h11", 1, position_m=np.array([0.1, 0.2, 4.0]), covariance=covariance)
     planar = planar_covariance(seen, Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
     assert (planar is not None) == is_sane
     if planar is not None:  # forward is the camera's z, left its -x

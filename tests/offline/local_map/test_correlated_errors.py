@@ -8,7 +8,7 @@ import pytest
 from groundsbot.offline.local_map.correlated_errors import SharedErrors, fit_shared_errors
 from groundsbot.offline.local_map.goodness_of_fit import fit_windows, in_windows
 from groundsbot.offline.sam.factors.odometry_and_readings import State
-from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.support.data.long_drives import LongDrive, make_long_drive, with_a_moved_tag, with_drifting_readings
@@ -99,7 +99,7 @@ def test_drives_that_only_a_tape_joins_have_nothing_to_contradict() -> None:
     problem = build_graph([segment, segment]).problem
     none, first, second = np.array([-1]), np.array([0]), np.array([200])
     placed = np.array([[3.0, 4.0, 0.0]])
-    measured = Measured(
+    measured = Priors(
         StartFactors(second, placed, np.diag([100.0, 100.0, 100.0])[None]),
         DistanceFactors(first, none, second, none, np.array([9.0]), np.array([0.01])),
     )

@@ -10,7 +10,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map import goodness_of_fit
-from groundsbot.offline.local_map.goodness_of_fit import Goodness, fit_windows, in_windows
+from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, fit_windows, in_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
@@ -18,7 +18,7 @@ from groundsbot.offline.measurements.covariance_components import CovariancePart
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import local_maps_without_outliers
-from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.budget import SolveBudget
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.drives import FAMILY, MadeTag, S, make_drive, make_positions, make_run, write_drive
@@ -27,7 +27,7 @@ from tests.support.data.long_drives import make_long_drive, with_a_moved_tag
 LENGTH_M = 500.0
 
 
-def judge(segment: Segment) -> Goodness:
+def judge(segment: Segment) -> GoodnessOfFit:
     return solve_local_map(segment).goodness
 
 
@@ -139,9 +139,9 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
-    def contradictory(segment: Segment, _: Effort, *, noise_is_open: bool) -> LocalMap:
+    def contradictory(segment: Segment, _: SolveBudget, *, noise_is_open: bool) -> LocalMap:
         assert noise_is_open
-        return replace(solve_local_map(segment), goodness=Goodness(300.0, 40, 80.0, 1.0, 1.0))
+        return replace(solve_local_map(segment), goodness=GoodnessOfFit(300.0, 40, 80.0, 1.0, 1.0))
 
     monkeypatch.setattr(local_maps_without_outliers, "solve_local_map", contradictory)
     (warning,) = build_map(read_runs([log])).warnings

@@ -15,7 +15,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.coarse_segment import coarse_keyframes, coarsen, refine_poses
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import Segment, segments_of
-from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.budget import SolveBudget
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
 from groundsbot.onboard.log.reading.reader import find_logs
@@ -58,7 +58,7 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     segment = replace(
         drive.segment,
         odometry=replace(odometry, covariance=100.0 * odometry.covariance),
-        readings=readings.spread(np.full((len(readings), 2), 10.0)),
+        readings=readings.inflate(np.full((len(readings), 2), 10.0)),
     )
     graph = build_graph([segment])
     found = solve_local_map(segment)
@@ -72,9 +72,9 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]:
     """Has the first start be dead reckoning; gathers what is started from."""
     starts: list[Segment] = []
-    built_up: Callable[[Segment, Effort], Any] = local_map._build_up
+    built_up: Callable[[Segment, SolveBudget], Any] = local_map._build_up
 
-    def worse(segment: Segment, effort: Effort) -> Any:
+    def worse(segment: Segment, effort: SolveBudget) -> Any:
         starts.append(segment)
         known = built_up(segment, effort)
         if len(starts) > 1:
@@ -125,7 +125,7 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
 
 def _n_pieces(length_m: float, wheel_sigma: float) -> int:
     segment = make_long_drive(2, length_m).segment
-    pieces, n_keyframes, found = local_map._Pieces(segment), 1, 0
+    pieces, n_keyframes, found = local_map._BuildUpSteps(segment), 1, 0
     pieces.wheel_covariance = wheel_sigma**2 * np.eye(3)
     while n_keyframes < len(segment.stamps_ns):
         n_keyframes, found = pieces.next_end(n_keyframes), found + 1
@@ -170,7 +170,7 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
     segment = make_long_drive(5, 300.0, town=make_town(5, (0.6, 1.2))).segment
     whole = solve_local_map(segment)
     monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
-    check = local_map._Check(build_graph([segment]), Effort.of_log(segment.run.log_bytes, segment.run.inputs))
+    check = local_map._Check(build_graph([segment]), SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs))
     assert 0 < len(check._tags) < len(segment.tags)
     assert check.judge(whole.solution).fits
 

@@ -9,10 +9,10 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online import information_root
-from groundsbot.offline.localization.online.drive import Table
+from groundsbot.offline.localization.online.drive import GrowingArrays
 from groundsbot.offline.localization.online.information_root import OnlineRoot
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
-from groundsbot.offline.localization.online.moving_frame import Known, pose_among, rotate_step
+from groundsbot.offline.localization.online.moving_frame import BorderPrior, pose_among, rotate_step
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
@@ -198,7 +198,7 @@ def test_tags_that_turn_together_go_along_arcs(twist: tuple[float, float, float]
     middle = places_m.mean(axis=0)
     quarter = np.column_stack([-(places_m - middle)[:, 1], (places_m - middle)[:, 0]])
     straight = twist[2] * quarter + twist[:2]
-    known = Known(np.zeros((12, 12)), np.zeros(12), np.concatenate([places_m, np.full((7, 2), np.nan)]))
+    known = BorderPrior(np.zeros((12, 12)), np.zeros(12), np.concatenate([places_m, np.full((7, 2), np.nan)]))
 
     def went(steps_m: FloatArray) -> FloatArray:
         return rotate_step(known, np.concatenate([np.zeros(first), steps_m.reshape(-1)]), first)[first:].reshape(-1, 2)
@@ -224,7 +224,7 @@ def test_a_pose_moves_along_with_the_tags_near_it() -> None:
 
 
 def test_a_table_keeps_its_rows_when_it_grows() -> None:
-    table = Table(number=((), int), pair=((2,), float))
+    table = GrowingArrays(number=((), int), pair=((2,), float))
     for i in range(2500):
         table.append(number=i, pair=(i, -i))
     np.testing.assert_array_equal(table["number"], np.arange(2500))

@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from groundsbot.offline.localization.online.information_root import Lifted, OnlineRoot
+from groundsbot.offline.localization.online.information_root import LeaveOneOut, OnlineRoot
 from groundsbot.offline.localization.online.tag_test import TagJudge
 from groundsbot.offline.measurements.tags import TagKey
 
@@ -27,10 +27,10 @@ class _MadeRoot:
     def squared_distance(self, tag: int) -> float:
         return self._held.get(tag, FITS)
 
-    def leave_one_out(self, tag: int) -> Lifted:
-        return Lifted(tag, np.zeros((23, 2)), np.zeros(2), np.eye(2))
+    def leave_one_out(self, tag: int) -> LeaveOneOut:
+        return LeaveOneOut(tag, np.zeros((23, 2)), np.zeros(2), np.eye(2))
 
-    def free_squares(self, free: list[tuple[int, TagKey]], lifted: Lifted | None = None) -> float:
+    def free_squares(self, free: list[tuple[int, TagKey]], lifted: LeaveOneOut | None = None) -> float:
         if lifted is None or lifted.at != 0:
             return CONTRADICTS
         return FITS if len(free) == 1 else self._together

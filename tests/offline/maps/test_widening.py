@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.commands.map_drives import exit_code, summary
-from groundsbot.offline.maps.archive import KeptCalibration, nominal_row
+from groundsbot.offline.maps.archive import ArchivedCalibration, nominal_row
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.fit_results import Misfit
 from groundsbot.offline.maps.json_document import map_as_json
@@ -23,7 +23,7 @@ QUIET = TagScatter(np.ones(3), np.zeros((3, 2, 2)))
 
 def full_component() -> Component:
     made = make_component()
-    kept = KeptCalibration(
+    kept = ArchivedCalibration(
         ("red",), ("wheel_scale",), nominal_row((0.1,))[None], np.ones(1), np.full((1, 1), 4e-6), np.full((1, 6), 1e-5)
     )
     one: np.ndarray = np.zeros(1, dtype=np.int64)

@@ -13,7 +13,7 @@ from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, reading_by_tilt, spread_by_tilt
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, reading_by_tilt
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
@@ -80,7 +80,7 @@ def test_a_floor_that_tilts_leaves_no_more_over_than_its_sigma_says() -> None:
     corners_px, _, _ = driven_past(3.0 * TILT_RAD, 3)
     near = read(corners_px[-20 * len(TAGS) :])
     assert near.chi2.mean() > 3.5
-    assert spread_by_tilt(near, 3.0 * TILT_RAD).chi2.mean() == pytest.approx(2.0, abs=0.8)
+    assert inflate_by_tilt(near, 3.0 * TILT_RAD).chi2.mean() == pytest.approx(2.0, abs=0.8)
 
 
 def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:

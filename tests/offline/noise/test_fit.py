@@ -12,7 +12,7 @@ from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.parameter_results import NOT_NEEDED
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import load_run
@@ -20,7 +20,7 @@ from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.sensor_model.sensor_model import STAMP_NOISE
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.fit import fit_noise
-from groundsbot.offline.noise.likelihood import Looker
+from groundsbot.offline.noise.likelihood import LikelihoodEvaluator
 from groundsbot.offline.noise.reweighing import fit_and_weigh, with_noise_of_map
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
@@ -167,9 +167,9 @@ def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -
     segment = maps[0].segment.with_position_noise((STAMP_NOISE,))
     names = ("sigma_corner_px", STAMP_NOISE)
     sigma = np.array([0.2, 0.5])
-    looker = Looker(noise_fit._part(solve_local_map(segment), segment, PRIOR, names))
+    looker = LikelihoodEvaluator(noise_fit._part(solve_local_map(segment), segment, PRIOR, names))
     variances = np.append(sigma**2, np.full(4, 0.05))
-    seen = looker.look(variances)
+    seen = looker.evaluate(variances)
     assert (seen.traces @ variances < 1.02 * seen.at_most).all()
 
 
@@ -225,7 +225,7 @@ def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
     runs = read_runs(find_logs([room]))
     times = []
     for refined in (False, True):
-        workings = Workings()
+        workings = Diagnostics()
         build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
         segments = [each.segment for each in workings.maps]
         times.append(np.concatenate([segment.readings.corner_sigmas for segment in segments]).max())

@@ -13,7 +13,7 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import grouping
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.outliers import split_alone
-from groundsbot.offline.outliers.sightings import sightings_of
+from groundsbot.offline.outliers.sightings import tracks_of
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_run
 
@@ -52,7 +52,7 @@ def solve_drives() -> LocalMap:
 
 
 def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
-    whole = sightings_of([laps()])
+    whole = tracks_of([laps()])
     assert len(whole) == 4 * N_LAPS
     assert few_of_each_tag(graph(), whole) is whole
 
@@ -61,7 +61,7 @@ def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
 def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, each reading once, and no more than are allowed; what there were is told."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
-    whole = sightings_of([laps()])
+    whole = tracks_of([laps()])
     few = few_of_each_tag(graph(), whole)
     assert (np.bincount(few.id) <= most).all()
     assert len(few) < len(whole)

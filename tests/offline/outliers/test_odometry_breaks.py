@@ -12,7 +12,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.outliers.grown_segments import Grown
+from groundsbot.offline.outliers.grown_segments import SolvedPart
 from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
 from tests.support.data.broken_odometry import make_clean_drive
@@ -65,7 +65,7 @@ def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int])
     drive = make_clean_drive(0).segment
     readings = drive.readings.where(np.arange(len(where)))
     segment = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
-    whole = Grown(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
+    whole = SolvedPart(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
     places = _places(segment, whole, whole)
     assert all(0 < place.end <= place.begin < 10 for place in places)
     assert all(np.isfinite(_seconds_between(segment, place)) for place in places)

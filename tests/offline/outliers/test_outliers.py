@@ -26,9 +26,9 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.evidence import linearise_observations, marginalise, noise_scales
 from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
-from groundsbot.offline.outliers.outliers import Searched, split_together, with_outliers_apart
+from groundsbot.offline.outliers.outliers import OutlierSearch, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import NOWHERE, minimise_places
-from groundsbot.offline.outliers.sightings import Sightings, instances, sightings_of, with_instances
+from groundsbot.offline.outliers.sightings import Tracks, instances, tracks_of, with_instances
 from groundsbot.offline.sam.arrowhead import covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
@@ -132,7 +132,7 @@ def local_maps() -> tuple[LocalMap, ...]:
 
 
 @cache
-def search() -> Searched:
+def search() -> OutlierSearch:
     maps = local_maps()
     graph, solution = solve_global_map(maps, merge(maps).groups[0], Stages())
     found = split_together(graph, solution, maps)
@@ -144,16 +144,16 @@ def search() -> Searched:
 def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
     seen = search()
-    own = np.flatnonzero(np.bincount(seen.sightings.id)[seen.sightings.id] > 3)[which]
+    own = np.flatnonzero(np.bincount(seen.tracks.id)[seen.tracks.id] > 3)[which]
     plain = linearise_observations(seen.graph, seen.solution.state, np.ones((4, 2)))
-    bare = marginalise(plain, seen.sightings, unmodelled_sigma_m=1e-4, weighed=False)
+    bare = marginalise(plain, seen.tracks, unmodelled_sigma_m=1e-4, weighed=False)
     at = int(np.flatnonzero(bare.which == own)[0])
     gain, _ = gain_of(minimise_places(bare, seen.place[bare.which]), np.array([at]))
     joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)
     place = seen.place.copy()
     place[own] = place.max() + 1
-    tags = instances(seen.sightings, place)
-    apart = build_graph(with_instances(seen.graph.segments, seen.sightings, tags))
+    tags = instances(seen.tracks, place)
+    apart = build_graph(with_instances(seen.graph.segments, seen.tracks, tags))
     start = apart.start(joined.state.poses, {}, seen.graph.calibration_of(joined.state))
     split = solve(apart.problem, start, losses=PLAIN_SQUARES)
     assert gain == pytest.approx(2.0 * (joined.cost - split.cost), rel=0.02, abs=0.02)
@@ -167,7 +167,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
     whole = information.times(np.eye(n))
     monkeypatch.setattr(covariance, "_FEW", 0)
     scales = noise_scales([each.goodness for each in local_maps()])
-    apart = marginalise(linearise_observations(seen.graph, seen.solution.state, scales), seen.sightings).information
+    apart = marginalise(linearise_observations(seen.graph, seen.solution.state, scales), seen.tracks).information
     assert apart.root.below.shape[0] > 0
     assert information.root.below.shape[0] == 0
     gather = np.zeros((2 * int(seen.places.place.max()) + 2, n))
@@ -199,10 +199,10 @@ def test_all_splits_of_a_place_are_weighed_at_once() -> None:
 
 def test_sightings_end_where_a_tag_is_out_of_sight() -> None:
     seen = search()
-    for s in range(len(seen.sightings)):
-        readings = np.flatnonzero(seen.sightings.of_reading == s)
-        assert len(readings) == seen.sightings.n_readings[s]
-    again = sightings_of(seen.graph.segments, np.ones(len(seen.sightings.of_reading), dtype=np.bool_))
+    for s in range(len(seen.tracks)):
+        readings = np.flatnonzero(seen.tracks.of_reading == s)
+        assert len(readings) == seen.tracks.n_readings[s]
+    again = tracks_of(seen.graph.segments, np.ones(len(seen.tracks.of_reading), dtype=np.bool_))
     assert (again.n_readings == 1).all()
 
 
@@ -213,14 +213,14 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
     zeros = np.zeros(len(place), dtype=np.int64)
     n_readings = np.r_[np.full(2 * n, 7), 1, 1]
     keys = tuple(TagKey(FAMILY, i) for i in range(n + 2))
-    sightings = Sightings(keys, zeros, zeros, place, zeros, zeros, zeros, n_readings, zeros)
+    sightings = Tracks(keys, zeros, zeros, place, zeros, zeros, zeros, n_readings, zeros)
     found = chances(sightings, place, Views(n_readings, np.r_[np.full(2 * n, 10), 30, 2]))
     assert (found[: 2 * n] == 1.0).all()
     assert found[-2] < 1e-6
     assert found[-1] > 0.05
 
 
-def _search_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> Searched:
+def _search_as(halls: list[dict[int, FloatArray]], *, is_noisy: bool) -> OutlierSearch:
     """One run after the other, whose noise was fitted or not, solved together and searched."""
     runs = [observe_at(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
     maps = [replace(solve_local_map(segment), is_noisy=is_noisy) for run in runs for segment in segments_of(run, NOISE)]

@@ -11,7 +11,7 @@ import pytest
 from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.mapping.workings import Workings
+from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import RunEvent
@@ -29,7 +29,7 @@ pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; witho
 
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
 
-Inside = tuple[MapResult, Workings]
+Inside = tuple[MapResult, Diagnostics]
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def made(folder: Path, logs: list[Path]) -> Path:
 
 @pytest.fixture(scope="module")
 def inside(logs: list[Path]) -> Inside:
-    workings = Workings()
+    workings = Diagnostics()
     return build_map(read_runs(logs), workings=workings), workings
 
 
@@ -165,7 +165,7 @@ def test_timelines_show_speed_tags_gaps_and_events(inside: Inside) -> None:
     events = (RunEvent(START_NS + S, True, HOSTILE), RunEvent(START_NS + 100 * S, False, "stopped"))
     changed = replace(segment, run=replace(segment.run, wheel_segments=(holed,), events=events))
     graph = replace(solved.graph, segments=(changed, *solved.graph.segments[1:]))
-    lame = Workings(workings.maps, [solved._replace(graph=graph)])
+    lame = Diagnostics(workings.maps, [solved._replace(graph=graph)])
     first = figures(document, lame)["timelines"][0]
     assert first["gaps"] == [[1.99, 3.01]]
     assert [(event["t_s"], event["loss"]) for event in first["events"]] == [(1.0, True), (first["t_s"][-1], False)]
@@ -208,7 +208,7 @@ def test_nothing_is_fetched(made: Path) -> None:
 
 
 def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
-    workings = Workings()
+    workings = Diagnostics()
     read = write_file((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
     assert read.words[0].startswith("One run, a_one, drove ")
     assert read.words[0].endswith("nothing was to be joined.")
@@ -219,7 +219,7 @@ def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
 
 def test_a_run_without_tags(tmp_path: Path) -> None:
     log = write_drive(tmp_path / "logs", DRIVES["a"], [], make_robot("a"))
-    workings = Workings()
+    workings = Diagnostics()
     read = write_file((build_map(read_runs([log]), workings=workings), workings), tmp_path)
     assert "It places no tag, so that nothing corrects what the wheels say." in read.words
     assert data_of(tmp_path / "report.html")["components"][0]["tags"] == []
@@ -228,7 +228,7 @@ def test_a_run_without_tags(tmp_path: Path) -> None:
 def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
     alone = write_drive(tmp_path / "logs", DRIVES["a"], far, make_robot("c"))
-    workings = Workings()
+    workings = Diagnostics()
     read = write_file((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
     assert "3 runs" in read.words[0]
     assert "fall into 2 components" in read.words[0]

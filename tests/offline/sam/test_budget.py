@@ -13,7 +13,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
-from groundsbot.offline.sam.budget import Effort, efforts_of, size_of, step_work
+from groundsbot.offline.sam.budget import SolveBudget, budgets_of, size_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
 from groundsbot.offline.self_calibration.information import information_of
@@ -134,7 +134,7 @@ def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_pat
 
 def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
-    effort = Effort.of_log(run.log_bytes)
+    effort = SolveBudget.of_log(run.log_bytes)
     first, second, third = segments_of(run, NoiseParameters())
     for segment in (first, second):
         effort.check(build_graph([segment]).problem, run.log, segment.name)
@@ -145,7 +145,7 @@ def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp
 def test_stretches_share_what_their_log_is_worth() -> None:
     segment = make_long_drive(4, 100.0).segment
     work = step_work(build_graph([segment]).problem)
-    effort = Effort.of_log(0)
+    effort = SolveBudget.of_log(0)
     effort.allowed = 2.5 * 30 * work
     solve_local_map(segment, effort)
     solve_local_map(segment, effort)
@@ -156,7 +156,7 @@ def test_stretches_share_what_their_log_is_worth() -> None:
 def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 10, 20), tmp_path))
     segments = [segment.part(0, 5 * (i + 1)) for i, segment in enumerate(segments_of(run, NoiseParameters()))]
-    whole, efforts = Effort.of_log(run.log_bytes), efforts_of(segments)
+    whole, efforts = SolveBudget.of_log(run.log_bytes), budgets_of(segments)
     assert sum(each.allowed for each in efforts) == pytest.approx(whole.allowed)
     assert [each.allowed / efforts[0].allowed for each in efforts] == pytest.approx(
         [size_of(segment) / size_of(segments[0]) for segment in segments]
@@ -176,7 +176,7 @@ def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
 
 def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (segment,) = segments_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
-    effort = Effort(2e9, 2e9, 1e9)
+    effort = SolveBudget(2e9, 2e9, 1e9)
     found, taken = solve_local_map(segment, effort), list[float]()
 
     def counted(*args: object, **kwargs: object) -> Solution:
@@ -191,7 +191,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
 
 def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
     local_map = solve_local_map(broken_drive("carried", 1).drive.segment)
-    maps, warnings = split_at_breaks([local_map], [Effort(1e8, 1e8, 1e9)])
+    maps, warnings = split_at_breaks([local_map], [SolveBudget(1e8, 1e8, 1e9)])
     assert maps == [local_map]
     (warning,) = warnings
     assert "was not searched to the end: that takes more work than a log of this size is worth" in warning
@@ -200,7 +200,7 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
     (segment,) = segments_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
-    effort = Effort(6e9, 6e9, 1e9)
+    effort = SolveBudget(6e9, 6e9, 1e9)
     found = solve_local_map(segment, effort)
     assert not found.goodness.fits
     assert "contradict each other" in found.goodness.warnings("it")[0]
@@ -212,11 +212,11 @@ def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every:
     """Even where its log is as small as it can be."""
     segment = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).segment
     log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_READING * len(segment.readings.tag)
-    effort = Effort.of_log(log_bytes)
+    effort = SolveBudget.of_log(log_bytes)
     found = solve_local_map(segment, effort)
     assert found.solution.converged
     assert found.goodness.fits
     assert effort.left > 0.5 * effort.allowed
-    assert effort.tries(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
-    everything = solve_local_map(segment, Effort.of_log(1 << 30))
+    assert effort.max_linearisations(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
+    everything = solve_local_map(segment, SolveBudget.of_log(1 << 30))
     np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)

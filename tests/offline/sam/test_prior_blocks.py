@@ -7,7 +7,7 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State, stack, whitening
-from groundsbot.offline.sam.factors.priors import KnownPlaces
+from groundsbot.offline.sam.factors.priors import JointPrior
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.support.data.graphs import make_graph, with_measured
 
@@ -18,7 +18,7 @@ def with_known(problem: Problem, truth: State, seed: int, tags: list[int], numbe
     n = 2 * len(tags) + len(numbers)
     root = 0.02 * (np.eye(n) + 0.4 * rng.standard_normal((n, n)))
     mean = np.concatenate([truth.tags[tags].reshape(-1), truth.calibration[numbers]]) + root @ rng.standard_normal(n)
-    known = KnownPlaces(np.array(tags), np.array(numbers), mean, whitening(root @ root.T))
+    known = JointPrior(np.array(tags), np.array(numbers), mean, whitening(root @ root.T))
     columns = problem.columns
     poses, places, calibration = (
         np.where(each >= 0, each + 3, -1) for each in (columns.poses, columns.tags, columns.calibration)

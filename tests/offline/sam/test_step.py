@@ -9,7 +9,7 @@ from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
-from groundsbot.offline.sam.step import Before, take_step
+from groundsbot.offline.sam.step import StepStart, take_step
 from tests.support.data.graphs import make_graph
 from tests.support.data.long_drives import make_long_drive
 
@@ -64,7 +64,7 @@ def test_a_step_too_long_is_taken_in_part() -> None:
             arrowhead,
             PLAIN_SQUARES,
             problem.anchor,
-            Before(truth, cost, False),
+            StepStart(truth, cost, False),
             times * step,
             1.0,
             arrowhead.empty_system(),
@@ -72,7 +72,7 @@ def test_a_step_too_long_is_taken_in_part() -> None:
         assert taken.share == share
         assert taken.cost < cost
     uphill = take_step(
-        arrowhead, PLAIN_SQUARES, problem.anchor, Before(truth, cost, False), -step, 1.0, arrowhead.empty_system()
+        arrowhead, PLAIN_SQUARES, problem.anchor, StepStart(truth, cost, False), -step, 1.0, arrowhead.empty_system()
     )
     assert uphill.cost == np.inf
 

@@ -81,9 +81,9 @@ def test_the_map_is_far_better_than_with_what_the_file_says(result: MapResult, r
 
 
 def test_a_map_says_how_the_clock_was_found(runs: list[Run]) -> None:
-    from groundsbot.offline.mapping.workings import Workings
+    from groundsbot.offline.mapping.workings import Diagnostics
 
-    workings = Workings()
+    workings = Diagnostics()
     build_map(runs[:1], workings=workings)
     (search,) = workings.searches.values()
     assert search.cost[np.argmin(np.abs(search.grid_s - search.offset_s))] < 5.0

@@ -24,13 +24,19 @@ from groundsbot.offline.maps.parameter_results import CalibrationChoice
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.measurements.segment import segments_of
-from groundsbot.offline.sam.budget import Effort
+from groundsbot.offline.sam.budget import SolveBudget
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
 from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
-from groundsbot.offline.self_calibration.robot import OPEN_SIGMAS, Learnt, Owned, correct_robot, open_parameters
+from groundsbot.offline.self_calibration.robot import (
+    OPEN_SIGMAS,
+    Correction,
+    OwnedParameter,
+    correct_robot,
+    open_parameters,
+)
 from groundsbot.offline.self_calibration.robot_table import AGREES, ASKED, WRONG, verdict_lines
-from groundsbot.offline.self_calibration.selection import TELLS_LESS, Told, choose, is_overruled
+from groundsbot.offline.self_calibration.selection import TELLS_LESS, CalibrationInformation, choose, is_overruled
 from groundsbot.offline.self_calibration.words import DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
@@ -76,7 +82,7 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
     readings = replace(segment.readings, corner_bias_px=np.tile(bias_px, (len(segment.readings), 1)))
     biased = replace(found, segment=replace(segment, readings=readings))
-    robots, efforts = {segment.run.name: segment.run.robot}, [Effort(1e11, 1e11, 1e9)]
+    robots, efforts = {segment.run.name: segment.run.robot}, [SolveBudget(1e11, 1e11, 1e9)]
     plain, less = (information_of([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
@@ -185,11 +191,15 @@ def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> No
     assert result.warnings == ()
 
 
-def stack_information(values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]) -> Told:
+def stack_information(
+    values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]
+) -> CalibrationInformation:
     """Segments that each tell of each number on its own."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
-    return Told(tuple(Parameter("r", name, (), sigma) for name, sigma in priors.items()), information, vector)
+    return CalibrationInformation(
+        tuple(Parameter("r", name, (), sigma) for name, sigma in priors.items()), information, vector
+    )
 
 
 def choice(
@@ -246,7 +256,7 @@ def test_a_file_that_is_right_is_called_wrong_once_in_a_hundred_maps() -> None:
 def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     wrong = mistaken(track_m=0.08, radius_left_m=0.02, yaw_rad=0.06, pitch_rad=-0.01)
     result = map_runs(log, wrong)
-    learnt = {Owned(each.owner, each.name): Learnt(each.value, each.sigma) for each in result.calibration}
+    learnt = {OwnedParameter(each.owner, each.name): Correction(each.value, each.sigma) for each in result.calibration}
     better = correct_robot(wrong, learnt)
     assert better.wheels.radius_left_m == pytest.approx(0.1, rel=1e-2)
     assert better.wheels.radius_left_m / better.wheels.radius_right_m == pytest.approx(1.0, rel=2e-3)
@@ -254,22 +264,22 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     again = map_runs(log, better, Calibrate())
     for each in again.calibration:
         assert abs(each.value) < each.sigma, each  # the same drive tells it once more
-        assert each.prior_sigma == pytest.approx(learnt[Owned(each.owner, each.name)].sigma, rel=1e-2)
+        assert each.prior_sigma == pytest.approx(learnt[OwnedParameter(each.owner, each.name)].sigma, rel=1e-2)
 
 
 def test_what_was_learnt_of_edges_is_written() -> None:
     robot = make_robot("a", edge_shift_px=0.02)
-    better = correct_robot(robot, {Owned("a", "edge_shift_px"): Learnt(-0.05, 0.004)})
+    better = correct_robot(robot, {OwnedParameter("a", "edge_shift_px"): Correction(-0.05, 0.004)})
     assert (better.edge_shift_px, better.edge_shift_px_sigma) == pytest.approx((-0.03, 0.004))
-    assert open_parameters(robot, {Owned("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
+    assert open_parameters(robot, {OwnedParameter("a", "edge_shift_px"): 1.0}).edge_shift_px_sigma == 1.0
 
 
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
     assert set(NAMES) == set(OPEN_SIGMAS) == set(DRIVES)
     robot = make_robot("a")
-    batch = Owned(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
+    batch = OwnedParameter(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
     everything = open_parameters(
-        robot, {Owned("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15}
+        robot, {OwnedParameter("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15}
     )
     sigmas = dict(zip(WHEEL_PARAMETERS, [each.sigma for each in parameters_of_wheels(everything)], strict=True))
     assert sigmas == pytest.approx({name: OPEN_SIGMAS[name] for name in WHEEL_PARAMETERS})
@@ -277,7 +287,7 @@ def test_every_number_that_may_be_freed_can_be_opened() -> None:
     assert everything.mount.roll_rad_sigma == OPEN_SIGMAS["mount_roll_rad"]
     assert everything.mount.z_m_sigma == robot.mount.z_m_sigma
     assert open_parameters(robot, {}) == robot
-    assert open_parameters(robot, {Owned("another", "track_scale"): 0.1}) == robot
+    assert open_parameters(robot, {OwnedParameter("another", "track_scale"): 0.1}) == robot
 
 
 def test_a_name_that_is_none_is_refused() -> None:
@@ -361,7 +371,7 @@ def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_t
     information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))
     vector = np.array([each @ np.array([-0.45 - 0.5 * m, m]) for each, m in zip(information, ahead, strict=True)])
     parameters = (Parameter("r", "track_scale", (), 0.01), Parameter("r", "mount_x_m", (), 0.005))
-    choices = choose(Told(parameters, information, vector))
+    choices = choose(CalibrationInformation(parameters, information, vector))
     assert is_overruled(choices)
-    mild = choose(Told(parameters, information, 0.2 * vector))
+    mild = choose(CalibrationInformation(parameters, information, 0.2 * vector))
     assert [each.is_freed for each in mild] == [True, False]

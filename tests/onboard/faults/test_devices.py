@@ -76,7 +76,7 @@ def test_a_relative_port_starts_at_robot_yaml(tmp_path: Path, monkeypatch: pytes
         driver.plug_in()
         made.wait_for_messages("/wheels", 2)
     monkeypatch.setattr(check, "_LISTEN_NS", 10_000_000)
-    assert str(tmp_path / "wheels") in check._check_wheels(files, RunClock(), check._Found()).text
+    assert str(tmp_path / "wheels") in check._check_wheels(files, RunClock(), check._DeviceFindings()).text
 
 
 def test_row_20_a_port_that_is_absent_at_the_start(tmp_path: Path, wheels_only: Path) -> None:

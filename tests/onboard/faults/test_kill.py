@@ -16,7 +16,7 @@ from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.fixtures.recording.devices import PtyPort
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from tests.support.data.logs import CAMERA, MS, ROBOT_YAML, START_NS, drive, facts, read_all, wheel_entry, write_log
 from tests.support.paths import ROOT
 
@@ -172,7 +172,7 @@ def test_row_19_a_second_recorder_leaves_with_one_line(tmp_path: Path, plug_in: 
 
 
 def test_row_38_what_is_out_of_range_is_refused_alone(tmp_path: Path) -> None:
-    run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, 5)
+    run = RunIdentity(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, 5)
     core = RecorderCore(tmp_path, run, durable=False)
     at_ns = START_NS + MS
     good = {"stamp_ns": at_ns, "receive_ns": at_ns, "sequence": 7}

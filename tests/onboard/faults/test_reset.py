@@ -8,7 +8,7 @@ import pytest
 
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.robot_yaml import Wheels
-from groundsbot.fixtures.drives.true_motion import Drive
+from groundsbot.fixtures.drives.true_motion import TrueMotion
 from groundsbot.fixtures.drives.wheel_controller import Controller, TimedLine
 from groundsbot.fixtures.recording import feed
 from groundsbot.fixtures.simulate import simulate
@@ -40,7 +40,7 @@ class ResetController(Controller):
 
     new_boot = True
 
-    def lines(self, drive: Drive, wheels: Wheels) -> list[TimedLine]:
+    def lines(self, drive: TrueMotion, wheels: Wheels) -> list[TimedLine]:
         """As a controller's, but for the reset."""
         lines = super().lines(drive, wheels)
         away_ns = [round(each * _NS_PER_S) for each in (RESET_AT_S, RESET_AT_S + AWAY_S)]

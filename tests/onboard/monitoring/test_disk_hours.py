@@ -17,12 +17,12 @@ from groundsbot.onboard.log.writing.segments import SegmentLimits
 from groundsbot.onboard.log.writing.storage import Disk
 from groundsbot.onboard.monitoring import check
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
-from groundsbot.onboard.monitoring.status import Look, Rates
+from groundsbot.onboard.monitoring.status import Rates, RecordingSnapshot
 from groundsbot.onboard.process.clock import RunClock
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import _PERIOD_S
 from groundsbot.onboard.recorder.disk.room import DiskRoom, space_policy
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.recorder.robot_files import RobotFiles
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.support.devices.live_recording import robot_yaml
@@ -59,7 +59,9 @@ def record(
         logs.append(SteppedLog(*arguments))
         return logs[0]
 
-    run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, START_NS - MINUTE)
+    run = RunIdentity(
+        parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, START_NS - MINUTE
+    )
     core = RecorderCore(folder, run, open_log=open_log)
     seconds = min(60, 12_000 // lines_hz)
     ticks = np.cumsum(rng.normal(1500.0 / lines_hz, 100.0 / lines_hz, (seconds * lines_hz, 2)), axis=0).astype(int)
@@ -93,10 +95,10 @@ def test_check_foresees_what_status_measures(
     tmp_path: Path, lines_hz: int, pictures_hz: int, picture_bytes: int
 ) -> None:
     rates = Rates()
-    rates.add(Look(START_NS, {}, {}, 0))
+    rates.add(RecordingSnapshot(START_NS, {}, {}, 0))
     folder, seconds = record(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
     written = sum(each.stat().st_size for each in folder.iterdir())
-    rates.add(Look(START_NS + round(seconds * S), {}, {}, written))
+    rates.add(RecordingSnapshot(START_NS + round(seconds * S), {}, {}, written))
     foreseen = hours_until_full(10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes).bytes_per_s)
     measured = hours_until_full(10**12, rates.bytes_per_s())
     assert foreseen is not None
@@ -126,19 +128,19 @@ def test_a_camera_that_ends_while_check_looks_has_been_seen(monkeypatch: pytest.
             return super().read(timeout_s)
 
     monkeypatch.setattr(check, "camera_for", lambda _settings, clock, since_ns: Short(clock, since_ns, 0, 20))
-    assert check._look(CameraSettings("drive.avi", 160, 120, 15.0), RunClock()).rate_hz == pytest.approx(10.0)
+    assert check._probe_camera(CameraSettings("drive.avi", 160, 120, 15.0), RunClock()).rate_hz == pytest.approx(10.0)
     monkeypatch.setattr(check, "camera_for", lambda _settings, clock, since_ns: Short(clock, since_ns, 0, 0))
     with pytest.raises(CameraEndedError, match="over"):
-        check._look(CameraSettings("drive.avi", 160, 120, 15.0), RunClock())
+        check._probe_camera(CameraSettings("drive.avi", 160, 120, 15.0), RunClock())
 
 
 def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_path: Path) -> None:
     files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port, camera: pictures}"))
-    assert check._load_of(files, check._Found(50.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
+    assert check._load_of(files, check._DeviceFindings(50.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
     assert Load(50.0, 2.0, 5.0, 3_000).kept_pictures_hz == 2.0
-    assert check._load_of(files, check._Found()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)
+    assert check._load_of(files, check._DeviceFindings()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)
     port_only = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port}"))
-    assert check._load_of(port_only, check._Found()).bytes_per_s == pytest.approx(5_400.0)
+    assert check._load_of(port_only, check._DeviceFindings()).bytes_per_s == pytest.approx(5_400.0)
 
 
 class Scripted(Camera):
@@ -169,5 +171,5 @@ class Scripted(Camera):
 def test_a_backlog_is_no_rate(monkeypatch: pytest.MonkeyPatch, backlog: int, new: int, rate_hz: float | None) -> None:
     monkeypatch.setattr(check, "camera_for", lambda _settings, clock, since_ns: Scripted(clock, since_ns, backlog, new))
     monkeypatch.setattr(check, "_LISTEN_NS", 50 * MS)
-    look = check._look(CameraSettings("pictures", 160, 120, 15.0), RunClock())
+    look = check._probe_camera(CameraSettings("pictures", 160, 120, 15.0), RunClock())
     assert look.rate_hz == (None if rate_hz is None else pytest.approx(rate_hz))

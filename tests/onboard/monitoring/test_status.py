@@ -15,15 +15,15 @@ from groundsbot.onboard.cli import app
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import EventKind
 from groundsbot.onboard.monitoring.housekeeping import Housekeeper
-from groundsbot.onboard.monitoring.status import Look, Rates, Status, is_alive, read_status, write_status
+from groundsbot.onboard.monitoring.status import Rates, RecordingSnapshot, Status, is_alive, read_status, write_status
 from groundsbot.onboard.process.systemd import Notifier
 from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import START_NS, S
 
 
-def look(second: float, lines: int, written_bytes: int = 0) -> Look:
+def look(second: float, lines: int, written_bytes: int = 0) -> RecordingSnapshot:
     now_ns = START_NS + round(second * S)
-    return Look(now_ns, {"/wheels": lines}, {"/wheels": now_ns - S // 4}, written_bytes)
+    return RecordingSnapshot(now_ns, {"/wheels": lines}, {"/wheels": now_ns - S // 4}, written_bytes)
 
 
 def test_rates_are_of_the_last_seconds_and_growth_of_the_last_minutes() -> None:

@@ -24,7 +24,7 @@ from groundsbot.onboard.recorder.disk import log_thread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.wheels.protocol import format_line
 from tests.support.data.logs import MS, read_all
 from tests.support.devices.fake_disks import MortalDisk
@@ -135,7 +135,7 @@ def record(
         )
         return logs[0]
 
-    run = Run(parse_robot_yaml(ROBOT_YAML, "r"), ROBOT_YAML, CAMERA, "run1", START_NS, START_NS - UPTIME_NS)
+    run = RunIdentity(parse_robot_yaml(ROBOT_YAML, "r"), ROBOT_YAML, CAMERA, "run1", START_NS, START_NS - UPTIME_NS)
     core = RecorderCore(Path("logs"), run, expect_wheels=expect_wheels, open_log=open_log)
 
     def wheel(index: int, at_ns: int) -> None:

@@ -11,7 +11,7 @@ from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetections
 from groundsbot.onboard.log.reading.reader import read_log
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
 ROBOT_YAML = """
@@ -30,7 +30,7 @@ TAG = Detection("tag36h11", 4, 0, 55.5, np.array([[1.25, 2.0], [9.0, 2.5], [9.5,
 
 def make_core(folder: Path, pictures_hz: float = 0.0, camera: CameraModel | None = CAMERA) -> RecorderCore:
     text = ROBOT_YAML.replace("PICTURES", str(pictures_hz))
-    run = Run(parse_robot_yaml(text, "robot.yaml"), text, camera, "run1", START_NS, START_NS - 5)
+    run = RunIdentity(parse_robot_yaml(text, "robot.yaml"), text, camera, "run1", START_NS, START_NS - 5)
     return RecorderCore(folder, run, durable=False)
 
 
@@ -266,7 +266,7 @@ def test_a_port_lost_just_before_the_end_is_a_loss(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_never_comes_or_does_not_come_back_is_a_loss(tmp_path: Path) -> None:
-    run = Run(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
+    run = RunIdentity(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
     for name, said in (
         ("never", {"recording without a single picture": 1}),
         ("lost", {"camera gone or silent at the end": 1}),
@@ -283,7 +283,7 @@ def test_a_camera_that_never_comes_or_does_not_come_back_is_a_loss(tmp_path: Pat
 
 
 def test_without_a_port_in_robot_yaml_detections_wait_for_nothing(tmp_path: Path) -> None:
-    run = Run(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
+    run = RunIdentity(parse_robot_yaml(ROBOT_YAML.replace("PICTURES", "0"), "r"), "", CAMERA, "run1", START_NS, 0)
     core = RecorderCore(tmp_path, run, durable=False, expect_wheels=False)
     core.on_detections([TAG], (64, 48), START_NS, START_NS + MS, StampSource.STAMP_SOURCE_CAMERA, 0)
     assert core.counts["/tags/detections"] == 1

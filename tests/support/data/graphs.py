@@ -16,7 +16,7 @@ from groundsbot.offline.sam.factors.odometry_and_readings import (
     State,
     whitening,
 )
-from groundsbot.offline.sam.factors.priors import DistanceFactors, Measured, StartFactors
+from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors
 from groundsbot.offline.sam.solver import Problem
 from tests.support.data.factors import odometry_of, readings_of
 
@@ -89,7 +89,7 @@ def with_measured(problem: Problem, truth: State, seed: int, n: int) -> Problem:
     place = np.where((pose >= 0)[..., None], truth.poses[pose, :2], truth.tags[tag])
     distance_m = np.linalg.norm(place[1] - place[0], axis=-1) + 0.02 * rng.standard_normal(n)
     distances = DistanceFactors(pose[0], tag[0], pose[1], tag[1], np.maximum(distance_m, 0.01), np.full(n, 0.02))
-    return replace(problem, measured=Measured(starts, distances))
+    return replace(problem, measured=Priors(starts, distances))
 
 
 def _drive(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, IntArray, IntArray]:

@@ -9,7 +9,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.evaluation.truth import TrueRun, Truth
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult
-from groundsbot.offline.maps.parameter_results import CalibrationResult, CheckResult, MetreResult
+from groundsbot.offline.maps.parameter_results import CalibrationResult, ConsistencyCheck, ScaleBudget
 from groundsbot.offline.maps.result import AdviceResult, Component, MapResult, RunResult, StartToStart, TagResult
 
 STEP_NS = 100_000_001  # so that stamps do not fit into a float of seconds
@@ -66,8 +66,8 @@ def make_map(*components: Component) -> MapResult:
             ),
             MeasurementResult("distance", "red_one", "tag36h11:3", np.array([4.1]), np.array([0.01]), None),
         ),
-        checks=(CheckResult("turn", 0, "red", None, 0.01, 0.002, 0.01),),
-        metres=(MetreResult(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
+        checks=(ConsistencyCheck("turn", 0, "red", None, 0.01, 0.002, 0.01),),
+        metres=(ScaleBudget(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
         warnings=("tag 9 lies elsewhere",),
         advice=(
             AdviceResult(

@@ -7,7 +7,7 @@ from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.log.losses import LogLosses
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log
-from groundsbot.onboard.recorder.recorder import RecorderCore, Run
+from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
 ROBOT_YAML = """
@@ -27,7 +27,9 @@ S = 1_000_000_000
 
 def make_core(folder: Path, camera: CameraModel | None = CAMERA) -> RecorderCore:
     """A core whose run folder is `folder/run1`."""
-    run = Run(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, camera, "run1", START_NS, START_NS - UPTIME_NS)
+    run = RunIdentity(
+        parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, camera, "run1", START_NS, START_NS - UPTIME_NS
+    )
     return RecorderCore(folder, run, durable=False)
 
 
