@@ -16,7 +16,7 @@ from groundsbot.offline.maps import (
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.outliers import (
     OutlierSearch,
-    false_detections,
+    find_false_detections,
     join_places,
     outlier_report,
     read_as_another,
@@ -120,7 +120,7 @@ def _outlier_report(
             f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'reading')}) of tags {_list_ids(ids)} "
             "went astray from where all others have them: left out"
         )
-    return suspects, stray | false_detections(searched.graph, suspects), told
+    return suspects, stray | find_false_detections(searched.graph, suspects), told
 
 
 def _list_ids(ids: Collection[tuple[str, int]]) -> str:

@@ -1,5 +1,5 @@
 from .duplicate_ids import split_duplicates
-from .left_out import false_detections, read_as_another, stray_passes, without_tags
+from .left_out import find_false_detections, read_as_another, stray_passes, without_tags
 from .local_maps_without_outliers import local_maps_of, remove_outliers_under_own_noise
 from .outliers import OutlierSearch, join_places, rename_tags, split_together, with_outliers_apart
 from .report import outlier_report
@@ -8,7 +8,7 @@ from .search import FALSE_ALARM
 __all__ = [
     "FALSE_ALARM",
     "OutlierSearch",
-    "false_detections",
+    "find_false_detections",
     "join_places",
     "local_maps_of",
     "outlier_report",

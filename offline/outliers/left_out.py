@@ -35,7 +35,7 @@ from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
-def false_detections(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
+def find_false_detections(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
     """Tags of the graph that are false detections and nothing else."""
     named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
     few = graph.n_readings() <= MOST_READINGS

@@ -155,7 +155,7 @@ class FakeNotifier:
     def alive(self, _text: str) -> None:
         self.said.append("alive")
 
-    def troubled(self, _text: str) -> None:
+    def notify_trouble(self, _text: str) -> None:
         self.said.append("troubled")
 
     def stopping(self) -> None:
