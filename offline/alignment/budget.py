@@ -29,7 +29,7 @@ class AlignmentTooLongError(Exception):
 
 
 @dataclass
-class AlignmentEffort:
+class AlignmentBudget:
     """What is left for all pairs of a map.
 
     Attributes:
@@ -39,11 +39,11 @@ class AlignmentEffort:
     left: float = np.inf
 
     @staticmethod
-    def of_logs(n_bytes: int) -> "AlignmentEffort":
+    def of_logs(n_bytes: int) -> "AlignmentBudget":
         """What drives are worth whose logs have so many bytes; without end where they are from no logs."""
         if not n_bytes:
-            return AlignmentEffort()
-        return AlignmentEffort(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2)
+            return AlignmentBudget()
+        return AlignmentBudget(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2)
 
     def begin(self) -> None:
         """Takes off what a pair takes in any case.
@@ -75,4 +75,4 @@ class AlignmentEffort:
             raise AlignmentTooLongError
 
 
-UNLIMITED: Final = AlignmentEffort()
+UNLIMITED: Final = AlignmentBudget()

@@ -27,7 +27,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
+from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentBudget
 from groundsbot.offline.alignment.condensed_map import AnchorTree, rotate_quarter
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, gate_ratio, log_likelihood_ratio
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
@@ -64,7 +64,7 @@ class LinearisedFit:
     by_transform: FloatArray
     by_a: FloatArray
     by_b: FloatArray
-    effort: AlignmentEffort = field(default_factory=AlignmentEffort)
+    effort: AlignmentBudget = field(default_factory=AlignmentBudget)
 
 
 class JointFit:
@@ -75,7 +75,7 @@ class JointFit:
         a: AnchorTree,
         b: AnchorTree,
         unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
-        effort: AlignmentEffort = UNLIMITED,
+        effort: AlignmentBudget = UNLIMITED,
     ) -> None:
         """Two trees and what may be done with them.
 

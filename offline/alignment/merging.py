@@ -13,7 +13,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import AlignmentEffort, AlignmentTooLongError
+from groundsbot.offline.alignment.budget import AlignmentBudget, AlignmentTooLongError
 from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
 from groundsbot.offline.alignment.cycle_consistency import Contradiction, Link, consistent_links, spanning_tree
 from groundsbot.offline.alignment.pairwise import Alignment, align
@@ -121,7 +121,7 @@ def _align_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
-    effort = AlignmentEffort.of_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
+    effort = AlignmentBudget.of_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
     by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)

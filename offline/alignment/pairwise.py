@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentEffort
+from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentBudget
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.joint_fit import JointFit
 from groundsbot.offline.alignment.model_selection import CHANCE_NATS, HypothesisTest
@@ -83,7 +83,7 @@ def align(
     a: CondensedMap,
     b: CondensedMap,
     placement: Placement | None = None,
-    effort: AlignmentEffort = UNLIMITED,
+    effort: AlignmentBudget = UNLIMITED,
 ) -> Alignment | None:
     """The transform that explains the shared tags best, or None where no two of them fit together.
 
@@ -112,7 +112,7 @@ class _AlignmentChoice(HypothesisTest):
         b: CondensedMap,
         shared: tuple[TagKey, ...],
         placement: Placement | None,
-        effort: AlignmentEffort,
+        effort: AlignmentBudget,
     ) -> None:
         self.fit = JointFit(a.tree(shared), b.tree(shared), effort=effort)
         super().__init__(self.fit.places_a, self.fit.places_b)

@@ -14,9 +14,9 @@ from groundsbot.offline.corners.floor_noise import (
     initial_attitude_sigmas,
     with_attitude_sigmas,
 )
-from groundsbot.offline.corners.floor_slope_test import stretches_off_level
+from groundsbot.offline.corners.floor_slope_test import segments_off_level
 from groundsbot.offline.corners.graph import CornerGraph, corner_graph
-from groundsbot.offline.corners.initial_tag_poses import tags_rehung
+from groundsbot.offline.corners.initial_tag_poses import with_alternative_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.corners.solver import CornerSolution, solve_corners
 from groundsbot.offline.maps import FloorSigmas, TagPose
@@ -102,10 +102,10 @@ def refine(
     sigma = LEVEL if too_many else initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
         found = solve_corners(with_attitude_sigmas(found.problem, sigma), found.state)
-        found = solve_corners(found.problem, tags_rehung(found.problem, found.state))
+        found = solve_corners(found.problem, with_alternative_tag_poses(found.problem, found.state))
         sigma = fit_attitude_sigmas(found.problem, found.state)
         found = solve_corners(with_attitude_sigmas(found.problem, sigma), found.state)
-    off_level = [*too_many, *stretches_off_level(graph, found)]
+    off_level = [*too_many, *segments_off_level(graph, found)]
     reason = "" if found.converged else found.reason
     if not reason and (share := found.pictures.outliers) > _MOST_OUTLIERS:
         reason = (

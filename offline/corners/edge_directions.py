@@ -16,7 +16,7 @@ from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spat
 from groundsbot.offline.corners.kernels.initial_tag_poses import eyes_of
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues
-from groundsbot.offline.foundation import borrowed, njit
+from groundsbot.offline.foundation import borrow, njit
 
 
 def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> CornerFactors:
@@ -32,7 +32,7 @@ def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> Corne
 @njit
 def project(looks: CornerArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
     """Sets the pixels (M, 4, 2) of all corners, before sides are seen too far out; NaN where a lens has no image."""
-    looks, values = borrowed(looks), borrowed(values)
+    looks, values = borrow(looks), borrow(values)
     axes, places = np.empty((4, 3, 3)), np.empty((4, 3))
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for m in range(len(looks.pose)):

@@ -229,7 +229,7 @@ class CornerFactors:
         """(M, 6) as corrected, and R_base_camera (M, 3, 3)."""
         mount = self.observations.mount + state.calibration[self.observations.mount_parameters]
         roll, pitch, yaw = mount[:, 3], mount[:, 4], mount[:, 5]
-        return mount, _about_up(yaw) @ _rotation_about_left(pitch) @ _about_forward(roll) @ _LEVEL_OPTICAL
+        return mount, _about_up(yaw) @ _rotation_about_y(pitch) @ _about_forward(roll) @ _LEVEL_OPTICAL
 
     def _predict(self, state: SpatialState) -> PredictedCorners:
         looks = self.observations
@@ -310,7 +310,7 @@ def _about_up(angle_rad: FloatArray) -> FloatArray:
     return _about(angle_rad, 0, 1)
 
 
-def _rotation_about_left(angle_rad: FloatArray) -> FloatArray:
+def _rotation_about_y(angle_rad: FloatArray) -> FloatArray:
     return _about(angle_rad, 2, 0)
 
 

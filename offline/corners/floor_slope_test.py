@@ -61,7 +61,7 @@ class _OffLevel(NamedTuple):
     freedom: int
 
 
-def stretches_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
+def segments_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
     """A sentence for each segment of a segment that stands otherwise than the rest, beyond the floor's own sigmas.
 
     The worst is taken first and the others judged given it: what a ramp bends looks off level too.

@@ -48,7 +48,7 @@ def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) ->
     return found
 
 
-def tags_rehung(problem: CornerProblem, state: SpatialState) -> SpatialState:
+def with_alternative_tag_poses(problem: CornerProblem, state: SpatialState) -> SpatialState:
     """The state with each tag in the way that costs its pictures least, as they stand on a floor that is not level.
 
     Where tags are hung first, pictures are taken for level: tilts of 0.3 degrees move corners by more than the two

@@ -108,25 +108,25 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
     system, cost = problem.system(state)
     costs = [cost]
 
-    def ended(reason: str, factor: FrontFactor | None = None) -> CornerSolution:
+    def finish(reason: str, factor: FrontFactor | None = None) -> CornerSolution:
         return CornerSolution(state, tuple(costs), reason, problem, factor)
 
     if not np.isfinite(cost):
-        return ended("the cost is no number at the start")
+        return finish("the cost is no number at the start")
     while len(costs) <= _MOST_STEPS:
         try:
             step = _step(problem, system, state, damping.share)
         except NotPositiveError:
-            return ended("something is not tied down")
+            return finish("something is not tied down")
         if step.expected <= _COST_TOLERANCE:
             state = step.state
-            return ended("converged", step.factor if damping.is_least else problem.factor(state))
+            return finish("converged", step.factor if damping.is_least else problem.factor(state))
         if step.expected <= _NEAR and damping.is_least:
             closed_in = _last_steps(problem, step, cost)
             if closed_in is not None:
                 state = closed_in.state
                 costs += closed_in.costs
-                return ended("converged", step.factor)
+                return finish("converged", step.factor)
         taken = _take_step(problem, state, step, cost)
         if taken is not None:
             damping.accept_step(taken.gain)
@@ -135,9 +135,9 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
             continue
         damping.reject_step()
         if damping.is_exhausted:
-            return ended("no step lowers the cost")
+            return finish("no step lowers the cost")
         system, _ = problem.system(state)  # its entries became the factor
-    return ended(f"stopped after {_MOST_STEPS} steps")
+    return finish(f"stopped after {_MOST_STEPS} steps")
 
 
 def _step(problem: CornerProblem, system: FrontalSystem, state: SpatialState, share: float) -> _Step:

@@ -1,6 +1,6 @@
 from .csv_table import CsvTable, read_table
 from .input_budget import ALONE, Inputs, size_bytes
-from .jit import announce_compilation, borrowed, inline, inner, njit
+from .jit import announce_compilation, borrow, inline, inner, njit
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
 
@@ -12,7 +12,7 @@ __all__ = [
     "StageCost",
     "Stages",
     "announce_compilation",
-    "borrowed",
+    "borrow",
     "inline",
     "inner",
     "njit",

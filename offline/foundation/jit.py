@@ -62,33 +62,33 @@ def inline(function: _F) -> _F:
 
 if TYPE_CHECKING:
 
-    def borrowed(value: _T) -> _T:
+    def borrow(value: _T) -> _T:
         """For use inside compiled functions: arrays, or a tuple of them, whose references are not counted."""
         return value
 
 else:
 
     @extending.intrinsic
-    def borrowed(_context, value):  # noqa: ANN001, ANN201 (numba's code generation carries no types)
+    def borrow(_context, value):  # noqa: ANN001, ANN201 (numba's code generation carries no types)
         """For use inside compiled functions: arrays, or a tuple of them, whose references are not counted.
 
         Whoever passes a tuple of many arrays on pays for counting each of them up and down again, atomically; inner
         loops spent two fifths of their time on that. Only for arguments: the caller holds them while the function runs.
         """
 
-        def uncounted(context, builder, kind, item):  # noqa: ANN001, ANN202
+        def without_count(context, builder, kind, item):  # noqa: ANN001, ANN202
             if isinstance(kind, types.Array):
                 array = context.make_array(kind)(context, builder, value=item)
                 array.meminfo = array.meminfo.type(None)
                 return array._getvalue()
             if isinstance(kind, types.BaseTuple):
                 members = [builder.extract_value(item, i) for i in range(len(kind))]
-                kept = [uncounted(context, builder, own, one) for own, one in zip(kind, members, strict=True)]
+                kept = [without_count(context, builder, own, one) for own, one in zip(kind, members, strict=True)]
                 return context.make_tuple(builder, kind, kept)
             return item
 
         def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-            return uncounted(context, builder, signature.args[0], arguments[0])
+            return without_count(context, builder, signature.args[0], arguments[0])
 
         return value(value), generate
 

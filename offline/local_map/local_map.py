@@ -24,7 +24,7 @@ from groundsbot.offline.measurements import (
     TagKey,
     coarse_keyframes,
     coarsen,
-    least_shared,
+    least_shared_variance,
     refine_poses,
     telling_keyframes,
     without_unconfirmed_tracks,
@@ -163,12 +163,12 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
     """The map of noisy ranges solved again, with what depends on ranges taken at those of the map."""
 
-    def changed(segment: Segment) -> Segment:
+    def with_solved_ranges(segment: Segment) -> Segment:
         graph = build_graph([segment])
         state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
         return replace(segment, readings=segment.readings.with_edges_at(graph.problem.readings.ranges_m(state)))
 
-    segment = changed(local_map.segment)
+    segment = with_solved_ranges(local_map.segment)
     if not segment.readings.from_corners.any():
         return local_map
     graph = build_graph([segment])
@@ -176,7 +176,9 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> Lo
     solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
     graph.problem.arrowhead.without_scratch()
     whole = local_map.whole
-    return replace(local_map, segment=segment, graph=graph, solution=solution, whole=whole and changed(whole))
+    return replace(
+        local_map, segment=segment, graph=graph, solution=solution, whole=whole and with_solved_ranges(whole)
+    )
 
 
 class WindowNoise(NamedTuple):
@@ -270,7 +272,7 @@ class _Check:
             graph.problem,
             effort=effort,
             share=_WINDOWS_SHARE,
-            least_shared=least_shared(segment.readings),
+            least_shared=least_shared_variance(segment.readings),
             least_factor=least_factor,
         )
 

@@ -86,7 +86,7 @@ def localize_maps(
     parts = _parts(known, folder, component)
     with stages.stage("looking for the start"):
         found = [_SegmentPlaces(each, _locate(each, parts)) for each in maps]
-    _check_shared(found, folder, parts)
+    _check_shared_tags(found, folder, parts)
     home = _home(found)
     here = [each.best for each in found if each.is_in(home)]
     not_located = tuple(each.why(home) for each in found if not each.is_in(home))
@@ -180,7 +180,7 @@ def _evidence(located: Located) -> float:
     return float("-inf") if located.alignment is None else located.alignment.evidence_nats
 
 
-def _check_shared(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, MapPrior]) -> None:
+def _check_shared_tags(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, MapPrior]) -> None:
     if any(each.located for each in found):
         return
     run = found[0].local_map.segment.run

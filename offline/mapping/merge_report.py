@@ -6,7 +6,7 @@ from math import degrees
 from groundsbot.offline.alignment import Alignment, Group, Merge, PairAlignment, reason_not_joined
 from groundsbot.offline.global_map import TagJoin
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.maps import AlignmentResult, RivalResult
+from groundsbot.offline.maps import AlignmentResult, AlternativeResult
 from groundsbot.offline.measurements import TagKey
 
 _TOO_LONG = (
@@ -131,7 +131,7 @@ def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment)
         inlier_rmse_m=alignment.rmse_m,
         outliers=_ids(alignment.outliers),
         is_sure=alignment.is_sure,
-        rivals=tuple(RivalResult(each.T_a_b, _ids(each.inliers)) for each in alignment.rivals),
+        rivals=tuple(AlternativeResult(each.T_a_b, _ids(each.inliers)) for each in alignment.rivals),
     )
 
 

@@ -1,6 +1,6 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
 from .files import JSON_FILE, read_map, write_map
-from .fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
+from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, SuspectTag
 from .json_document import advice_as_json, map_as_json
 from .mcap import MAP_FILE, write_mcap
 from .model import MapModel
@@ -37,6 +37,7 @@ __all__ = [
     "NOT_NEEDED",
     "AdviceResult",
     "AlignmentResult",
+    "AlternativeResult",
     "ArchivedCalibration",
     "ArchivedSegment",
     "CalibrationChoice",
@@ -51,7 +52,6 @@ __all__ = [
     "MapResult",
     "MeasurementResult",
     "Misfit",
-    "RivalResult",
     "RobotNumber",
     "RunResult",
     "ScaleBudget",

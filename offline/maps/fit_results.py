@@ -6,7 +6,7 @@ from groundsbot.calib.foundation import FloatArray
 
 
 @dataclass(frozen=True)
-class RivalResult:
+class AlternativeResult:
     """Another transform that explains the shared tags almost as well."""
 
     T_from_to: FloatArray  # (3,)
@@ -25,7 +25,7 @@ class AlignmentResult:
     inlier_rmse_m: float
     outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
     is_sure: bool = True  # else the runs are not joined by it: chance or a rival explains the tags almost as well
-    rivals: tuple[RivalResult, ...] = ()
+    rivals: tuple[AlternativeResult, ...] = ()
     is_weak: bool = False  # one tag alone joins them: if that was moved in between, nothing shows it
     # (3, 3) of T_from_to as x, y, theta in the first run's frame; None where the transform only begins a solve.
     covariance: FloatArray | None = None

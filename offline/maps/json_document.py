@@ -11,7 +11,13 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, RivalResult, SuspectTag
+from groundsbot.offline.maps.fit_results import (
+    AlignmentResult,
+    AlternativeResult,
+    MeasurementResult,
+    Misfit,
+    SuspectTag,
+)
 from groundsbot.offline.maps.parameter_results import ConsistencyCheck, FittedNoise, FittedParameter
 from groundsbot.offline.maps.result import (
     AdviceResult,
@@ -224,7 +230,7 @@ def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
         outliers=_tag_names(entry["outliers"]),
         is_sure=entry["is_sure"],
         rivals=tuple(
-            RivalResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
+            AlternativeResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
         ),
         is_weak=entry.get("is_weak", False),
         covariance=None if entry.get("covariance") is None else array_from(entry["covariance"]),

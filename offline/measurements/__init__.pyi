@@ -6,7 +6,7 @@ from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .segment import Segment, segments_of
-from .sensor_model.corner_bias import least_shared, least_shared_by_corners
+from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
 from .sensor_model.readings import Readings
 from .sensor_model.sensor_model import (
     MAX_RANGE_M,
@@ -53,8 +53,8 @@ __all__ = [
     "coarse_keyframes",
     "coarsen",
     "growth",
-    "least_shared",
     "least_shared_by_corners",
+    "least_shared_variance",
     "load_run",
     "parse_measurements",
     "passes_of",

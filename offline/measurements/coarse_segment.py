@@ -83,14 +83,14 @@ def _compose(odometry: SegmentOdometry, keyframes: IntArray) -> SegmentOdometry:
     end = np.repeat(keyframes[1:], np.diff(keyframes))
     to_end = se2.adjoint(se2.between(poses[end], poses[1:]))
 
-    def carried(covariance: FloatArray) -> FloatArray:
+    def carry(covariance: FloatArray) -> FloatArray:
         total: FloatArray = np.add.reduceat(to_end @ covariance @ to_end.swapaxes(-1, -2), first, axis=-3)
         return total
 
     return SegmentOdometry(
         motion=se2.between(poses[first], poses[keyframes[1:]]),
-        covariance=carried(odometry.covariance),
-        parts=replace(odometry.parts, unit=carried(odometry.parts.unit), rest=carried(odometry.parts.rest)),
+        covariance=carry(odometry.covariance),
+        parts=replace(odometry.parts, unit=carry(odometry.parts.unit), rest=carry(odometry.parts.rest)),
         jacobian=np.add.reduceat(to_end @ odometry.jacobian, first, axis=0),
         distance_m=np.add.reduceat(odometry.distance_m, first),
     )

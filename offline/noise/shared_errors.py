@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.measurements import Segment, cells_of, least_shared, least_shared_by_corners, passes_of
+from groundsbot.offline.measurements import Segment, cells_of, least_shared_by_corners, least_shared_variance, passes_of
 from groundsbot.offline.noise.lasting_errors import LastingErrors
 
 # What readings of a tag err by is forgotten, but for a share of 1/e, after so much of the way, or so much turned. On
@@ -81,7 +81,7 @@ def with_shared_errors(segment: Segment, shared: FloatArray, sigma_corner_px: fl
     for errors, both in zip(lasting_errors(segment), shared, strict=True):
         times += errors.alike()[:, None] * np.einsum("mij,j->mi", back**2, both)
     n_in_cell = in_cell(segment)
-    sigmas = np.sqrt(1.0 + np.maximum(times, n_in_cell[:, None] * least_shared(readings)))
+    sigmas = np.sqrt(1.0 + np.maximum(times, n_in_cell[:, None] * least_shared_variance(readings)))
     of_corners = np.maximum(np.sqrt(1.0 + times.max(axis=1)), inflation_of_corners(segment, n_in_cell, sigma_corner_px))
     return replace(segment, readings=readings.inflate(sigmas, of_corners))
 

@@ -117,7 +117,7 @@ def fit_variances(
     )
 
 
-def _own_by_shared(parts: Sequence[Part], sigma: FloatArray) -> float:
+def _own_by_shared_variance(parts: Sequence[Part], sigma: FloatArray) -> float:
     """How large the own errors of readings are where the fit begins, in units of those that shared ones are told in.
 
     At most one: shared errors that dwarf the own ones would leave nothing to be said of these.
@@ -144,7 +144,7 @@ class _Search:
         self.lookers = [LikelihoodEvaluator(part) for part in parts]
         self._n = len(sigma)
         n_shared = parts[0].components.n_lasting if parts else 0
-        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared(parts, sigma)))
+        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
         self.variances = np.maximum(np.append(start**2, self._middle[self._n :]), self._least)
         self.seen: PartLikelihood = evaluate_all(self.lookers, self.variances)

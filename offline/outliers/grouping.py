@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.outliers.sightings import Tracks, places_told_apart
+from groundsbot.offline.outliers.sightings import Tracks, split_places
 from groundsbot.offline.sam import LEVELS, Graph, Tree
 
 # Of one tag. A choice among so many takes as long as a few linearisations; drives of the project's worlds, and the
@@ -28,7 +28,7 @@ _LEVELS: Final = LEVELS - 1  # below the top
 
 def few_of_each_tag(graph: Graph, sightings: Tracks) -> Tracks:
     """The same readings in fewer sightings where a tag has very many; the same sightings where none has."""
-    tag = places_told_apart(graph.segments, sightings)
+    tag = split_places(graph.segments, sightings)
     most = _most_of_each(np.bincount(tag), _FREE + len(graph.problem.columns.poses) // _KEYFRAMES_A_SIGHTING)
     if np.bincount(tag, minlength=1).max() <= most:
         return sightings

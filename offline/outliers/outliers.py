@@ -33,7 +33,7 @@ from groundsbot.offline.outliers.sightings import (
     Tracks,
     instances,
     letters,
-    places_told_apart,
+    split_places,
     tracks_of,
     with_instances,
 )
@@ -275,7 +275,7 @@ def _tracks(graph: Graph, at: LinearisedObservations) -> Tracks:
 def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> OutlierSearch:
     at = linearise_observations(graph, solution.state, scales)
     sightings = _tracks(graph, at)
-    place = places_told_apart(graph.segments, sightings)
+    place = split_places(graph.segments, sightings)
     evidence = marginalise(at, sightings)
     return OutlierSearch(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
 

@@ -127,7 +127,7 @@ def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
     return np.column_stack(rows).reshape(-1, 4), of_reading
 
 
-def places_told_apart(segments: Sequence[Segment], sightings: Tracks) -> IntArray:
+def split_places(segments: Sequence[Segment], sightings: Tracks) -> IntArray:
     """(S,) equal for sightings of what the segments take for one tag."""
     keys = [(*segments[c].tags[t],) for c, t in zip(sightings.segment, sightings.tag, strict=True)]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}

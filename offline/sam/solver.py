@@ -247,19 +247,19 @@ def solve(
     costs, n_linearised = [cost], n_linearised + 1
     last, n_steps, damping, rolled = n_linearised + most_tries, 0, Damping(), False
 
-    def ended(reason: str, *, converged: bool) -> Solution:
+    def finish(reason: str, *, converged: bool) -> Solution:
         return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
 
     if not np.isfinite(cost):
-        return ended("the cost is no number at the start", converged=False)
+        return finish("the cost is no number at the start", converged=False)
     while n_steps < most_steps and n_linearised < last and not damping.is_exhausted:
         n_steps += 1
         try:
             step, expected = _step(arrowhead, system, damping, rows)
         except UnderDeterminedError:
-            return ended("a variable is in no factor", converged=False)
+            return finish("a variable is in no factor", converged=False)
         if expected <= cost_tolerance + relative_tolerance * cost:
-            return ended("converged", converged=True)
+            return finish("converged", converged=True)
         before = StepStart(state, cost, rolled)
         taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spare)
         n_linearised += taken.n_linearised
@@ -279,10 +279,10 @@ def solve(
             arrowhead.linearise(state, *curvature.losses, out=system)
             n_linearised += 1
         if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
-            return ended("converged", converged=True)
+            return finish("converged", converged=True)
         damping.accept_step(gain)
     reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
-    return ended(reason, converged=False)
+    return finish(reason, converged=False)
 
 
 def _step(

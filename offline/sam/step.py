@@ -61,7 +61,7 @@ def take_step(
     """
     n_linearised = 0
 
-    def tried(share: float, *, rolled: bool) -> StepResult:
+    def try_share(share: float, *, rolled: bool) -> StepResult:
         nonlocal n_linearised
         n_linearised += 1
         part = share * step
@@ -70,12 +70,12 @@ def take_step(
         return StepResult(moved, arrowhead.linearise(moved, *losses, out=out)[1], rolled, share, n_linearised)
 
     for share in _SHARES:
-        first = tried(share, rolled=before.rolled)
+        first = try_share(share, rolled=before.rolled)
         if first.cost < before.cost - _GOOD_GAIN * share * (2.0 - share) * expected:
             return first
-        other = tried(share, rolled=not before.rolled)
+        other = try_share(share, rolled=not before.rolled)
         if other.cost < min(before.cost, first.cost):
             return other
         if first.cost < before.cost:
-            return tried(share, rolled=before.rolled)
+            return try_share(share, rolled=before.rolled)
     return StepResult(before.state, np.inf, before.rolled, 1.0, n_linearised)

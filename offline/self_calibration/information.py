@@ -18,7 +18,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
-from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared
+from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared_variance
 from groundsbot.offline.noise import in_cell, inflation_of_corners
 from groundsbot.offline.sam import Parameter, Solution, SolveBudget, build_graph, solve
 from groundsbot.offline.self_calibration.selection import CalibrationInformation
@@ -92,7 +92,7 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
 
 def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
     """The segment under the noise that its windows leave over, errors that neighbouring readings share included."""
-    least = least_shared(local_map.segment.readings)
+    least = least_shared_variance(local_map.segment.readings)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_readings = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}

@@ -52,7 +52,7 @@ class V4l2Camera(Camera):
         capture.set(cv2.CAP_PROP_FOURCC, float(_MJPG))  # first: the sizes to be had depend on it
         refused = [
             f"{name} is {actual:g}, asked for {wanted:g}"
-            for name, setting, wanted in self._requested()
+            for name, setting, wanted in self._requested_format()
             if not _is_set(actual := _set(capture, setting, wanted), wanted)
         ]
         self._format = int(capture.get(cv2.CAP_PROP_FOURCC))
@@ -98,7 +98,7 @@ class V4l2Camera(Camera):
             return np.ascontiguousarray(picture[:, :, 0 if self._format in _GREY_FIRST else 1])
         return picture
 
-    def _requested(self) -> list[tuple[str, int, float]]:
+    def _requested_format(self) -> list[tuple[str, int, float]]:
         settings = self._settings
         wanted = [
             ("width_px", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),

@@ -169,19 +169,19 @@ class _Sides:
         seen = (offsets >= -middle[..., None]) & (offsets < (size[:, 1:] - middle)[..., None]) & first[..., None]
         index = line * stride[:, :1] + middle * stride[:, 1:]
 
-        def summed(over_line: FloatArray, by_offset: FloatArray) -> FloatArray:
+        def sum_over(over_line: FloatArray, by_offset: FloatArray) -> FloatArray:
             """(S, Q) of (S, A) and (S,): what grows evenly with the pixels' offsets from the line."""
             return (over_line[..., None] + (by_offset[:, None] * offsets)[:, None]).reshape(len(line), -1)
 
         off = line - begin[:, :1], middle - begin[:, 1:]
         along /= self._length[:, None] ** 2
-        share = summed(off[0] * along[:, :1] + off[1] * along[:, 1:], along[:, 1])
-        distance = summed(off[0] * across[:, :1] + off[1] * across[:, 1:], across[:, 1])
+        share = sum_over(off[0] * along[:, :1] + off[1] * along[:, 1:], along[:, 1])
+        distance = sum_over(off[0] * across[:, :1] + off[1] * across[:, 1:], across[:, 1])
         distance -= (4.0 * self._sagitta)[:, None] * (share - share**2)
         clear = np.minimum(_CLEAR_OF_CORNER_PX / self._length, 0.25)[:, None]
         seen = seen.reshape(distance.shape)
         seen &= (np.abs(distance) < band_px[:, None]) & (clear < share) & (share < 1.0 - clear)
-        return summed(index, stride[:, 1]).astype(np.int64), share, distance, seen
+        return sum_over(index, stride[:, 1]).astype(np.int64), share, distance, seen
 
     def fit(self) -> tuple[FloatArray, BoolArray]:
         """(S, 2) how far each side lies from the detector's at both ends; (T,) of which tags all four look right."""

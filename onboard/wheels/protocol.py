@@ -65,7 +65,7 @@ def format_line(line: WheelLine) -> bytes:
     """The bytes of one line, counters taken modulo 2^32 (ticks into [-2^31, 2^31), flags modulo 2^16)."""
     body = (
         f"GBW,{PROTOCOL_VERSION},{line.boot_id % _U32},{line.sequence % _U32},{line.t_us % _U32},"
-        f"{_to_signed(line.ticks_left)},{_to_signed(line.ticks_right)},{line.flags % _U16}"
+        f"{_as_signed_int(line.ticks_left)},{_as_signed_int(line.ticks_right)},{line.flags % _U16}"
     ).encode("ascii")
     return b"$%s*%04X\r\n" % (body, crc16(body))
 
@@ -221,5 +221,5 @@ def _nearest(wrapped: int, expected: int) -> int:
     return expected + (wrapped - expected + _I32) % _U32 - _I32
 
 
-def _to_signed(value: int) -> int:
+def _as_signed_int(value: int) -> int:
     return (value + _I32) % _U32 - _I32

@@ -60,7 +60,7 @@ def test_each_row_has_a_protection_that_can_be_taken_out() -> None:
     assert {each.row for each in PROTECTIONS} == set(rows_of(PAGE.read_text(encoding="utf-8")))
     for each in PROTECTIONS:
         source = (ROOT / each.file).read_text(encoding="utf-8")
-        ast.parse(each.taken_out_of(source))
+        ast.parse(each.take_out_of(source))
 
 
 def test_what_fails_without_mutation_proves_nothing_and_each_test_is_first_run_once(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_some_seeds_of_the_room_by_every_method(tmp_path: Path, capsys: pytest.C
         assert 0.5 < paper[f"{what}_rmse_m"] / wheels[f"{what}_rmse_m"] < 2.0
     assert two_d["nees_tags_per_dim"] is not None
     assert wheels["nees_tags_per_dim"] is None
-    assert [each.missed() for each in tallies] == [[], [], []]
+    assert [each.broken_bounds() for each in tallies] == [[], [], []]
 
 
 def test_where_nothing_errs_what_is_compared_with_finds_the_truth(tmp_path: Path) -> None:
@@ -74,10 +74,10 @@ def test_what_is_promised_is_held_against_the_bound(monkeypatch: pytest.MonkeyPa
         (replace(good, start_rmse_m=1.2 * bound.start_to_start_m), ["start_to_start_rmse_m is 1.200"]),
         (replace(good, tags_rmse_m=1.3 * bound.tags_m, nees_tags=1.2), ["tags_rmse_m is 1.300", "nees_tags_per_dim"]),
     ):
-        missed = Tally("room", "sharp", [figures], [bound]).missed()
+        missed = Tally("room", "sharp", [figures], [bound]).broken_bounds()
         assert len(missed) == len(expected)
         assert all(text in sentence for text, sentence in zip(expected, missed, strict=True))
-    assert Tally("room", "2D", in_parts=[3]).missed() == ["room, 2D, seed 3: the map is in parts"]
+    assert Tally("room", "2D", in_parts=[3]).broken_bounds() == ["room, 2D, seed 3: the map is in parts"]
 
 
 def test_what_is_found_is_held_against_the_most_likely_map_of_the_same_seeds() -> None:

@@ -13,7 +13,7 @@ class Protection(NamedTuple):
     new: str
     test: str = ""  # a word of the test's name that is enough to run; all of the row's where empty
 
-    def taken_out_of(self, source: str) -> str:
+    def take_out_of(self, source: str) -> str:
         """The file's text without the protection.
 
         Raises:

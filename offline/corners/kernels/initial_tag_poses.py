@@ -10,7 +10,7 @@ from groundsbot.offline.corners.kernels.planar_pose import ray_through, square_p
 from groundsbot.offline.corners.kernels.step import turn_by
 from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, base_before, face
 from groundsbot.offline.corners.kernels.view_selection import ByTag
-from groundsbot.offline.foundation import borrowed, inline, inner, njit
+from groundsbot.offline.foundation import borrow, inline, inner, njit
 from groundsbot.offline.sam import Loss, eliminate_columns, loss_and_weight, multiply
 
 # Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
@@ -29,7 +29,7 @@ _ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fi
 @njit
 def rays_of(looks: CornerArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
     """Sets unit rays (C, 4, 3) to the corners of some looks; NaN where none was found."""
-    looks = borrowed(looks)
+    looks = borrow(looks)
     for i in range(len(which)):
         for k in range(4):
             ray_through(lenses[looks.camera[which[i]]], looks.corners_px[which[i], k], out[i, k])
@@ -43,7 +43,7 @@ def candidate_poses(
 
     Two planar poses, NaN where there is none, and two upright ones as far off as the tag is on the floor.
     """
-    looks, values = borrowed(looks), borrowed(values)
+    looks, values = borrow(looks), borrow(values)
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     W, place, in_map = np.empty((3, 3)), np.empty(3), np.empty(3)
     in_camera, seen = np.empty((2, 3)), np.empty((2, 3, 3))
@@ -105,7 +105,7 @@ def fit(
     Robots' poses and the calibration are held. Returns what the looks lose (C,); infinite where they see no such tag,
     and where a candidate is on its way to where one of the same tag before it has settled.
     """
-    looks, values, judges = borrowed(looks), borrowed(values), borrowed(judges)
+    looks, values, judges = borrow(looks), borrow(values), borrow(judges)
     axes, eyes = _eyes(looks, values, judges.order)
     losses, is_settled = np.full(len(tags), np.inf), np.zeros(len(tags), dtype=np.bool_)
     normal, rows, step = np.empty((7, _ROW)), np.zeros((8, _ROW)), np.empty(6)

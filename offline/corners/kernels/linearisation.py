@@ -7,7 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, corner_factor, face
 from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem, Kind, add_matrix, add_vector
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import (
     Loss,
     OdometryArrays,
@@ -41,7 +41,7 @@ def add_corners(
     Where the system has no room for matrices only gradients are added. Looks (M,) go in the order that is given: what
     has nothing to do with the pose is summed up first for those in a row that have all else in common.
     """
-    looks, values, kind, system = borrowed(looks), borrowed(values), borrowed(kind), borrowed(system)
+    looks, values, kind, system = borrow(looks), borrow(values), borrow(kind), borrow(system)
     r, J, B, normal, vector = _corner_scratch()
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     total, is_whole, last = 0.0, len(system.entries) > 0, -1
@@ -118,7 +118,7 @@ def add_attitude_noise(
 
     Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
     """
-    looks, values = borrowed(looks), borrowed(values)
+    looks, values = borrow(looks), borrow(values)
     r, J, B, _, vector = _corner_scratch()
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for m in range(len(looks.pose)):
@@ -146,7 +146,7 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
 
     Where the system has no room for matrices only gradients are added.
     """
-    odometry, values, kind, system = borrowed(odometry), borrowed(values), borrowed(kind), borrowed(system)
+    odometry, values, kind, system = borrow(odometry), borrow(values), borrow(kind), borrow(system)
     C, product, J, heavy = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, N_MOTION)), np.empty((3, N_MOTION))
     normal, vector = np.empty((N_MOTION, N_MOTION)), np.empty(N_MOTION)
     free, place = np.empty(N_MOTION, dtype=np.uint64), np.empty(N_MOTION, dtype=np.uint64)

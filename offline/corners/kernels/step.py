@@ -4,7 +4,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.kernels.view import SpatialValues
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import advance, go_along, multiply, series
 
 
@@ -31,7 +31,7 @@ def move(
         anchor: (T,) a pose from which each tag was seen.
         out: after.
     """
-    values, out = borrowed(values), borrowed(out)
+    values, out = borrow(values), borrow(out)
     turn, turned = np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(values.poses)):
         advance(values.poses[p], step[poses[p, 0]], step[poses[p, 1]], step[poses[p, 2]], out.poses[p])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import eliminate_columns
 
 Unsigned = NDArray[np.uint64]
@@ -123,7 +123,7 @@ def _take(
 @njit
 def assemble(kind: Kind, normal: FloatArray, system: FrontalSystem) -> None:
     """Adds normal matrices (M, k, k) of a kind of factor."""
-    kind, system = borrowed(kind), borrowed(system)
+    kind, system = borrow(kind), borrow(system)
     width = kind.place.shape[1]
     free, place = np.empty(width, dtype=np.uint64), np.empty(width, dtype=np.uint64)
     for m in range(len(normal)):
@@ -181,7 +181,7 @@ def _front(nodes: Nodes, i: int, entries: FloatArray) -> FloatArray:
 @njit
 def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
     """Adds (M, k) of a kind of factor to (n,), but for what is held."""
-    kind = borrowed(kind)
+    kind = borrow(kind)
     for m in range(len(vectors)):
         add_vector(kind, m, vectors[m], out)
 
@@ -189,7 +189,7 @@ def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
 @njit
 def factorise(nodes: Nodes, entries: FloatArray) -> int:
     """Fronts become rows of R; -1, or the column that has no positive pivot."""
-    nodes = borrowed(nodes)
+    nodes = borrow(nodes)
     for i in range(len(nodes.parent)):
         front, start, n_own = _front(nodes, i, entries), nodes.start[i], nodes.n_own[i]
         failed = eliminate_columns(front, n_own)
@@ -209,7 +209,7 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
 @njit
 def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
     """Each row of X (k, n) <- R^-T row. All go through a front while it is at hand."""
-    nodes = borrowed(nodes)
+    nodes = borrow(nodes)
     own = np.empty(_largest(nodes))  # of a row, what a front has: side by side
     for i in range(len(nodes.parent)):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
@@ -228,7 +228,7 @@ def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
 @njit
 def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
     """X (n,) <- R^-1 x."""
-    nodes = borrowed(nodes)
+    nodes = borrow(nodes)
     own = np.empty(_largest(nodes))
     for i in range(len(nodes.parent) - 1, -1, -1):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
@@ -273,7 +273,7 @@ def whiten(nodes: Nodes, entries: FloatArray, path: IntArray, row: IntArray, Z: 
         row: (n,) of each of their columns in Z; others do not matter.
         Z: changed in place.
     """
-    nodes = borrowed(nodes)
+    nodes = borrow(nodes)
     for i in path:
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
         for k in range(nodes.n_own[i]):

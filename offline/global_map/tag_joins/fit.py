@@ -182,11 +182,11 @@ def _linearise(a: PlacedTags, b: PlacedTags, T: FloatArray) -> tuple[FloatArray,
     by_transform[:, :2, 2] = -rotate_quarter(in_a[:, :2])
     by_transform[:, 5, 2] = -1.0
     both = np.kron(np.eye(2 * k), turned)
-    S = a.covariance + both @ b.covariance @ both.T + np.diag(_unmodelled(a, b) ** 2)
+    S = a.covariance + both @ b.covariance @ both.T + np.diag(_unmodelled_covariance(a, b) ** 2)
     return np.concatenate([apart, tilted], axis=1).ravel(), by_transform.reshape(-1, 3), S
 
 
-def _unmodelled(a: PlacedTags, b: PlacedTags) -> FloatArray:
+def _unmodelled_covariance(a: PlacedTags, b: PlacedTags) -> FloatArray:
     """(6 K,) sigmas beyond what covariances say, of each difference: a centimetre, and what moves a tag by that.
 
     What a mount's pitch or a lens's remains shift by a centimetre at its range, they turn by that over the range.

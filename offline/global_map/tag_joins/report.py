@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.join import TagJoin
-from groundsbot.offline.maps import AlignmentResult, RivalResult
+from groundsbot.offline.maps import AlignmentResult, AlternativeResult
 
 
 def join_results(components: Sequence[SolvedComponent], joins: Sequence[TagJoin]) -> tuple[AlignmentResult, ...]:
@@ -47,7 +47,7 @@ def _result(components: Sequence[SolvedComponent], join: TagJoin) -> AlignmentRe
         inlier_rmse_m=float(np.sqrt((apart_m**2).sum(axis=1).mean())),
         outliers=(),
         is_sure=not join.reason,
-        rivals=tuple(RivalResult(T, tags) for T in join.rivals),
+        rivals=tuple(AlternativeResult(T, tags) for T in join.rivals),
         is_weak=join.is_weak,
         covariance=covariance,
     )

@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.bags.frames import FixedFrames
 from groundsbot.offline.importing.bags.reader import Bag, BagMessage, BagTopic
-from groundsbot.offline.importing.bags.tags import BagPicture, left_out_lines, read_picture
+from groundsbot.offline.importing.bags.tags import BagPicture, exclusion_lines, read_picture
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     CAMERA_INFO,
@@ -91,7 +91,7 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
     content.pictures, n_looks = _each_time_once(content.pictures, [(look.stamp_ns,) for look in content.pictures])
     if not chosen.has_pictures and not any(look.tags for look in content.pictures):
         told = "; ".join(
-            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *left_out_lines(content.left_out)]
+            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *exclusion_lines(content.left_out)]
         )
         raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
     content.remarks = clock.remarks()

@@ -18,7 +18,7 @@ from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.pictures import camera_of
 from groundsbot.offline.importing.bags.positions import position_entries
 from groundsbot.offline.importing.bags.reader import Bag, BagTopic
-from groundsbot.offline.importing.bags.tags import BagPicture, left_out_lines, with_tf_positions
+from groundsbot.offline.importing.bags.tags import BagPicture, exclusion_lines, with_tf_positions
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     APRILTAG_ROS,
@@ -137,7 +137,7 @@ def tag_entries(
             f"{plural(len(found.entries), 'picture')}; is it the right family? see --tag-family"
         )
     _check_sizes(where, robot, found)
-    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *left_out_lines(content.left_out)]
+    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *exclusion_lines(content.left_out)]
     return TagEntries(found.entries, found.camera, [*said, *found.remarks])
 
 

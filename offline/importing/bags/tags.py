@@ -99,7 +99,7 @@ def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tupl
     return BagPicture(stamp_ns, frame, tuple(found)), left_out
 
 
-def left_out_lines(left_out: Mapping[str, int]) -> list[str]:
+def exclusion_lines(left_out: Mapping[str, int]) -> list[str]:
     """For a person."""
     return [f"{plural(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
 

@@ -55,9 +55,9 @@ class TagJudge:
         if least < bound:
             self._hold(tag, of_map, n_readings)
         elif len(self._others(root, set())) >= _OUTVOTE:
-            yield from self._release_outvoted(root, squares, bound, n_readings)
+            yield from self._release_minority(root, squares, bound, n_readings)
 
-    def _release_outvoted(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
+    def _release_minority(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
         """Lets go of the tag without which most others fit, each and all together."""
         most, outvoted = _OUTVOTE - 1, -1
         for tag in held:

@@ -33,7 +33,7 @@ def refined_bias_px(corners_px: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(small_px[:, None], (_UPRIGHT_PX, _ANYHOW_PX)))
 
 
-def least_shared(readings: Readings) -> FloatArray:
+def least_shared_variance(readings: Readings) -> FloatArray:
     """(M, 2) variance that readings share with their neighbours at least, as a multiple of their own, by component."""
     if not readings.corner_bias_px.any():
         return np.zeros((len(readings), 2))

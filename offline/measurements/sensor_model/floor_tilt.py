@@ -53,15 +53,15 @@ def floor_tilt_rad(found: TagReadings, tag: IntArray, keyframe: IntArray, camera
     lever_m2 = ahead_m**2 + aside_m**2  # base tips about its own place on the floor
     by_tilt = lever_m2[first] + lever_m2[second]
 
-    def times_expected(variance: float) -> float:
+    def ratio_to_expected(variance: float) -> float:
         return float(np.median(square / (noise + variance * by_tilt))) / _MEDIAN_CHI2
 
-    if times_expected(0.0) < 1.0 - ndtri(_FALSE_ALARM) * _MEDIAN_SPREAD / np.sqrt(len(first)):
+    if ratio_to_expected(0.0) < 1.0 - ndtri(_FALSE_ALARM) * _MEDIAN_SPREAD / np.sqrt(len(first)):
         return 0.0
     low, high = 0.0, float(np.max(square / by_tilt)) / _MEDIAN_CHI2
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if times_expected(middle) > 1.0 else (low, middle)
+        low, high = (middle, high) if ratio_to_expected(middle) > 1.0 else (low, middle)
     return float(np.sqrt(high))
 
 

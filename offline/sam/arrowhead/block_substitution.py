@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
@@ -63,7 +63,7 @@ def substitute(
         inside: room for the rows of a leaf's poses.
         outside: room for the rows of a leaf's front.
     """
-    pieces = borrowed(pieces)
+    pieces = borrow(pieces)
     n_nodes = len(pieces.level) - 1
     for each in range(n_nodes):
         node = each if outwards else n_nodes - 1 - each

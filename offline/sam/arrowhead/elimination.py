@@ -8,7 +8,7 @@ the blocks of H again when needed, so that fill is never stored.
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.leaf_elimination import eliminate_leaf
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
@@ -28,7 +28,7 @@ def eliminate(tree: Tree, system: NormalEquations, damping: float, rows: SquareR
     Returns:
         -1, or the first column whose pivot is not positive.
     """
-    tree, system, rows = borrowed(tree), borrowed(system), borrowed(rows)
+    tree, system, rows = borrow(tree), borrow(system), borrow(rows)
     for node in range(len(tree.level)):
         front = _front_of(tree, node, rows.workspace)
         if tree.level[node] == 0:

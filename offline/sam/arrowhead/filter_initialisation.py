@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.foundation import borrowed, inline, njit
+from groundsbot.offline.foundation import borrow, inline, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, OdometryArrays, Values, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
@@ -84,8 +84,8 @@ def _run(
     known: _Filter,
     out: Values,
 ) -> None:
-    tree, odometry, readings = borrowed(tree), borrowed(odometry), borrowed(readings)
-    start, known, out = borrowed(start), borrowed(known), borrowed(out)
+    tree, odometry, readings = borrow(tree), borrow(odometry), borrow(readings)
+    start, known, out = borrow(start), borrow(known), borrow(out)
     n_segments = len(tree.segment_start) - 1
     longest = 0
     for segment in range(n_segments):

@@ -8,7 +8,7 @@ factors of Lupton and Sukkarieh, "Visual-inertial-aided navigation for high-dyna
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.linearisation.kernels import OdometryArrays, multiply, wrap
 from groundsbot.offline.sam.linearisation.odometry import motion_at, wheel_correction
 
@@ -46,7 +46,7 @@ def compose(odometry: OdometryArrays, index: IntArray, out: OdometryArrays) -> N
         index: (P,) of each pose in the skeleton, -1 where it is not kept; the first of a segment is.
         out: its motion, covariance, information and jacobian are set.
     """
-    odometry, index, out = borrowed(odometry), borrowed(index), borrowed(out)
+    odometry, index, out = borrow(odometry), borrow(index), borrow(out)
     motion, blocks, scratch = np.empty(5), np.empty((2, 3, 3)), np.empty((2, 3, 3))
     at = 0
     for m in range(len(odometry.first)):
@@ -120,7 +120,7 @@ def expand(
         calibration: (C,).
         out: (P, 3) takes all poses.
     """
-    odometry, index, composed = borrowed(odometry), borrowed(index), borrowed(composed)
+    odometry, index, composed = borrow(odometry), borrow(index), borrow(composed)
     for pose in range(len(index)):
         if index[pose] >= 0:
             for i in range(3):

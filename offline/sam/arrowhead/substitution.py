@@ -3,7 +3,7 @@
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
@@ -11,7 +11,7 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 @njit
 def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
     """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
-    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
+    tree, system, rows, vector = borrow(tree), borrow(system), borrow(rows), borrow(vector)
     inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 1):
         start, end = tree.front_start[node], tree.front_start[node + 1]
@@ -35,7 +35,7 @@ def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector:
 @njit
 def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
     """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
-    tree, system, rows, vector = borrowed(tree), borrowed(system), borrowed(rows), borrowed(vector)
+    tree, system, rows, vector = borrow(tree), borrow(system), borrow(rows), borrow(vector)
     inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 2, -1, -1):
         start, end = tree.front_start[node], tree.front_start[node + 1]

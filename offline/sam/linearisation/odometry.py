@@ -8,7 +8,7 @@ Small matrices travel as tuples, row by row; of symmetric ones the upper triangl
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrowed, inner, njit
+from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import (
@@ -29,7 +29,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 @njit
 def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
     """Adds all odometry factors to the blocks; returns the sum of their losses."""
-    odometry, values, free, system = borrowed(odometry), borrowed(values), borrowed(free), borrowed(system)
+    odometry, values, free, system = borrow(odometry), borrow(values), borrow(free), borrow(system)
     scratch = np.empty((6, 3, 3))
     total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
     for m in range(len(odometry.first)):

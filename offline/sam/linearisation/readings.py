@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
-from groundsbot.offline.foundation import borrowed, inline, inner, njit
+from groundsbot.offline.foundation import borrow, inline, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, Values
@@ -23,7 +23,7 @@ def add_readings(readings: ObservationArrays, loss: Loss, values: Values, free: 
     The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
     whitened derivative of the reading by the tag's place in the sensor.
     """
-    readings, values, free, system = borrowed(readings), borrowed(values), borrowed(free), borrowed(system)
+    readings, values, free, system = borrow(readings), borrow(values), borrow(free), borrow(system)
     r, J = np.empty(2), np.empty((2, N_READING))
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
     for m in range(len(readings.pose)):

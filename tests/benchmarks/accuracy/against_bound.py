@@ -128,7 +128,7 @@ class Tally:
             "nees_start_per_dim": _mean([each.nees_start for each in self.figures]),
         }
 
-    def missed(self) -> list[str]:
+    def broken_bounds(self) -> list[str]:
         """A sentence for each promise that is not kept."""
         who, row, most = f"{self.world}, {self.method}", self.row(), METHODS[self.method].most_times_bound
         found = [f"{who}, seed {seed}: the map is in parts" for seed in self.in_parts]
@@ -260,7 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for each in tallies:
         row = each.row()
         say(_line(each.world, each.method, row["seeds"], list(row.values())[3:]))
-    return exit_code([sentence for each in tallies for sentence in each.missed()] + broken_pairs(tallies))
+    return exit_code([sentence for each in tallies for sentence in each.broken_bounds()] + broken_pairs(tallies))
 
 
 _COLUMNS: Final = ("start m", "tags m", "path m", "bound: start", "tags", "NEES: tags", "start")

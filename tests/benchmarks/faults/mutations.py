@@ -71,7 +71,7 @@ def verdict(protection: Protection, copy: Path, green: dict[tuple[str, str], boo
         return _RED_BEFORE
     file = copy / protection.file
     whole = file.read_bytes()
-    file.write_text(protection.taken_out_of(whole.decode()), encoding="utf-8")
+    file.write_text(protection.take_out_of(whole.decode()), encoding="utf-8")
     try:
         return _FAILS if _pytest(copy, *tests) == _FAILED else _STILL_PASSES
     finally:

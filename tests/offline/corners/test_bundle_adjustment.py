@@ -21,7 +21,7 @@ from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import SpatialState
 from groundsbot.offline.corners.floor_noise import fit_attitude_sigmas, initial_attitude_sigmas, with_attitude_sigmas
 from groundsbot.offline.corners.graph import corner_graph
-from groundsbot.offline.corners.initial_tag_poses import alternative_states, tags_rehung
+from groundsbot.offline.corners.initial_tag_poses import alternative_states, with_alternative_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.corners.solver import CornerSolution, solve_corners
 from groundsbot.offline.evaluation.against_truth import evaluate
@@ -322,7 +322,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
         for other in alternative_states(problem, found.state, tag):
             if np.trace(other.turns[tag].T @ found.state.turns[tag]) > 1.0 + 2.0 * np.cos(np.radians(20.0)):
                 continue
-            right = tags_rehung(problem, other)
+            right = with_alternative_tag_poses(problem, other)
             assert np.trace(right.turns[tag].T @ found.state.turns[tag]) > 1.0 + 2.0 * np.cos(np.radians(10.0))
             n_turned += 1
     assert n_turned > 0
