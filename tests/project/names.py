@@ -27,9 +27,10 @@ def _words(text: str) -> frozenset[str]:
 
 
 _IRREGULAR: Final = _words(
-    "told heard seen held kept hung known shown taken given left lost made built drawn found thrown borne foretold begun"
-    " broken chosen driven fallen grown hidden laid led met paid risen said sent spent stood stuck thought understood"
-    " won worn written wound swung torn bent brought bought caught dealt dug done eaten forgotten frozen gone beaten"
+    "told heard seen held kept hung known shown taken given left lost made built drawn found thrown borne foretold"
+    " begun broken chosen driven fallen grown hidden laid led met paid risen said sent spent stood stuck thought"
+    " understood won worn written wound swung torn bent brought bought caught dealt dug done eaten forgotten frozen"
+    " gone beaten"
 )
 _NO_PARTICIPLES: Final = _words("need seed feed speed exceed proceed indeed embed unneeded outlined preintegrated")
 _FOLLOWERS: Final = _words(
