@@ -13,8 +13,8 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.arrowhead.build import build_arrowhead, build_skeleton, reweigh
-from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, Skeleton, UnderDeterminedError
+from groundsbot.offline.sam.arrowhead.build import build_arrowhead, reweigh
+from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, UnderDeterminedError
 from groundsbot.offline.sam.curvature import Curvature
 from groundsbot.offline.sam.damping import Damping
 from groundsbot.offline.sam.factors.odometry_and_readings import (
@@ -98,11 +98,6 @@ class Problem:
         """The order of elimination, settled once."""
         return build_arrowhead(self.odometry, self.readings, self.prior, self.columns, self.measured)
 
-    @cached_property
-    def skeleton(self) -> Skeleton:
-        """The smaller problem for starting values."""
-        return build_skeleton(self.arrowhead)
-
     def reweigh(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
         """The same factors with other whitenings, (M, 3, 3) and (N, 2, 2); the order of elimination is kept."""
         other = replace(
@@ -145,8 +140,8 @@ class Solution:
     """Where the solve ended and why.
 
     Attributes:
-        costs: one an accepted step, the first before all of them but after relaxed ones.
-        n_linearised: how often all factors were linearised, rejected and relaxed steps included.
+        costs: one an accepted step, the first before all of them.
+        n_linearised: how often all factors were linearised, rejected steps included.
     """
 
     state: State
@@ -211,7 +206,6 @@ def solve(
     cost_tolerance: float = COST_TOLERANCE,
     losses: Losses = DEFAULT_LOSSES,
     relative_tolerance: float = _COST_ROUNDING,
-    relaxed_steps: int = 0,
     most_steps: int = MAX_STEPS,
     most_tries: int = MAX_TRIES,
 ) -> Solution:
@@ -233,18 +227,16 @@ def solve(
         cost_tolerance: stop where the next step would lower the cost by less.
         losses: of each kind of factor.
         relative_tolerance: or by less than this share.
-        relaxed_steps: first steps on readings as places, for a start that is metres off; they bind less to the valley
-            that a start lies in.
-        most_steps: how many to try, relaxed ones aside.
-        most_tries: once factors were linearised so often no further step begins; relaxed ones count aside.
+        most_steps: how many to try.
+        most_tries: once factors were linearised so often no further step begins.
     """
     problem.check(start)
     arrowhead = problem.arrowhead
     curvature = Curvature(losses)
     system, spare, rows = arrowhead.scratch
-    state, n_linearised = _solve_preintegrated(problem, start, relaxed_steps)
+    state, n_linearised = start, 1
     _, cost = arrowhead.linearise(state, *losses, out=system)
-    costs, n_linearised = [cost], n_linearised + 1
+    costs = [cost]
     last, n_steps, damping, rolled = n_linearised + most_tries, 0, Damping(), False
 
     def finish(reason: str, *, converged: bool) -> Solution:
@@ -324,16 +316,6 @@ def factorise(
             if damping > _MOST_FLOOR:
                 raise
             damping = max(10.0 * damping, _LEAST_FLOOR)
-
-
-def _solve_preintegrated(problem: Problem, start: State, steps: int) -> tuple[State, int]:
-    """After some relaxed steps, and how many there were: none where something is not tied down."""
-    if not steps:
-        return start, 0
-    try:
-        return problem.skeleton.solve(start, problem.anchor, steps), steps
-    except UnderDeterminedError:
-        return start, 0
 
 
 def _expected_decrease(system: NormalEquations, step: FloatArray, damping: float) -> float:

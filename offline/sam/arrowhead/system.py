@@ -15,9 +15,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead import block_substitution, substitution
 from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
-from groundsbot.offline.sam.arrowhead.filter_initialisation import starting_pass
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
-from groundsbot.offline.sam.arrowhead.preintegration import expand
 from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
@@ -255,55 +253,3 @@ class Factorisation:
         rest = vector - self.arrowhead.product(self.system, solution)
         length = float(np.linalg.norm(solution))
         return float(np.linalg.norm(self.solve_in_order(rest))) / length if length else 0.0
-
-
-@dataclass(frozen=True)
-class Skeleton:
-    """The poses that read tags: a smaller problem to start with, nearly linear because readings count as places.
-
-    Range and bearing are far from linear where a start is metres off; places (x, y) are not.
-
-    Attributes:
-        arrowhead: of these poses, the motions between them composed; `whole` of all poses.
-        index: (P,) of each pose in the skeleton, -1 where it is not kept.
-    """
-
-    arrowhead: Arrowhead
-    whole: Arrowhead
-    index: IntArray
-
-    def starting_values(self, state: State, start_sigma: FloatArray) -> State:
-        """Poses and tags from one pass in order of time.
-
-        Args:
-            state: its calibration counts, and the pose at the start of each segment.
-            start_sigma: (number of segments, 3) how far off these starts may be, in their own axes.
-        """
-        own, start = self.arrowhead, self._select(state)
-        values = Values(start.poses, start.tags, start.calibration)
-        out = Values(np.empty_like(start.poses), np.empty_like(start.tags), np.empty_like(start.calibration))
-        starting_pass(own.tree, own.odometry, own.readings, values, np.square(start_sigma), out)
-        return self._expand(State(*out))
-
-    def solve(self, state: State, anchor: IntArray, steps: int) -> State:
-        """The state after some Gauss-Newton steps.
-
-        Raises:
-            UnderDeterminedError: something is not tied down; the column is the skeleton's.
-        """
-        kept, own = self._select(state), self.arrowhead
-        system, _, rows = own.scratch
-        for _ in range(steps):
-            own.linearise(kept, out=system)
-            kept = own.retract(
-                kept, -own.factorise(system, out=rows).solve_in_order(system.gradient), self.index[anchor]
-            )
-        return self._expand(kept)
-
-    def _select(self, state: State) -> State:
-        return State(state.poses[self.index >= 0], state.tags, state.calibration)
-
-    def _expand(self, kept: State) -> State:
-        poses = np.empty((len(self.index), 3))
-        expand(self.whole.odometry, self.index, self.arrowhead.odometry, kept.poses, kept.calibration, poses)
-        return State(poses, kept.tags, kept.calibration)

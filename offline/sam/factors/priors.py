@@ -1,6 +1,6 @@
 """What is known from elsewhere, as factors like those of measurements: what a person measured, what a map holds."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -139,18 +139,6 @@ class Priors:
         """Tags at which a distance ends, or that a map holds."""
         ends = np.concatenate([self.distances.tag_a, self.distances.tag_b, self.known.tags])
         return np.unique(ends[ends >= 0])
-
-    def among(self, index: IntArray) -> "Priors":
-        """The same of a part of the poses, which all ends are among: (P,) the index of each there."""
-        ends = {
-            name: np.where(pose >= 0, index[pose], -1)
-            for name, pose in (("pose_a", self.distances.pose_a), ("pose_b", self.distances.pose_b))
-        }
-        return replace(
-            self,
-            starts=replace(self.starts, pose=index[self.starts.pose]),
-            distances=replace(self.distances, **ends),
-        )
 
 
 NO_PRIORS: Final = Priors(

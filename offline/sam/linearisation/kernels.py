@@ -43,14 +43,13 @@ class OdometryArrays(NamedTuple):
 
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
-        information, covariance: (M, 3, 3) of the motion's right tangent.
+        information: (M, 3, 3) of the motion's right tangent.
         slots: (M, 3) of each parameter in its segment's calibration, -1 where held.
     """
 
     first: IntArray
     motion: FloatArray
     information: FloatArray
-    covariance: FloatArray
     jacobian: FloatArray
     parameters: IntArray
     slots: IntArray

@@ -12,8 +12,8 @@ import numpy as np
 
 from groundsbot.offline.sam.factors.robust_losses import SQUARES
 from groundsbot.offline.sam.solver import Losses, solve
-from tests.benchmarks.speed.solver_bench import least_seconds, memory_mib, our_start, reset_peak, warm_up
-from tests.benchmarks.speed.solver_world import make_fleet
+from tests.benchmarks.speed.solver_bench import least_seconds, memory_mib, reset_peak, warm_up
+from tests.benchmarks.speed.solver_world import joint_start, make_fleet
 
 KEYFRAMES: Final = (500, 1500, 5000, 15000, 50000)  # of each of two robots
 N_TAGS: Final = 100
@@ -45,13 +45,13 @@ def growth() -> None:
 def many_tags() -> None:
     """Prints what 2,000 tags and 20,000 keyframes take."""
     fleet = make_fleet(1, 10, 2000, 2600, n_crossings=14)
-    _ = fleet.problem.skeleton
+    _ = fleet.problem.arrowhead
     before = memory_mib("VmRSS")
     reset_peak()
     found: list[str] = []
 
     def run() -> None:
-        solution = solve(fleet.problem, our_start(fleet), losses=_PLAIN, relative_tolerance=1e-7, relaxed_steps=2)
+        solution = solve(fleet.problem, joint_start(fleet), losses=_PLAIN, relative_tolerance=1e-7)
         found.append(f"{solution.reason}, {solution.n_linearised} linearisations, cost {solution.cost:.6g}")
 
     took = least_seconds(run, 1)

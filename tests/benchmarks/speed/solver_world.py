@@ -3,13 +3,13 @@
 No logs, pictures or calibration: only odometry and readings, as many as wanted, with the truth beside them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
-from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry import fit_transform, se2
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.sam.factors.odometry_and_readings import (
@@ -20,7 +20,7 @@ from groundsbot.offline.sam.factors.odometry_and_readings import (
     State,
     whitening,
 )
-from groundsbot.offline.sam.solver import Problem
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 
 ROAD_M: Final = 6.0
 STEP_M: Final = 0.25
@@ -32,6 +32,9 @@ HALF_VIEW_RAD: Final = np.radians(60.0)
 READ_SHARE: Final = 0.5  # of the tags in view
 SIGMA_MOTION: Final = np.array([0.01, 0.004, np.radians(0.25)])  # of one step
 SIGMA_READING: Final = np.array([0.05, np.radians(1.0)])
+PIECE_M: Final = 10.0  # as `local_map` builds up a drive
+PIECE_SHARE: Final = 0.01
+PIECE_COST_TOLERANCE: Final = 1e-2
 SIGMA_START: Final = np.array([0.3, 0.3, np.radians(5.0)])  # how well starts are known to begin with
 
 
@@ -158,3 +161,60 @@ def _dead_reckoned(rng: np.random.Generator, problem: Problem, truth: State, n_r
     state = State(np.concatenate(poses), np.zeros_like(truth.tags), truth.calibration)
     _, first_reading = np.unique(problem.readings.tag, return_index=True)
     return State(state.poses, problem.readings.places_in_map(state)[first_reading], truth.calibration)
+
+
+def joint_start(fleet: Fleet) -> State:
+    """Return where the joint solve of `map` starts: drives solved alone, laid onto those before by shared tags."""
+    n = len(fleet.truth.poses) // fleet.n_robots
+    poses, places = [], np.full_like(fleet.truth.tags, np.nan)
+    for robot in range(fleet.n_robots):
+        own, tags = _built_up_drive(fleet, robot * n, n)
+        shared = np.isfinite(places[tags, 0])
+        T = fit_transform(places[tags[shared]], own.tags[shared]) if robot else fleet.truth.poses[0]
+        poses.append(se2.compose(T, own.poses))
+        places[tags[~shared]] = se2.apply(T, own.tags[~shared])
+    return State(np.concatenate(poses), places, fleet.truth.calibration)
+
+
+def _built_up_drive(fleet: Fleet, first: int, n: int) -> tuple[State, IntArray]:
+    """One drive in the frame of its start, and the tags that it reads."""
+    problem, known = fleet.problem, np.zeros((1, 3))
+    motion = problem.odometry.motion[np.searchsorted(problem.odometry.first, first) :][: n - 1]
+    along_m = np.append(0.0, np.cumsum(np.hypot(motion[:, 0], motion[:, 1])))
+    places = np.zeros((0, 2))
+    while True:
+        last_m = along_m[len(known) - 1]
+        end = int(np.searchsorted(along_m, last_m + max(PIECE_M, PIECE_SHARE * last_m))) + 1
+        part, tags = _first_poses(problem, first, min(end, n))
+        poses = np.concatenate(
+            [known, chain_motions(motion[len(known) - 1 : len(part.columns.poses) - 1], known[-1])[1:]]
+        )
+        start = State(poses, np.zeros((len(tags), 2)), np.zeros(1))
+        _, first_reading = np.unique(part.readings.tag, return_index=True)
+        found = part.readings.places_in_map(start)[first_reading]
+        found[: len(places)] = places
+        solution = solve(part, State(poses, found, np.zeros(1)), PIECE_COST_TOLERANCE, PLAIN_SQUARES)
+        known, places = solution.state.poses, solution.state.tags
+        if len(known) == n:
+            return solution.state, tags
+
+
+def _first_poses(problem: Problem, first: int, n: int) -> tuple[Problem, IntArray]:
+    """Return the first poses of a drive as a problem of its own, and the tags observed from them, first seen first."""
+    steps = (problem.odometry.first >= first) & (problem.odometry.first < first + n - 1)
+    read = (problem.readings.pose >= first) & (problem.readings.pose < first + n)
+    own = problem.readings.tag[read]
+    seen, at = np.unique(own, return_index=True)
+    tags = seen[np.argsort(at)]
+    index = np.full(len(problem.columns.tags), -1)
+    index[tags] = np.arange(len(tags))
+    odometry = {each.name: getattr(problem.odometry, each.name)[steps] for each in fields(problem.odometry)}
+    readings = {each.name: getattr(problem.readings, each.name)[read] for each in fields(problem.readings)}
+    pose = readings["pose"] - first
+    return Problem(
+        odometry=OdometryFactors(**{**odometry, "first": odometry["first"] - first}),
+        readings=ReadingFactors(**{**readings, "pose": pose, "tag": index[own]}),
+        prior=problem.prior,
+        columns=_columns(n, len(tags)),
+        anchor=_middle(pose, index[own], len(tags)),
+    ), tags
