@@ -152,8 +152,8 @@ PROTECTIONS: Final = (
         "15",
         "nobody who writes waits for the disk",
         "onboard/recorder/disk/log_keeper.py",
-        "            self._put_on_disk(batch, now_s)\n        self._tell_losses()",
-        "            with self._lock:\n                self._put_on_disk(batch, now_s)\n        self._tell_losses()",
+        "            self._put_on_disk(batch, now_s)\n        self._report_losses()",
+        "            with self._lock:\n                self._put_on_disk(batch, now_s)\n        self._report_losses()",
     ),
     Protection(
         "16",
@@ -279,7 +279,7 @@ PROTECTIONS: Final = (
     Protection(
         "29",
         "a new epoch is a new segment of the map",
-        "offline/measurements/motion_model/segments.py",
+        "offline/measurements/motion_model/wheel_segments.py",
         "cuts = np.flatnonzero(np.diff(table[:, 1])) + 1",
         "cuts = np.flatnonzero(np.diff(table[:, 1]))[:0]",
         test="mid_run",

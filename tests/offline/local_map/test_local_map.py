@@ -80,7 +80,7 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]
         if len(starts) > 1:
             return known
         return known._replace(
-            poses=segment.odometry.dead_reckon(), wheel_calibration=np.zeros(3), tags={}, calibration={}
+            poses=segment.odometry.dead_reckon(), odometry_calibration=np.zeros(3), tags={}, calibration={}
         )
 
     monkeypatch.setattr(local_map, "_build_up", worse)
@@ -126,7 +126,7 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
 def _n_pieces(length_m: float, wheel_sigma: float) -> int:
     segment = make_long_drive(2, length_m).segment
     pieces, n_keyframes, found = local_map._BuildUpSteps(segment), 1, 0
-    pieces.wheel_covariance = wheel_sigma**2 * np.eye(3)
+    pieces.covariance = wheel_sigma**2 * np.eye(3)
     while n_keyframes < len(segment.stamps_ns):
         n_keyframes, found = pieces.next_end(n_keyframes), found + 1
     return found

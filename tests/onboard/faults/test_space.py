@@ -65,10 +65,10 @@ sys.path.insert(0, {str(ROOT)!r})
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.storage import Disk
 from tests.support.data.logs import drive
-from tests.support.devices.kept_logs import make_keeper, stepped
+from tests.support.devices.kept_logs import make_keeper, step
 folder = pathlib.Path({str(tmp_path)!r})
 keeper = make_keeper(folder, Disk(), pictures=True)
-problems = [keeper.status.problem for _ in stepped(keeper, drive(5.0, picture_hz=20, picture_bytes=400_000))]
+problems = [keeper.status.problem for _ in step(keeper, drive(5.0, picture_hz=20, picture_bytes=400_000))]
 assert "No space left" in problems[-1], problems
 assert sorted(path.name for path in (folder / "run1").iterdir()) == ["0000.camera.mcap", "0000.core.mcap"]
 print(len(list(read_log(folder / "run1"))), "read")
