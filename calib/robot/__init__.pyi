@@ -12,6 +12,7 @@ from .parameters import (
 )
 from .robot_yaml import (
     R_LEVEL_OPTICAL,
+    Gyro,
     Mount,
     Robot,
     TagBatch,
@@ -32,6 +33,7 @@ __all__ = [
     "TAG_SCALE",
     "TIME_OFFSET",
     "WHEEL_PARAMETERS",
+    "Gyro",
     "Mount",
     "NoiseParameters",
     "Robot",

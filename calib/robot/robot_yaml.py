@@ -71,6 +71,21 @@ class Wheels(_Section):
         turn = 2.0 * math.pi / self.ticks_per_turn
         return self.radius_left_m * turn, self.radius_right_m * turn
 
+    @property
+    def relative_sigmas(self) -> tuple[float, float, float]:
+        """Of the radii's common scale, of the right radius over the left and of the track, as shares.
+
+        Errors of the two radii are independent where the file says nothing else.
+        """
+        ratio_sigma = math.hypot(
+            self.radius_left_m_sigma / self.radius_left_m, self.radius_right_m_sigma / self.radius_right_m
+        )
+        return (
+            self.radii_scale_sigma or 0.5 * ratio_sigma,
+            self.radii_ratio_sigma or ratio_sigma,
+            self.track_m_sigma / self.track_m,
+        )
+
 
 class Mount(_Section):
     """Where the camera sits on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
@@ -136,6 +151,21 @@ class TagBatch(_Section):
         return self.sigma_size_m / _reference_size(vars(self))
 
 
+class Gyro(_Section):
+    """A gyro's yaw rate, to the left: its noise, and how well its calibration is known before a drive.
+
+    The defaults are those of an ICM-20948 as it comes, a little wider than its data sheet.
+    """
+
+    noise_rad_per_sqrt_s: Positive = math.radians(0.015)
+    bias_rad_s_sigma: Positive = math.radians(2.0)
+    bias_walk_rad_s_per_sqrt_s: Positive = math.radians(10.0 / 3600.0) / 60.0
+    scale: Annotated[float, Field(gt=-0.5, lt=1.0)] = 0.0  # the rate is (1 + scale) times what is measured
+    scale_sigma: Positive = 0.02
+    time_offset_s: Finite = 0.0  # by which the gyro's stamps are late against the wheels'
+    time_offset_s_sigma: Positive = 0.005
+
+
 class Devices(_Section):
     """What the recorder opens."""
 
@@ -181,6 +211,8 @@ class Robot(_Section):
     )
     tags: list[TagBatch] = []
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
+    # A log with a gyro whose file says nothing of it is taken to have the defaults.
+    gyro: Gyro | None = Field(None, exclude_if=lambda gyro: gyro is None)
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
 

@@ -36,7 +36,7 @@ from groundsbot.offline.sam import (
     SolveBudget,
     State,
     build_graph,
-    parameters_of_wheels,
+    odometry_parameters_of,
     solve,
 )
 
@@ -107,7 +107,7 @@ class _PartialMap(NamedTuple):
     """What is known of a segment as far as it has been built up."""
 
     poses: FloatArray
-    wheel_calibration: FloatArray
+    odometry_calibration: FloatArray
     tags: dict[TagKey, FloatArray]
     calibration: dict[Parameter, float]
 
@@ -140,7 +140,7 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
     best: LocalMap | None = None
     n_in_vain = 0
     for n_others in range(1 + _OTHER_STARTS):
-        poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
+        poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
         effort.spend(solution)
@@ -219,7 +219,7 @@ def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solutio
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, readings)))
     graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
     known = _build_up(coarsen(segment, keyframes), effort)
-    poses = refine_poses(segment, keyframes, known.poses, known.wheel_calibration)
+    poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
     start = graph.start(poses, known.tags, known.calibration)
     return graph, solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
 
@@ -314,32 +314,32 @@ def _redrawn(segment: Segment, rng: np.random.Generator) -> Segment:
 
 def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
     """Solves the segment piece by piece, each from the solution of the last; dead reckoning where effort ends."""
-    known = _PartialMap(np.zeros((1, 3)), np.zeros(3), {}, {})
+    known = _PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
     pieces, n_keyframes = _BuildUpSteps(segment), 1
     while True:
         n_keyframes = pieces.next_end(n_keyframes)
         part = segment.prefix(n_keyframes)
         graph = build_graph([part])
-        poses = _extend(part, known.poses, known.wheel_calibration)
+        poses = _extend(part, known.poses, known.odometry_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         most_tries = effort.max_linearisations(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
         solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
         effort.spend(solution)
         state = solution.state
-        wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
+        wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
         known = _PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
         if n_keyframes == len(segment.stamps_ns) or effort.left < enough:
             break
-        pieces.wheel_covariance = solution.covariance(graph.problem.columns.calibration[graph.wheel_parameters(0)])
-    return known._replace(poses=_extend(segment, known.poses, known.wheel_calibration))
+        pieces.covariance = solution.covariance(graph.problem.columns.calibration[graph.odometry_parameters(0)])
+    return known._replace(poses=_extend(segment, known.poses, known.odometry_calibration))
 
 
 class _BuildUpSteps:
     """Numbers of keyframes at which building up stops and solves; the last is all of them.
 
     Attributes:
-        wheel_covariance: (3, 3) of WHEEL_PARAMETERS, as far as they are known; at first as robot.yaml says.
+        covariance: (P, P) of the odometry's parameters, as far as they are known; at first as robot.yaml says.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -348,7 +348,7 @@ class _BuildUpSteps:
         # Of the heading at each keyframe: its derivative by the wheels' parameters, and the variance of its noise.
         self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
         self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
-        self.wheel_covariance = np.diag([each.sigma**2 for each in parameters_of_wheels(segment.run.robot)])
+        self.covariance = np.diag([each.sigma**2 for each in odometry_parameters_of(segment)])
 
     def next_end(self, n_keyframes: int) -> int:
         """Where the piece after so many keyframes ends."""
@@ -356,17 +356,17 @@ class _BuildUpSteps:
         way_m, grown_m = self._along_m[rest] - self._along_m[last], _PIECE_SHARE * self._along_m[rest]
         by_wheels = self._by_wheels[rest] - self._by_wheels[last]
         variance_rad2 = self._noise_rad2[rest] - self._noise_rad2[last]
-        variance_rad2 += np.einsum("ki,ij,kj->k", by_wheels, self.wheel_covariance, by_wheels)
+        variance_rad2 += np.einsum("ki,ij,kj->k", by_wheels, self.covariance, by_wheels)
         ends = way_m >= np.maximum(_PIECE_M, grown_m)
         ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
         return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
 
 
-def _extend(part: Segment, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+def _extend(part: Segment, poses: FloatArray, odometry_calibration: FloatArray) -> FloatArray:
     """Poses of a longer segment: those known, then dead reckoning from the last one."""
     n_known = len(poses)
     rest = part.odometry.motion[n_known - 1 :]
     if not len(rest):
         return poses
-    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ wheel_calibration))
+    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ odometry_calibration))
     return np.concatenate([poses, chain_motions(rest, poses[-1])[1:]])

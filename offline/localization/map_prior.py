@@ -17,7 +17,7 @@ from groundsbot.offline.alignment import CondensedMap
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
-from groundsbot.offline.sam import NO_PRIORS, CalibrationPrior, Graph, JointPrior, Parameter, whitening
+from groundsbot.offline.sam import NO_PRIORS, Graph, JointPrior, Parameter, whitening
 
 # Far below what a tag's place is ever known to, and far above rounding.
 _LEAST_SIGMA_M: Final = 1e-6
@@ -80,10 +80,11 @@ class MapPrior:
             names: the map's tag of each of the graph's tags that is one.
         """
         known = self._prior(graph, names)
-        sigma = graph.problem.prior.sigma.copy()
+        prior = graph.problem.prior
+        sigma = prior.sigma.copy()
         sigma[known.calibration] = np.inf  # what robot.yaml says of these is in the map already
         measured = replace(NO_PRIORS, known=known)
-        return replace(graph, problem=replace(graph.problem, prior=CalibrationPrior(sigma), measured=measured))
+        return replace(graph, problem=replace(graph.problem, prior=replace(prior, sigma=sigma), measured=measured))
 
     def _prior(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> JointPrior:
         tags = [tag for tag in graph.tags if tag in names]

@@ -67,9 +67,9 @@ def _along_m(segment: Segment) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.maximum(segment.odometry.distance_m, turned_m))])
 
 
-def refine_poses(segment: Segment, keyframes: IntArray, poses: FloatArray, wheel_calibration: FloatArray) -> FloatArray:
+def refine_poses(segment: Segment, keyframes: IntArray, poses: FloatArray, corrections: FloatArray) -> FloatArray:
     """(K, 3) poses of all keyframes from those of some (k, 3): dead reckoning on from each to the next."""
-    driven = segment.odometry.dead_reckon(wheel_calibration)
+    driven = segment.odometry.dead_reckon(corrections)
     before = np.searchsorted(keyframes, np.arange(len(driven)), side="right") - 1
     return se2.compose(poses[before], se2.between(driven[keyframes[before]], driven))
 
@@ -93,4 +93,6 @@ def _compose(odometry: SegmentOdometry, keyframes: IntArray) -> SegmentOdometry:
         parts=replace(odometry.parts, unit=carry(odometry.parts.unit), rest=carry(odometry.parts.rest)),
         jacobian=np.add.reduceat(to_end @ odometry.jacobian, first, axis=0),
         distance_m=np.add.reduceat(odometry.distance_m, first),
+        differences=odometry.differences
+        and odometry.differences.at_steps(np.repeat(np.arange(len(first)), np.diff(keyframes))),
     )

@@ -12,6 +12,7 @@ from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
+from groundsbot.offline.measurements.motion_model.gyro import GyroSamples
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
@@ -58,6 +59,7 @@ class Run:
         lost: what of the log cannot be read, in words; empty where all can.
         corners_refined: the corners in it were sharpened on the picture, all of them.
         events: what the recorder told, in order of their stamps.
+        gyro: yaw rates; None where the log has none.
     """
 
     name: str
@@ -77,6 +79,7 @@ class Run:
     lost: str = ""
     corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
+    gyro: GyroSamples | None = None
 
     def shift_stamps(self, late_s: float) -> "Run":
         """The run with the stamps of pictures and imported positions taken back by so many seconds."""

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.robot import NoiseParameters
+from groundsbot.calib.robot import Gyro, NoiseParameters
 from groundsbot.offline.measurements.keyframes import (
     candidate_stamps,
     choose_keyframes,
     keyframe_at,
     tags_at_candidates,
 )
+from groundsbot.offline.measurements.motion_model.heading_fusion import GyroFit, with_gyro
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, concatenate_observations
@@ -35,6 +36,7 @@ class Segment:
         tags: what was read, sorted; `readings.tag` points here.
         readings: tag readings, ordered by keyframe.
         warnings: what a person should know.
+        gyro_fit: the noise of the gyro and where wheels slipped; None without one.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Segment:
     tags: tuple[TagKey, ...]
     readings: Readings
     warnings: tuple[str, ...] = ()
+    gyro_fit: GyroFit | None = None
 
     @property
     def T_base_camera(self) -> FloatArray:
@@ -114,11 +117,22 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
     readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
     seen, tag = np.unique(readings.tag, return_inverse=True)
+    odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
+    fused = run.gyro and with_gyro(
+        odometry,
+        run.gyro,
+        keyframe_stamps_ns,
+        run.robot.gyro or Gyro(),
+        np.array(run.robot.wheels.relative_sigmas),
+        noise,
+        name,
+    )
     return Segment(
         name=name,
         run=run,
         stamps_ns=keyframe_stamps_ns,
-        odometry=compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise),
+        odometry=fused[0] if fused else odometry,
+        gyro_fit=fused[1] if fused else None,
         tags=tuple(run.tags[i] for i in seen),
         readings=replace(readings, tag=tag),
         warnings=tuple(warnings),

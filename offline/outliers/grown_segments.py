@@ -92,14 +92,14 @@ def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None
     """A part of a segment, from what is known of another that has an end in common with it."""
     part = segment.part(first, end)
     graph = build_graph([part])
-    wheels = np.zeros(3) if known is None else known.wheels
+    wheels = np.zeros(segment.odometry.jacobian.shape[2]) if known is None else known.wheels
     poses = _poses(segment, first, end, known, wheels)
     start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
     solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.max_linearisations(graph.problem, 1.0))
     effort.spend(solution, is_built=True)
     state, problem = solution.state, graph.problem
     freedom = problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
-    wheels, tags = graph.wheel_calibration(state, 0), graph.tags_of(state)
+    wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
     return SolvedPart(first, end, state.poses, wheels, tags, graph.calibration_of(state), solution.cost, freedom)
 
 

@@ -336,7 +336,7 @@ def _without_motions(problem: Problem, end: int, begin: int) -> Problem:
 def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
     """(3,) the motion that the wheels do not have."""
     odometry = graph.segments[0].odometry.part(end - 1, begin)
-    told = odometry.dead_reckon(graph.wheel_calibration(state, 0))[-1]
+    told = odometry.dead_reckon(graph.odometry_calibration(state, 0))[-1]
     return se2.between(told, se2.between(state.poses[end - 1], state.poses[begin]))
 
 

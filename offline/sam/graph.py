@@ -22,6 +22,7 @@ from groundsbot.offline.sam.parameters import (
     Parameter,
     camera_parameters_of,
     mount_parameters_of,
+    odometry_parameters_of,
     parameters_of_wheels,
     scale_parameter_of,
 )
@@ -57,9 +58,13 @@ class Graph:
         first = int(self.first_pose[segment])
         return state.poses[first : first + len(self.segments[segment].stamps_ns)]
 
-    def wheel_calibration(self, state: State, segment: int) -> FloatArray:
-        """(3,) wheel parameters of one segment's robot."""
-        return state.calibration[self.wheel_parameters(segment)]
+    def odometry_calibration(self, state: State, segment: int) -> FloatArray:
+        """(P,) corrections of one segment's odometry: of WHEEL_PARAMETERS, then of a gyro where there is one."""
+        return state.calibration[self.odometry_parameters(segment)]
+
+    def odometry_parameters(self, segment: int) -> IntArray:
+        """(P,) indices of the columns of one segment's `SegmentOdometry.jacobian`."""
+        return _indices(self.parameters, odometry_parameters_of(self.segments[segment]))
 
     def wheel_parameters(self, segment: int) -> IntArray:
         """(3,) indices of one segment's WHEEL_PARAMETERS."""
@@ -121,7 +126,7 @@ def build_graph(segments: Sequence[Segment]) -> Graph:
     problem = Problem(
         odometry=_odometry_factors(segments, first_pose, parameters),
         readings=readings,
-        prior=CalibrationPrior(np.array([p.sigma for p in parameters])),
+        prior=_calibration_prior(segments, parameters),
         columns=_columns(int(lengths.sum()), len(tags), parameters),
         anchor=_middle_readings(readings, len(tags)),
     )
@@ -160,18 +165,47 @@ def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Colu
 def _odometry_factors(
     segments: Sequence[Segment], first_pose: IntArray, parameters: Sequence[Parameter]
 ) -> OdometryFactors:
-    first, indices = [], []
+    first, indices, jacobians = [], [], []
+    most = max(segment.odometry.jacobian.shape[2] for segment in segments)
     for segment, start in zip(segments, first_pose, strict=True):
-        n = len(segment.odometry)
+        n, jacobian = len(segment.odometry), segment.odometry.jacobian
         first.append(start + np.arange(n))
-        indices.append(np.tile(_indices(parameters, parameters_of_wheels(segment.run.robot)), (n, 1)))
+        own, n_missing = _indices(parameters, odometry_parameters_of(segment)), most - jacobian.shape[2]
+        indices.append(np.tile(np.pad(own, (0, n_missing)), (n, 1)))  # the first parameter is a held zero
+        jacobians.append(np.pad(jacobian, ((0, 0), (0, 0), (0, n_missing))) if n_missing else jacobian)
     return OdometryFactors(
         first=np.concatenate(first),
         motion=np.concatenate([segment.odometry.motion for segment in segments]),
         whitening=whitening(np.concatenate([segment.odometry.covariance for segment in segments])),
-        jacobian=np.concatenate([segment.odometry.jacobian for segment in segments]),
+        jacobian=np.concatenate(jacobians),
         parameters=np.concatenate(indices),
     )
+
+
+def _calibration_prior(segments: Sequence[Segment], parameters: Sequence[Parameter]) -> CalibrationPrior:
+    """What robots' files say of each number, and what gyros and wheels say of each other's jointly.
+
+    All differences of heading together are a triangle of rows by QR decomposition, whatever their number.
+    """
+    sigma = np.array([p.sigma for p in parameters])
+    blocks, walks = [np.zeros((0, len(parameters) + 1))], dict[str, FloatArray]()
+    for segment in segments:
+        differences = segment.odometry.differences
+        if differences is None:
+            continue
+        at = _indices(parameters, odometry_parameters_of(segment))
+        rows = np.zeros((len(differences.rows), len(parameters) + 1))
+        rows[:, at], rows[:, -1] = differences.rows, differences.values
+        walk = np.zeros((len(differences.walk_rows), len(parameters) + 1))
+        walk[:, at] = differences.walk_rows
+        blocks.append(rows)
+        walks[differences.owner] = walk  # parts of a segment share its bias
+    rows = np.concatenate([*blocks, *walks.values()])
+    if not len(rows):
+        return CalibrationPrior(sigma)
+    rows[:, :-1] *= sigma > 0.0
+    triangle: FloatArray = np.asarray(np.linalg.qr(rows, mode="r"))[: len(parameters)]
+    return CalibrationPrior(sigma, np.ascontiguousarray(triangle[:, :-1]), np.ascontiguousarray(triangle[:, -1]))
 
 
 def _reading_factors(
@@ -206,7 +240,7 @@ def _reading_factors(
 
 def _parameters(segment: Segment) -> list[Parameter]:
     robot = segment.run.robot
-    found = parameters_of_wheels(robot) + [scale_parameter_of(segment, tag) for tag in segment.tags]
+    found = odometry_parameters_of(segment) + [scale_parameter_of(segment, tag) for tag in segment.tags]
     found += camera_parameters_of(segment)
     if segment.readings.in_camera.any():
         found += mount_parameters_of(robot)

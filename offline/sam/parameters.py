@@ -2,14 +2,13 @@
 
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from groundsbot.calib.robot import (
     CAMERA_PARAMETERS,
     IMPORTED_BATCH,
     MOUNT_PARAMETERS,
     TAG_SCALE,
     WHEEL_PARAMETERS,
+    Gyro,
     Robot,
 )
 from groundsbot.offline.measurements import Segment, TagKey
@@ -29,19 +28,32 @@ NO_PARAMETER: Final = Parameter("", "", (), 0.0)
 
 
 def parameters_of_wheels(robot: Robot) -> list[Parameter]:
-    """In the order of WHEEL_PARAMETERS. Errors of the two radii are independent where the file says nothing else."""
+    """In the order of WHEEL_PARAMETERS."""
     wheels = robot.wheels
     nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
-    relative_left = wheels.radius_left_m_sigma / wheels.radius_left_m
-    relative_right = wheels.radius_right_m_sigma / wheels.radius_right_m
-    ratio_sigma = float(np.hypot(relative_left, relative_right))
-    sigmas = (
-        wheels.radii_scale_sigma or 0.5 * ratio_sigma,
-        wheels.radii_ratio_sigma or ratio_sigma,
-        wheels.track_m_sigma / wheels.track_m,
-    )
     return [
-        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(WHEEL_PARAMETERS, sigmas, strict=True)
+        Parameter(robot.robot_id, name, nominal, sigma)
+        for name, sigma in zip(WHEEL_PARAMETERS, wheels.relative_sigmas, strict=True)
+    ]
+
+
+def odometry_parameters_of(segment: Segment) -> list[Parameter]:
+    """In the order of the columns of `SegmentOdometry.jacobian`: of the wheels, then of the gyro where there is one.
+
+    The bias at each node of one segment has a wide prior of its own here; how far it walks from node to node is among
+    the rows of `HeadingDifferences`.
+    """
+    robot, differences = segment.run.robot, segment.odometry.differences
+    found = parameters_of_wheels(robot)
+    if differences is None:
+        return found
+    gyro = robot.gyro or Gyro()
+    scale, time_offset, *nodes = differences.parameter_names
+    return [
+        *found,
+        Parameter(robot.robot_id, scale, (gyro.scale,), gyro.scale_sigma),
+        Parameter(robot.robot_id, time_offset, (gyro.time_offset_s,), gyro.time_offset_s_sigma),
+        *(Parameter(differences.owner, name, (), gyro.bias_rad_s_sigma) for name in nodes),
     ]
 
 

@@ -90,7 +90,7 @@ class Problem:
         """Half the sum of all losses: rho(|r|^2) of odometry and readings, |r|^2 of priors and what was measured."""
         odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
         readings, _ = losses_and_weights(losses.readings, self.readings.residual(state))
-        prior = (self.prior.residual(state) ** 2).sum()
+        prior = (self.prior.residual(state) ** 2).sum() + (self.prior.joint_residual(state) ** 2).sum()
         return 0.5 * float(odometry.sum() + readings.sum() + prior + self.measured.sum_of_squares(state))
 
     @cached_property

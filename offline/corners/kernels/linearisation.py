@@ -22,7 +22,7 @@ from groundsbot.offline.sam import (
 
 N_LOOK: Final = 19
 N_POSE: Final = 3  # which come first
-N_MOTION: Final = 9
+N_POSES: Final = 6  # columns of a motion before those of the odometry's parameters
 _WIDTH: Final = 20  # of a look's rows, with a zero at the end: columns go in pairs
 
 
@@ -147,9 +147,11 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
     Where the system has no room for matrices only gradients are added.
     """
     odometry, values, kind, system = borrow(odometry), borrow(values), borrow(kind), borrow(system)
-    C, product, J, heavy = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, N_MOTION)), np.empty((3, N_MOTION))
-    normal, vector = np.empty((N_MOTION, N_MOTION)), np.empty(N_MOTION)
-    free, place = np.empty(N_MOTION, dtype=np.uint64), np.empty(N_MOTION, dtype=np.uint64)
+    n_parameters = odometry.jacobian.shape[2]
+    n = N_POSES + n_parameters
+    C, product, J, heavy = np.empty((3, n_parameters)), np.empty((3, n_parameters)), np.empty((3, n)), np.empty((3, n))
+    normal, vector = np.empty((n, n)), np.empty(n)
+    free, place = np.empty(n, dtype=np.uint64), np.empty(n, dtype=np.uint64)
     total, is_whole, last, cos_j, sin_j = 0.0, len(system.entries) > 0, -1, 1.0, 0.0
     for m in range(len(odometry.first)):
         i = odometry.first[m]
@@ -173,26 +175,27 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
             J[k, 0] = -(J[k, 3] * cos - J[k, 4] * sin)
             J[k, 1] = -(J[k, 3] * sin + J[k, 4] * cos)
             J[k, 2] = -(J[k, 3] * u + J[k, 4] * v + J[k, 5])
-            J[k, 6], J[k, 7], J[k, 8] = C[k, 0], C[k, 1], C[k, 2]
+            for j in range(n_parameters):
+                J[k, N_POSES + j] = C[k, j]
         l0, l1, l2, l3, l4, l5 = scaled_information(odometry.information[m], s)
         f0 = l0 * e[0] + l1 * e[1] + l2 * e[2]
         f1 = l1 * e[0] + l3 * e[1] + l4 * e[2]
         f2 = l2 * e[0] + l4 * e[1] + l5 * e[2]
         rho, w = loss_and_weight(loss, e[0] * f0 + e[1] * f1 + e[2] * f2)
         total += rho
-        for k in range(N_MOTION):
+        for k in range(n):
             vector[k] = w * (f0 * J[0, k] + f1 * J[1, k] + f2 * J[2, k])
         add_vector(kind, m, vector, system.gradient)
         if is_whole:
-            for k in range(N_MOTION):
+            for k in range(n):
                 heavy[0, k] = w * (l0 * J[0, k] + l1 * J[1, k] + l2 * J[2, k])
                 heavy[1, k] = w * (l1 * J[0, k] + l3 * J[1, k] + l4 * J[2, k])
                 heavy[2, k] = w * (l2 * J[0, k] + l4 * J[1, k] + l5 * J[2, k])
-            for k in range(N_MOTION):
+            for k in range(n):
                 c0, c1, c2 = J[0, k], J[1, k], J[2, k]
-                for j in range(k, N_MOTION):
+                for j in range(k, n):
                     normal[k, j] = c0 * heavy[0, j] + c1 * heavy[1, j] + c2 * heavy[2, j]
-            add_matrix(kind, m, normal, 0, N_MOTION, system, free, place)
+            add_matrix(kind, m, normal, 0, n, system, free, place)
     return total
 
 

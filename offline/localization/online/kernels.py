@@ -195,7 +195,7 @@ def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, 
     t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # they have what that reads
     e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type] # likewise
     s = 1.0 / (1.0 + values.calibration[motions.parameters[m, 0]])
-    C, product = np.empty((3, 3)), np.empty((3, 3))
+    C, product = np.empty_like(motions.jacobian[m]), np.empty_like(motions.jacobian[m])
     error_by_wheels(motions.jacobian[m], t, e, s, C, product)
     a, b, p, q = J
     cos, sin = np.cos(turn), np.sin(turn)
@@ -207,7 +207,7 @@ def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, 
         out[i, 0], out[i, 1], out[i, 2] = -(j0 * cos - j1 * sin), -(j0 * sin + j1 * cos), -(j0 * u + j1 * v + j2)
         out[i, 3], out[i, 4], out[i, 5] = j0, j1, j2
         out[i, 6] = -(w0 * e[0] + w1 * e[1] + w2 * e[2])
-        for k in range(3):
+        for k in range(motions.parameters.shape[1]):
             column = border.columns[motions.parameters[m, k]]
             if column >= 0:
                 out[i, 7 + column] += w0 * C[0, k] + w1 * C[1, k] + w2 * C[2, k]

@@ -14,6 +14,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2, wheels
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
+from groundsbot.offline.measurements.motion_model.gyro import HeadingDifferences
 
 # In the order of the unit covariances below.
 ODOMETRY_NOISE: Final = (
@@ -82,6 +83,8 @@ class SegmentOdometry:
         parts: what the covariance is made of.
         jacobian: (K-1, 3, 3) derivative of that tangent by WHEEL_PARAMETERS.
         distance_m: (K-1,) driven.
+        differences: of a gyro from the wheels, where the headings are by both; the jacobian then has columns of the
+            gyro's parameters after those of the wheels.
     """
 
     motion: FloatArray
@@ -89,6 +92,7 @@ class SegmentOdometry:
     parts: CovarianceParts
     jacobian: FloatArray
     distance_m: FloatArray
+    differences: HeadingDifferences | None = None
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -96,13 +100,17 @@ class SegmentOdometry:
 
     def part(self, first: int, end: int) -> "SegmentOdometry":
         """Steps first to end - 1 only."""
-        steps = slice(first, end)
+        steps, differences = slice(first, end), self.differences
+        if differences is not None:
+            index = np.arange(len(self)) - first
+            differences = differences.at_steps(np.where((index >= 0) & (index < end - first), index, -1))
         return SegmentOdometry(
             self.motion[steps],
             self.covariance[steps],
             self.parts.where(steps),
             self.jacobian[steps],
             self.distance_m[steps],
+            differences,
         )
 
     def with_noise(self, noise: NoiseParameters) -> "SegmentOdometry":
@@ -110,7 +118,7 @@ class SegmentOdometry:
         return replace(self, covariance=self.parts.under(noise))
 
     def dead_reckon(self, calibration: FloatArray | None = None, start: FloatArray | None = None) -> FloatArray:
-        """(K, 3) poses that follow from the motions alone, from `start` (3,) on, with wheel parameters (3,)."""
+        """Return poses (K, 3) by the motions alone, from `start` (3,) on; `calibration` (P,) corrects the motions."""
         motion = self.motion
         if calibration is not None:
             motion = se2.compose(motion, se2.exp(self.jacobian @ calibration))

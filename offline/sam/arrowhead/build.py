@@ -64,7 +64,7 @@ def build_arrowhead(
         tree=tree,
         odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
         readings=by_pose._replace(slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
-        prior_sigma=prior.sigma,
+        prior=prior,
         free=free,
         tangent=_tangent_order(columns),
         measured=prior_blocks(measured, tree, free),
@@ -80,7 +80,7 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryA
         information=_information(odometry.whitening[in_order]),
         jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
         parameters=odometry.parameters[in_order],
-        slots=np.full((len(first), 3), -1),
+        slots=np.full(odometry.parameters.shape, -1),
     )
 
 

@@ -19,7 +19,7 @@ from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
@@ -47,7 +47,7 @@ class Arrowhead:
     tree: Tree
     odometry: OdometryArrays
     readings: ObservationArrays
-    prior_sigma: FloatArray
+    prior: CalibrationPrior
     free: Free
     tangent: IntArray
     measured: PriorBlocks | None = None
@@ -72,11 +72,21 @@ class Arrowhead:
         linearise_kernels.clear(system)
         total = linearise_odometry.add_odometry(self.odometry, odometry_loss, values, self.free, system)
         total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
-        total += linearise_readings.add_priors(self.prior_sigma, values, self.free, system)
+        total += linearise_readings.add_priors(self.prior.sigma, values, self.free, system)
+        if len(self.prior.rows):
+            total += self._add_joint_prior(state, system)
         if self.measured is not None:
             total += self.measured.add(state, system)
         linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
         return system, 0.5 * total
+
+    def _add_joint_prior(self, state: State, system: NormalEquations) -> float:
+        """Adds what is known of several calibration numbers together; returns the sum of squares."""
+        residual = self.prior.joint_residual(state)
+        rows = self.prior.rows[:, self.free.calibration >= 0]
+        system.calibration[:] += rows.T @ rows
+        system.gradient[len(system.gradient) - len(system.calibration) :] += rows.T @ residual
+        return float(residual @ residual)
 
     def retract(self, state: State, step: FloatArray, anchor: IntArray) -> State:
         """The state after a step in the arrowhead's order; tags move along with their anchor poses (T,)."""

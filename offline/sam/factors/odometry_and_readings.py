@@ -4,7 +4,7 @@ Each class gives whitened residuals (M, n) and Jacobian blocks: pairs of columns
 derivatives (M, n, k). A column of -1 marks something that is held and has no column.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -65,8 +65,8 @@ class OdometryFactors:
         first: (M,) index of T_i; T_j is the next pose.
         motion: (M, 3) by nominal calibration.
         whitening: (M, 3, 3) W with W^T W the information of the motion's right tangent.
-        jacobian: (M, 3, 3) by the wheel parameters.
-        parameters: (M, 3) indices into the calibration, wheel_scale first.
+        jacobian: (M, 3, P) by the parameters of the wheels and, where there is one, of a gyro.
+        parameters: (M, P) indices into the calibration, wheel_scale first.
     """
 
     first: IntArray
@@ -231,13 +231,21 @@ class ReadingFactors:
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """What robot.yaml says of each calibration number: r = c / sigma; where sigma is 0 it is held.
+    """What is known of the calibration without the map: r = c / sigma of each number, which is held where sigma is 0.
 
     Attributes:
-        sigma: (C,)
+        sigma: (C,) by robot.yaml.
+        rows: (R, C) of a joint factor r = rows c + values, zero for what is held.
+        values: (R,)
     """
 
     sigma: FloatArray
+    rows: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    values: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def joint_residual(self, state: State) -> FloatArray:
+        """(R,), whitened."""
+        return np.asarray(self.rows @ state.calibration + self.values) if len(self.rows) else self.values
 
     def residual(self, state: State) -> FloatArray:
         """(C, 1), whitened."""

@@ -44,7 +44,7 @@ class OdometryArrays(NamedTuple):
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
         information: (M, 3, 3) of the motion's right tangent.
-        slots: (M, 3) of each parameter in its segment's calibration, -1 where held.
+        slots: (M, P) of each parameter in its segment's calibration, -1 where held.
     """
 
     first: IntArray

@@ -7,7 +7,7 @@ Small matrices travel as tuples, row by row; of symmetric ones the upper triangl
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
@@ -30,7 +30,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
     """Adds all odometry factors to the blocks; returns the sum of their losses."""
     odometry, values, free, system = borrow(odometry), borrow(values), borrow(free), borrow(system)
-    scratch = np.empty((6, 3, 3))
+    scratch = np.empty((6, 3, max(3, odometry.jacobian.shape[2])))
     total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
     for m in range(len(odometry.first)):
         i = odometry.first[m]
@@ -55,7 +55,7 @@ def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Fre
         A = (cos, sin, sin * x - cos * y, cos * x + sin * y)
         _add_blocks(system, i, H, A)
         _add_gradient(system.gradient, 3 * i, f, J, A)
-        if odometry.slots[m, 0] >= 0 or odometry.slots[m, 1] >= 0 or odometry.slots[m, 2] >= 0:
+        if _has_slots(odometry.slots[m]):
             error_by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
             _unpack(M, L, A, f, scratch)
             _add_wheels(odometry, m, free, scratch, system)
@@ -63,19 +63,22 @@ def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Fre
 
 
 @inner
+def _has_slots(slots: IntArray) -> bool:
+    return bool((slots >= 0).any())
+
+
+@inner
 def wheel_correction(odometry: OdometryArrays, m: int, calibration: FloatArray) -> _Three:
-    """T = K c, what calibration c puts at the end of a motion."""
-    c0 = calibration[odometry.parameters[m, 0]]
-    c1 = calibration[odometry.parameters[m, 1]]
-    c2 = calibration[odometry.parameters[m, 2]]
-    if c0 == 0.0 and c1 == 0.0 and c2 == 0.0:
-        return 0.0, 0.0, 0.0
-    K = odometry.jacobian[m]
-    return (
-        K[0, 0] * c0 + K[0, 1] * c1 + K[0, 2] * c2,
-        K[1, 0] * c0 + K[1, 1] * c1 + K[1, 2] * c2,
-        K[2, 0] * c0 + K[2, 1] * c1 + K[2, 2] * c2,
-    )
+    """T = K c, what calibration c of wheels and gyro puts at the end of a motion."""
+    K, parameters = odometry.jacobian[m], odometry.parameters[m]
+    x, y, theta = 0.0, 0.0, 0.0
+    for k in range(len(parameters)):
+        c = calibration[parameters[k]]
+        if c != 0.0:
+            x += K[0, k] * c
+            y += K[1, k] * c
+            theta += K[2, k] * c
+    return x, y, theta
 
 
 @inner
@@ -217,12 +220,12 @@ def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray
     along, even, odd = series(t[2])
     across = t[2] * even
     p, q = odd * t[0] - even * t[1], even * t[0] + odd * t[1]
-    for j in range(3):
+    for j in range(K.shape[1]):
         product[0, j] = along * K[0, j] + across * K[1, j] + p * K[2, j]
         product[1, j] = along * K[1, j] - across * K[0, j] + q * K[2, j]
         product[2, j] = K[2, j]
     a, b, p, q = _right_jacobian_inverse((-e[0], -e[1], -e[2]), half_angle_cotangent(e[2]))
-    for j in range(3):
+    for j in range(K.shape[1]):
         C[0, j] = -(a * product[0, j] - b * product[1, j] + p * product[2, j])
         C[1, j] = -(b * product[0, j] + a * product[1, j] + q * product[2, j])
         C[2, j] = -product[2, j]
@@ -248,10 +251,10 @@ def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> 
 
 @inner
 def _add_wheels(odometry: OdometryArrays, m: int, free: Free, scratch: FloatArray, system: NormalEquations) -> None:
-    """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for what is free of the wheel parameters."""
+    """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for the free parameters of wheels and gyro."""
     M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
     first, base = odometry.first[m], len(system.gradient) - len(system.calibration)
-    for k in range(3):
+    for k in range(odometry.slots.shape[1]):
         slot, column = odometry.slots[m, k], free.calibration[odometry.parameters[m, k]]
         if slot < 0:
             continue
@@ -266,7 +269,7 @@ def _add_wheels(odometry: OdometryArrays, m: int, free: Free, scratch: FloatArra
         u0 = L[0, 0] * C[0, k] + L[0, 1] * C[1, k] + L[0, 2] * C[2, k]
         u1 = L[1, 0] * C[0, k] + L[1, 1] * C[1, k] + L[1, 2] * C[2, k]
         u2 = L[2, 0] * C[0, k] + L[2, 1] * C[1, k] + L[2, 2] * C[2, k]
-        for other in range(3):
+        for other in range(odometry.slots.shape[1]):
             row = free.calibration[odometry.parameters[m, other]]
             if row >= 0:
                 system.calibration[row, column] += C[0, other] * u0 + C[1, other] * u1 + C[2, other] * u2
