@@ -1,4 +1,4 @@
-"""How local maps lie to each other: RANSAC over shared tags, which transforms hold together, merging.
+"""RANSAC transforms between local maps from shared tags, their mutual consistency, and merging.
 
 In: local maps. Out: transforms between pairs, and components of maps with one frame each. In the paper: the RANSAC
 alignment of the robots' local maps.

@@ -1,10 +1,11 @@
-"""A local map reduced to its tags, with what its solve knows of them, in coordinates that stand a bend.
+"""A local map reduced to its tags and their joint covariance, in coordinates that stay linear for large heading errors.
 
-The joint covariance of a solve is about small errors. A long drive errs by degrees in its heading, and what turns by
-phi moves on an arc: two tags 2 m apart, whose distance is known to a millimetre, come out 2 m phi^2 / 2 nearer when
-their errors are taken in map axes (11 mm at 6 degrees). So each tag is kept in the frame of a pose that read it, these
-anchor poses relative to each other along a tree of the stiffest relations, and errors enter there, T o exp(delta), as
-they do along a segment. To first order that is the same covariance; but a bend is no longer a contradiction.
+The joint covariance of a solve holds for small errors. The heading of a long drive errs by degrees, and what turns by
+phi moves on an arc. Two tags 2 m apart, whose distance is known to a millimetre, come out 2 m phi^2 / 2 nearer when
+their errors are taken in map axes (11 mm at 6 degrees). So each tag is expressed in the frame of a pose that observed
+it, and these anchor poses relative to each other along a tree of the most certain relations. Errors are right
+perturbations there, T o exp(delta), as in odometry. To first order the covariance is the same, but a drive bent by
+heading errors is no longer a contradiction.
 
 Andersson and Nygards, "C-SAM: Multi-robot SLAM using square root information smoothing" (2008), and Cunningham et al.,
 "DDF-SAM" (2010), condense local maps too, in map axes.
@@ -30,10 +31,10 @@ class CondensedMap:
     Attributes:
         name: of the segment.
         tags: sorted.
-        T_start_anchor: (T, 3) a pose from which each tag was read.
+        T_start_anchor: (T, 3) a pose that observed each tag.
         tag_m: (T, 2) each tag in its anchor's frame.
         covariance: (5 T, 5 T) of right tangents of all anchors, (x, y, theta) each, then of all tags in their anchors.
-        root: the index of the anchor that stands still when errors are drawn: it carries the frame.
+        root: the index of the anchor that carries the frame: it is fixed when errors are drawn.
     """
 
     name: str
@@ -45,39 +46,39 @@ class CondensedMap:
 
     @property
     def tags_m(self) -> FloatArray:
-        """(T, 2) in the frame of the start."""
+        """Tag positions (T, 2) in the frame of the start."""
         return se2.apply(self.T_start_anchor, self.tag_m)
 
     @property
     def extent_m(self) -> float:
-        """Length of the longer side of the box that holds the tags."""
+        """Length of the longer side of the tags' bounding box."""
         return float(np.ptp(self.tags_m, axis=0).max())
 
     @property
     def frame_covariance(self) -> FloatArray:
-        """(3, 3) of where the start truly lies in the frame that the root carries, as a twist there."""
+        """Covariance (3, 3) of the start in the frame that the root carries, as a twist at the start."""
         columns = 3 * self.root + np.arange(3)
         carried = se2.adjoint(self.T_start_anchor[self.root])
         covariance: FloatArray = carried @ self.covariance[np.ix_(columns, columns)] @ carried.T
         return covariance
 
     def tree(self, tags: Sequence[TagKey]) -> "AnchorTree":
-        """Some of the tags, for an alignment."""
+        """Return the anchor tree of some of the tags."""
         index = {tag: i for i, tag in enumerate(self.tags)}
         return _anchor_tree(self, np.array([index[tag] for tag in tags], dtype=np.int64))
 
 
 @dataclass(frozen=True)
 class AnchorTree:
-    """Tags as a function of errors xi ~ N(0, covariance): how each anchor lies off its parent, each tag off its anchor.
+    """Tag positions as a function of errors xi ~ N(0, covariance) of anchors relative to parents and tags to anchors.
 
     Attributes:
         root: (3,) T_start_root, exact.
-        order: (n,) nodes so that parents come first.
+        order: (n,) nodes with parents first.
         parent: (n,) of each node; -1: the root.
         step: (n, 3) T_parent_anchor.
         tag_m: (n, 2) in the anchor's frame.
-        above: (n, n) whether node k lies on the way from the root to node i, i itself included.
+        above: (n, n) whether node k is on the path from the root to node i, i itself included.
         covariance: (5 n, 5 n) of xi: the n steps' right tangents, then the n tags in their anchors.
     """
 
@@ -90,11 +91,11 @@ class AnchorTree:
     covariance: FloatArray
 
     def places(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) tags in the frame of the start, and (n, 3) anchors."""
+        """Return (n, 2) tag positions in the frame of the start, and (n, 3) anchors."""
         n = len(self.step)
         moved = se2.compose(self.step, se2.exp(xi[: 3 * n].reshape(n, 3))).tolist()
         parent = self.parent.tolist()
-        along = [*moved, self.root.tolist()]  # overwritten in order; plain numbers, as arrays of three cost more
+        along = [*moved, self.root.tolist()]  # overwritten in order; plain floats are faster than arrays of three
         for node in self.order.tolist():
             x, y, theta = along[parent[node]]
             cos, sin = math.cos(theta), math.sin(theta)
@@ -104,10 +105,10 @@ class AnchorTree:
         return se2.apply(anchors, self.tag_m + xi[3 * n :].reshape(n, 2)), anchors
 
     def jacobian(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) tags in the frame of the start, and their derivatives (2 n, 5 n) by xi."""
+        """Return (n, 2) tag positions in the frame of the start, and their derivatives (2 n, 5 n) by xi."""
         n = len(self.step)
         places, anchors = self.places(xi)
-        # A node's step moves all that hangs on it by the twist Ad(T) Jr dxi in the frame of the start.
+        # A node's step moves its whole subtree by the twist Ad(T) Jr dxi in the frame of the start.
         by_step = se2.adjoint(anchors) @ se2.right_jacobian(xi[: 3 * n].reshape(n, 3))
         moved = by_step[None, :, :2] + rotate_quarter(places)[:, None, :, None] * by_step[None, :, None, 2]
         out = np.zeros((n, 2, 5 * n))
@@ -120,12 +121,12 @@ class AnchorTree:
 
 
 def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float = 1.0) -> CondensedMap:
-    """A local map reduced to some of its tags.
+    """Reduce a local map to some of its tags.
 
     Args:
         local_map: solved.
         tags: sorted, one at least.
-        variance_factor: the covariance's, where the noise is known to be larger than the solve was told.
+        variance_factor: multiplies the covariance where the noise is larger than the solve assumed.
     """
     problem, state = local_map.graph.problem, local_map.solution.state
     index = {tag: i for i, tag in enumerate(local_map.graph.tags)}
@@ -146,12 +147,12 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
 
 
 def rotate_quarter(vectors: FloatArray) -> FloatArray:
-    """(..., 2) turned by a quarter to the left: how points move when all turns."""
+    """Return vectors (..., 2) rotated by +90 degrees: the derivative of points by a rotation."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
 def _in_anchors(joint: FloatArray, T_start_anchor: FloatArray, tag_m: FloatArray) -> FloatArray:
-    """From tags in the frame of the start to tags in their anchors' frames: de = R^T dl - d_xy - d_theta J e."""
+    """Transform the covariance from tags in the start's frame to tags in anchors: de = R^T dl - d_xy - d_theta J e."""
     n = len(tag_m)
     cos, sin = np.cos(T_start_anchor[:, 2]), np.sin(T_start_anchor[:, 2])
     turn = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
@@ -168,12 +169,12 @@ def _in_anchors(joint: FloatArray, T_start_anchor: FloatArray, tag_m: FloatArray
 
 
 def _stillest(joint: FloatArray, n: int) -> int:
-    """The anchor whose heading is best known against all others'."""
+    """Return the anchor with the least summed variance of heading relative to the others."""
     return int(np.argmin(_heading_variance(joint, n).sum(axis=1)))
 
 
 def _heading_variance(joint: FloatArray, n: int) -> FloatArray:
-    """(n, n) of the differences of the anchors' headings."""
+    """Return (n, n) variances of the heading differences between anchors."""
     headings = joint[2 : 3 * n : 3, 2 : 3 * n : 3]
     own = np.diag(headings)
     return np.maximum(own[:, None] + own - 2.0 * headings, 0.0)
@@ -213,14 +214,14 @@ def _anchor_tree(condensed: CondensedMap, which: IntArray) -> AnchorTree:
 
 
 def _stiffest_tree(condensed: CondensedMap, nodes: IntArray) -> tuple[IntArray, IntArray]:
-    """(n,) parent of each node but the last, which is the root, and (n,) these nodes with parents first.
+    """Return (n,) the parent of each node but the last, which is the root, and (n,) these nodes with parents first.
 
-    Neighbours in the tree are those whose headings are best known against each other: there an error in the turn is
-    smallest, and with it what bending adds in second order.
+    The tree minimises the variances of relative heading along its edges: there rotation errors are smallest, and with
+    them the second-order errors of position.
     """
     n = len(nodes)
     variance = _heading_variance(condensed.covariance, len(condensed.tags))[np.ix_(nodes, nodes)]
-    # Only their order counts; and what is near zero (tags read from one pose) would be no edge.
+    # Only the order of weights counts; a weight near zero (tags observed from one pose) would be no edge.
     weight = 1.0 + variance / max(float(variance.max()), 1e-30)
     np.fill_diagonal(weight, 0.0)
     tree = minimum_spanning_tree(weight)

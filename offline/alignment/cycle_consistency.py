@@ -1,4 +1,4 @@
-"""Which alignments between many local maps go together: where they close a ring, they must close it."""
+"""Consistency of alignments between many local maps: transforms must compose to identity around cycles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 
-# A ring that closes is taken for one that does not so rarely.
+# False alarm rate of the test of a cycle.
 _FALSE_ALARM: Final = 1e-4
 _GATE: Final = float(chi2.isf(_FALSE_ALARM, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """Two maps, by index, and how the second lies in the first.
+    """The pose of the second of two maps, given by index, in the first.
 
     Attributes:
         T_a_b: (3,)
         covariance: (3, 3) of its right tangent.
-        evidence_nats: how sure it is.
-        names: of both, which settle what evidence leaves open.
+        evidence_nats: log Bayes factor of the alignment over chance.
+        names: of both maps; they break ties.
     """
 
     a: int
@@ -36,11 +36,11 @@ class Link:
 
     @property
     def rank(self) -> tuple[float, tuple[str, str]]:
-        """Sorts the surest first."""
+        """Sort key, most certain link first."""
         return -self.evidence_nats, self.names
 
     def transform_from(self, index: int) -> tuple[int, FloatArray, FloatArray]:
-        """The other map, T_index_other, and its right tangent's covariance."""
+        """Return the other map, T_index_other, and its right tangent's covariance."""
         if index == self.a:
             return self.b, self.T_a_b, self.covariance
         turned = se2.adjoint(self.T_a_b)
@@ -49,7 +49,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A link that was left out, by how far the ring that it closes gapes, and the maps of that ring in order."""
+    """A rejected link, the error of the cycle that it closes, and the maps of that cycle in order."""
 
     link: Link
     ring: tuple[int, ...]
@@ -58,11 +58,11 @@ class Contradiction:
 
 
 def consistent_links(links: Sequence[Link]) -> tuple[list[Link], list[Contradiction]]:
-    """The links left when those are gone that contradict others, surest first; the same in any order of the links.
+    """Return mutually consistent links, most certain first, and those rejected; independent of the order of the links.
 
-    Of three maps that are all linked, the ring must close. The link goes that is in most rings which do not, counted
-    against those which do; among equals the least sure one. Then the links that join all maps without a ring, surest
-    first, have the say over what remains.
+    Each cycle of three maps is tested for closure. The link is removed that is in the largest number of inconsistent
+    cycles less consistent ones; among equals the least certain. This repeats until all such cycles close. Then each
+    link that remains must close with the spanning tree of the most certain links.
     """
     left = sorted(links, key=lambda link: link.rank)
     contradictions = []
@@ -76,7 +76,7 @@ def consistent_links(links: Sequence[Link]) -> tuple[list[Link], list[Contradict
 
 
 def spanning_tree(links: Sequence[Link]) -> list[Link]:
-    """Links that join all maps which any link joins, without a ring; surest first (Kruskal's)."""
+    """Return the links of a maximum spanning forest, most certain first (Kruskal's algorithm)."""
     root: dict[int, int] = {}
 
     def find(i: int) -> int:
@@ -93,7 +93,7 @@ def spanning_tree(links: Sequence[Link]) -> list[Link]:
 
 
 def path(links: Sequence[Link], begin: int, end: int) -> list[Link]:
-    """The links of a tree from one map to another; empty where they are not joined."""
+    """Return the links of a tree from one map to another; empty if they are not connected."""
     before: dict[int, Link] = {}
     queue, seen = [begin], {begin}
     while queue:
@@ -114,10 +114,10 @@ def path(links: Sequence[Link], begin: int, end: int) -> list[Link]:
 
 
 def gap_of(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
-    """Where a ring of links ends that should end where it began: (3,) twist, and its squared sigmas.
+    """Return the closure error of a cycle of links: (3,) twist, and its squared Mahalanobis distance.
 
-    Links that share a map share its errors, in a way that they do not know. Whatever it is, the variance of a sum of n
-    errors is at most n times the sum of their variances: that is what the gap is held against.
+    Links that share a map have correlated errors of unknown correlation. The variance of a sum of n errors is at most n
+    times the sum of their variances, whatever the correlation; this bound is used.
     """
     T, covariance, here = np.zeros(3), np.zeros((3, 3)), begin
     for link in links:
@@ -133,7 +133,7 @@ _Ring = tuple[tuple[Link, Link, Link], tuple[FloatArray, float]]
 
 
 def _triangles(links: Sequence[Link]) -> list[_Ring]:
-    """All rings of three, and how they gape."""
+    """Return all cycles of three links, with their closure errors."""
     of = {frozenset((link.a, link.b)): link for link in links}
     partners: dict[int, set[int]] = {}
     for link in links:
@@ -149,7 +149,7 @@ def _triangles(links: Sequence[Link]) -> list[_Ring]:
 
 
 def _worst(rings: Sequence[_Ring]) -> Link:
-    """Of the links in rings that do not close, the one most often so, counted against those which do close."""
+    """Return the link in most inconsistent cycles, less consistent ones."""
     against: dict[Link, int] = {}
     suspects: set[Link] = set()
     for members, (_, square) in rings:
@@ -161,13 +161,13 @@ def _worst(rings: Sequence[_Ring]) -> Link:
 
 
 def _contradiction(link: Link, rings: Sequence[_Ring]) -> Contradiction:
-    """Told of the ring that gapes most."""
+    """Return the contradiction of the link's worst cycle."""
     members, (gap, square) = max((ring for ring in rings if link in ring[0]), key=lambda ring: ring[1][1])
     return Contradiction(link, tuple(sorted({m.a for m in members} | {m.b for m in members})), gap, square**0.5)
 
 
 def _closing(links: Sequence[Link], contradictions: list[Contradiction]) -> list[Link]:
-    """Without those that do not close with the tree; they are added to the contradictions."""
+    """Return the links that close with the tree; the others are appended to the contradictions."""
     tree = spanning_tree(links)
     kept = list(tree)
     for link in links:

@@ -1,20 +1,19 @@
-"""Two local maps held together by some of the tags they share: the least that both must bend, and what it tells.
+"""Joint least-squares fit of two local maps to some of the tags they share.
 
-With xi_a, xi_b the errors of the maps and T the pose of frame b in frame a, the shared tags M ask for
-f_a(xi_a) = T f_b(xi_b). The least of xi_a' C_a^-1 xi_a + xi_b' C_b^-1 xi_b under that condition is what the cost of
-solving both runs together rises by over the local maps (in squared sigmas), and chi-square with 2 M - 3 degrees of
-freedom where all is well. Found by Gauss-Newton on the condition (generalised least squares with the joint covariance
-S of the differences), linearised anew at each step: the Gauss-Helmert model, as in Foerstner and Wrobel,
-"Photogrammetric Computer Vision" (2016), section 4.8.
+With xi_a, xi_b the errors of the maps and T the pose of frame b in frame a, the shared tags M impose f_a(xi_a) = T
+f_b(xi_b). The minimum of xi_a' C_a^-1 xi_a + xi_b' C_b^-1 xi_b under this condition is the cost increase of solving
+both runs together over the local maps (in squared sigmas). It is chi-square with 2 M - 3 degrees of freedom where the
+tags are the same. It is found by Gauss-Newton on the condition (generalised least squares with the joint covariance S
+of the differences), linearised anew at each step: the Gauss-Helmert model, as in Foerstner and Wrobel, "Photogrammetric
+Computer Vision" (2016), section 4.8.
 
-Calibration is a nuisance of each local solve, so the covariances carry what it leaves open, the scale included; the two
-maps' calibrations are taken as independent. Where they are one robot's, or one batch of tags, their errors are common
-and the true differences smaller than S says: the test is then blunter, never false.
+Calibration is a nuisance parameter of each local solve, so the covariances include its uncertainty, that of the scale
+too. The two maps' calibrations are taken as independent. Where they are one robot's, or one batch of tags, their errors
+are common and the true differences smaller than S: the test then loses power, but raises no false alarms.
 
-Two tags that are read together a hundred times come out a tenth of a millimetre apart from where they came out in
-another run, says the covariance: it knows of noise, not of a mount that pitches, a lens's remains or a board that
-leans, which shift a tag by millimetres, by more the more the sides differ that it is seen from. So S also holds a
-sigma of 1 cm for each tag, which is little against any tag that was moved.
+By its covariance, two tags observed together a hundred times agree between runs to a tenth of a millimetre. It contains
+noise only. A mount that pitches, residual lens distortion or a board that leans shift a tag by millimetres, by more for
+more different views. So S also contains a sigma of 1 cm for each tag, small against any tag that was moved.
 """
 
 from dataclasses import dataclass, field
@@ -38,7 +37,7 @@ _CONVERGED_SIGMAS: Final = 1e-3
 
 @dataclass(frozen=True)
 class FitState:
-    """T_a_b and how both maps bend to meet."""
+    """Linearisation point: T_a_b and the errors of both maps."""
 
     T_a_b: FloatArray  # (3,)
     xi_a: FloatArray  # (5 n,)
@@ -47,14 +46,14 @@ class FitState:
 
 @dataclass(frozen=True)
 class LinearisedFit:
-    """The differences of all shared tags around a bend: f_a - T f_b = apart + by_transform dT + noise.
+    """Differences of all shared tags around a linearisation point: f_a - T f_b = apart + by_transform dT + noise.
 
     Attributes:
-        apart: (2 n,) for maps that do not bend.
+        apart: (2 n,) for maps without errors.
         covariance: (2 n, 2 n) of the noise.
         by_transform: (2 n, 3) by a motion (x, y, turn) of map b about `centre`.
         by_a: (2 n, 5 n) by xi_a; by_b by xi_b.
-        effort: that least squares over its tags are taken off.
+        effort: the budget that fits of its tags are charged to.
     """
 
     at: FitState
@@ -68,7 +67,7 @@ class LinearisedFit:
 
 
 class JointFit:
-    """Two maps' trees of the same n tags in the same order."""
+    """Anchor trees of two maps over the same n tags in the same order."""
 
     def __init__(
         self,
@@ -77,13 +76,13 @@ class JointFit:
         unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
         effort: AlignmentBudget = UNLIMITED,
     ) -> None:
-        """Two trees and what may be done with them.
+        """Store the trees.
 
         Args:
             a: the tree of one map.
             b: that of the other.
-            unmodelled_sigma_m: of each coordinate, beyond what the covariances say.
-            effort: what it may take.
+            unmodelled_sigma_m: of each coordinate, beyond the covariances.
+            effort: the budget.
         """
         self.a, self.b = a, b
         self.n = len(a.step)
@@ -98,30 +97,30 @@ class JointFit:
 
     @property
     def places_a(self) -> FloatArray:
-        """(n, 2) as map a has them; `places_b` in frame b."""
+        """Tag positions (n, 2) in map a; `places_b` in frame b."""
         return self._unbent[0][0]
 
     @property
     def places_b(self) -> FloatArray:
-        """(n, 2) as map b has them."""
+        """Tag positions (n, 2) in map b."""
         return self._unbent[1][0]
 
     @property
     def covariance_a(self) -> FloatArray:
-        """(2 n, 2 n) of map a's tags against its root, to first order; `covariance_b` likewise."""
+        """Covariance (2 n, 2 n) of map a's tags relative to its root, to first order; `covariance_b` likewise."""
         return self._unbent[0][2]
 
     @property
     def covariance_b(self) -> FloatArray:
-        """(2 n, 2 n) of map b's."""
+        """Covariance (2 n, 2 n) of map b's tags."""
         return self._unbent[1][2]
 
     def unbent(self, T_a_b: FloatArray) -> FitState:
-        """Both maps as they are."""
+        """Return the linearisation point of both maps without errors."""
         return FitState(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
 
     def linearise(self, bend: FitState) -> LinearisedFit:
-        """The differences around a bend."""
+        """Return the differences around a linearisation point."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
         if bent:
             self._effort.linearise(self.n)
@@ -144,7 +143,7 @@ class JointFit:
         return LinearisedFit(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
 
     def retract(self, linear: LinearisedFit, held: "SubsetFit") -> FitState:
-        """The bend that the tags held ask for."""
+        """Return the linearisation point after a step: the errors with which the fitted tags agree."""
         pull = np.zeros(2 * self.n)
         pull[held.rows] = held.pull
         return FitState(
@@ -154,7 +153,7 @@ class JointFit:
         )
 
     def solve(self, bend: FitState, members: BoolArray) -> tuple[LinearisedFit, "SubsetFit"]:
-        """Where the steps end that these tags (n,) ask for, from a bend nearby."""
+        """Iterate the fit of these tags (n,) to convergence, from a linearisation point nearby."""
         linear = self.linearise(bend)
         held = hold(linear, members)
         for _ in range(_STEPS):
@@ -170,15 +169,15 @@ class JointFit:
 
 @dataclass(frozen=True)
 class SubsetFit:
-    """The least squares over some tags of a `LinearisedFit`.
+    """Least-squares fit of some tags of a `LinearisedFit`.
 
     Attributes:
-        rows: (2 m,) of theirs.
-        root: (2 m, 2 m) lower triangular, of the covariance.
-        motion: (3,) that map b still makes.
+        rows: (2 m,) of these tags.
+        root: (2 m, 2 m) lower Cholesky factor of the covariance.
+        motion: (3,) estimated motion of map b.
         information: (3, 3) of it.
-        pull: (2 m,) how strongly each tag pulls.
-        rise: m tags' sum of squared sigmas, chi-square with 2 m - 3 degrees of freedom.
+        pull: (2 m,) inverse covariance times residual.
+        cost_increase: sum of squared sigmas of m tags, chi-square with 2 m - 3 degrees of freedom.
         log_determinant: of their covariance.
     """
 
@@ -188,11 +187,11 @@ class SubsetFit:
     motion: FloatArray
     information: FloatArray
     pull: FloatArray
-    left: FloatArray  # (2 m,) whitened
+    left: FloatArray  # (2 m,) whitened residual
 
     @property
     def T_a_b(self) -> FloatArray:
-        """(3,) pose of frame b in frame a once the motion is made."""
+        """Pose (3,) of frame b in frame a after the motion."""
         dx, dy, turn = self.motion
         centre = self.linear.centre
         about = centre - se2.apply([0.0, 0.0, turn], centre)
@@ -200,31 +199,31 @@ class SubsetFit:
 
     @property
     def cost_increase(self) -> float:
-        """In squared sigmas."""
+        """Cost in squared sigmas."""
         return float(self.left @ self.left)
 
     @property
     def closes(self) -> bool:
-        """Whether chance explains the rise."""
+        """Whether the cost is below the chi-square gate."""
         return self.cost_increase <= _cost_increase_bound(len(self.rows) - 3)
 
     @cached_property
     def root(self) -> FloatArray:
-        """Worked out again by who asks after `without_root`."""
+        """Computed again if asked for after `without_root`."""
         return _root(self.linear, self.rows)
 
     def without_root(self) -> None:
-        """Lets go of the root, which may be most of an explanation; what it is asked for most stays known."""
+        """Free the Cholesky factor, which may be most of the memory; its log determinant stays cached."""
         _ = self.log_determinant
         vars(self).pop("root", None)
 
     @cached_property
     def log_determinant(self) -> float:
-        """Of the covariance of the differences."""
+        """Log determinant of the covariance of the differences."""
         return 2.0 * float(np.log(np.diag(self.root)).sum())
 
     def others(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) difference of each tag that those held foretell, and (n, 2, 2) its covariance; theirs mean nothing."""
+        """Return residuals (n, 2) of predicted tags and covariances (n, 2, 2); undefined for the fitted tags."""
         linear = self.linear
         n = len(linear.apart) // 2
         coupled = linalg.solve_triangular(self.root, linear.covariance[self.rows], lower=True, check_finite=False)
@@ -237,10 +236,10 @@ class SubsetFit:
         return off.reshape(n, 2), spread
 
     def without_each(self) -> tuple[FloatArray, FloatArray]:
-        """What the others make of each tag held: three tags at least.
+        """Return leave-one-out residuals of the fitted tags: at least three.
 
-        With P the inverse covariance freed of the motion, P_ii^-1 (P w)_i is the difference that the others leave, and
-        P_ii^-1 the covariance that they foretell for it (Baarda's test).
+        With P the inverse covariance projected orthogonally to the motion, P_ii^-1 (P w)_i is the residual of tag i
+        under the prediction from the others, and P_ii^-1 its covariance (Baarda's data snooping).
 
         Returns:
             (m, 2) differences, and (m, 2, 2) their covariances.
@@ -255,15 +254,15 @@ class SubsetFit:
         return (covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance
 
     def misfits(self) -> FloatArray:
-        """(m,) how ill each tag held fits where the others want it, see `gate_ratio`; three tags at least."""
+        """Return (m,) leave-one-out gate ratios of the fitted tags, see `gate_ratio`; at least three tags."""
         return gate_ratio(*self.without_each())
 
     def log_likelihood_ratio(self) -> FloatArray:
-        """(m,) log of how much better each tag held fits than as a wrong one; three tags at least."""
+        """Return (m,) leave-one-out log likelihood ratios of fitting over wrong; at least three tags."""
         return log_likelihood_ratio(*self.without_each())
 
     def motion_covariance(self) -> FloatArray:
-        """(3, 3) of the motion."""
+        """Return the covariance (3, 3) of the motion."""
         return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
 
 
@@ -273,7 +272,7 @@ def _cost_increase_bound(freedom: int) -> float:
 
 
 def hold(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
-    """Least squares over some tags (n,), two at least."""
+    """Fit some tags (n,), at least two, by least squares."""
     rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
     linear.effort.hold(len(rows) // 2)
     root = _root(linear, rows)
@@ -285,13 +284,13 @@ def hold(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
     left = apart + whitened @ motion
     pull = linalg.solve_triangular(root, left, lower=True, trans=1, check_finite=False)
     held = SubsetFit(linear, rows, whitened, motion, information, pull, left)
-    vars(held)["root"] = root  # where the property has it
+    vars(held)["root"] = root  # fills the cached property
     return held
 
 
 def _root(linear: LinearisedFit, rows: IntArray) -> FloatArray:
     S = linear.covariance[np.ix_(rows, rows)]
-    # Readings without noise leave rounding only; far below any true sigma.
+    # Noise-free observations leave rounding only; this is far below any true sigma.
     S[np.diag_indices(len(rows))] += 1e-12 * float(np.trace(S)) / len(rows) + 1e-18
     return np.asarray(linalg.cholesky(S, lower=True, check_finite=False), dtype=np.float64)
 

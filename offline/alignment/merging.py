@@ -1,7 +1,6 @@
-"""Many local maps -> components, each with one frame: which segments the shared tags join, and where each starts.
+"""Merge many local maps into components with one frame each: which segments shared tags join, and where each starts.
 
-Nothing here depends on the order of the maps but the frame: pairs are aligned in the order of names, and what is equal
-is settled by them.
+The result does not depend on the order of the maps, except for the frame: pairs are aligned and ties broken by names.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,15 +22,15 @@ from groundsbot.offline.measurements import Placement, TagKey
 
 @dataclass(frozen=True)
 class PairAlignment:
-    """Two local maps, by index, and how the second lies in the first.
+    """Alignment of a pair of local maps, given by index.
 
     Attributes:
-        a: whose name comes first.
+        a: the map whose name comes first.
         b: the other.
         shared: the tags in both.
-        alignment: by these; None where no two of them fit together.
-        placement: as somebody measured it, of the starts.
-        is_searched: whether what the logs are worth sufficed to look for an alignment.
+        alignment: from these; None where no two of them fit together.
+        placement: measured by a person, between the starts.
+        is_searched: whether the budget sufficed to search for an alignment.
     """
 
     a: int
@@ -48,7 +47,7 @@ class Group:
 
     Attributes:
         members: indices of local maps in the order given; the first one's start is the frame.
-        T_frame_start: (n, 3) starting values of the members' starts.
+        T_frame_start: (n, 3) initial values of the members' starts.
     """
 
     members: tuple[int, ...]
@@ -57,12 +56,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Merge:
-    """What hangs together, and why.
+    """Components of maps, and the alignments that join them.
 
     Attributes:
         pairs: all that share a tag or a measured placement, in order of the maps' names.
-        links: by which maps were joined, surest first.
-        contradictions: links that others overruled.
+        links: accepted links, most certain first.
+        contradictions: rejected links.
         groups: largest first.
     """
 
@@ -77,13 +76,12 @@ def merge(
     placements: Mapping[tuple[int, int], Placement] | None = None,
     variance_factors: Sequence[float] | None = None,
 ) -> Merge:
-    """Aligns all pairs, keeps the alignments that go together, and places what they join.
+    """Align all pairs, keep the consistent alignments, and place the maps that they join.
 
     Args:
         maps: solved, of distinct names.
         placements: measured poses of the second map's start in the first one's, by indices.
-        variance_factors: by which each map's noise is larger than its solve was told; from what the solve left over
-            where None, 1 at least.
+        variance_factors: of each map's covariance; None: from the residuals of its solve, at least 1.
     """
     condensed = _condense(maps, variance_factors or [variance_factor(each) for each in maps])
     pairs = tuple(_align_pairs(maps, condensed, placements or {}))
@@ -92,10 +90,10 @@ def merge(
 
 
 def variance_factor(local_map: LocalMap) -> float:
-    """Chi-square per degree of freedom; a solve that left over less than it was told proves nothing by that.
+    """Return chi-square per degree of freedom, at least 1: smaller residuals than assumed prove nothing.
 
-    Where a map's parts do not join within their noise, something that is in no covariance bends it, and by as much as
-    they do not join its covariance says too little.
+    Where the parts of a map do not fit together within their noise, an unmodelled error deforms it. Its covariance is
+    then too small by the excess of that test.
     """
     problem = local_map.graph.problem
     n_priors = int((problem.prior.sigma > 0.0).sum())
@@ -106,7 +104,7 @@ def variance_factor(local_map: LocalMap) -> float:
 
 
 def _condense(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
-    """Each map reduced to the tags that others have too; None where there are none."""
+    """Return each map reduced to the tags that other maps have too; None where there are none."""
     count: dict[TagKey, int] = {}
     for local_map in maps:
         for tag in local_map.graph.tags:
@@ -140,14 +138,14 @@ def _align_pairs(
 
 
 def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[CondensedMap | None]) -> list[Link]:
-    """One where the pair is joined: by its tags, or else by what was measured."""
+    """Return at most one link for a pair: by its tags, or else by the measured placement."""
     names = maps[pair.a].segment.name, maps[pair.b].segment.name
     alignment, placement = pair.alignment, pair.placement
     if alignment is not None and alignment.is_sure:
         return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.evidence_nats, names)]
     if placement is None:
         return []
-    # A link is of the frames that the maps' roots carry, what was measured of the starts themselves.
+    # A link relates the frames that the maps' roots carry, a measurement the starts themselves.
     frame_a, frame_b = condensed[pair.a], condensed[pair.b]
     covariance = placement.covariance.copy()
     if frame_a is not None:
@@ -155,13 +153,13 @@ def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[Co
         covariance += back @ frame_a.frame_covariance @ back.T
     if frame_b is not None:
         covariance += frame_b.frame_covariance
-    # Against a start anywhere within a kilometre.
+    # The null hypothesis is a start anywhere within a kilometre.
     evidence_nats = log(2.0 * pi * 1e6) - 0.5 * float(np.linalg.slogdet(2.0 * pi * covariance)[1])
     return [Link(pair.a, pair.b, placement.T_a_b, covariance, evidence_nats, names)]
 
 
 def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
-    """Components of the maps under a tree of links, largest first."""
+    """Return the components of the maps under a forest of links, largest first."""
     neighbours: dict[int, list[Link]] = {i: [] for i in range(len(maps))}
     for link in tree:
         neighbours[link.a].append(link)
@@ -185,6 +183,6 @@ def _groups(maps: Sequence[LocalMap], tree: Sequence[Link]) -> list[Group]:
 
 
 def size_rank(maps: Sequence[LocalMap], group: Group) -> tuple[int, int, int]:
-    """Sorts groups, largest first: most tags, then most keyframes."""
+    """Return the sort key of groups, largest first: most tags, then most keyframes."""
     tags = {tag for m in group.members for tag in maps[m].graph.tags}
     return -len(tags), -sum(len(maps[m].T_start_base) for m in group.members), group.members[0]

@@ -1,13 +1,13 @@
-"""Which explanations of some shared tags leave it open which of them is true: a comparison of models by evidence.
+"""Bayesian comparison of alternative hypotheses of which shared tags are unchanged.
 
-A shared tag is where it was, or it is of one group that moved as one (a shelf), or it was moved on its own. An
-explanation names the tags that are where they were; what it is worth is its evidence, and that of groups among the
-rest, where these rather moved as one than each alone. Whether a group moved or all the others did, no likelihood
-tells: both say the same of every tag. There the larger group stayed, if it is so many times larger.
+A shared tag is where it was, or it belongs to a group that moved as one (a shelf), or it was moved alone. A hypothesis
+names the unchanged tags. It is compared by its marginal likelihood (evidence), including groups among the other tags
+where they more likely moved as one than each alone. Whether a group moved or all others did is not observable: both
+predict the same. There the larger group is taken as unchanged, if it is larger by a given factor.
 
-Evidence is held against chance: that one tag is where it was at most, and the others are wrong, each where it happens
-to be. There map b may have any heading about the one tag, and of all headings the typical one counts (the geometric
-mean): a heading about which others fit is an explanation of its own.
+The null hypothesis is chance: at most one tag is unchanged, and the others are wrong, each where it happens to be. Then
+map b may have any heading about the one tag, and the typical heading counts (the geometric mean of the likelihood): a
+heading at which others fit is a hypothesis of its own.
 """
 
 from collections.abc import Sequence
@@ -25,29 +25,29 @@ from groundsbot.offline.alignment.joint_fit import LinearisedFit, SubsetFit, hol
 from groundsbot.offline.alignment.ransac import Explanation, without
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, log_wrong
 
-# Sure is what explains the tags a hundred times better than anything else. Hardly any comes near: of 214 trials of
-# `tests.benchmarks.trust.alignment_study` none was between this and 10,000 times.
+# A hypothesis is accepted if it is a hundred times as likely as any alternative. Few are near this bound: of 214 trials
+# of `tests.benchmarks.trust.alignment_study` none was between this and 10,000 times.
 MARGIN_NATS: Final = log(100.0)
-# And so many times better than chance, of which less is known than of anything that tags say.
+# The factor over chance is larger, since the model of chance is cruder than that of tags.
 CHANCE_NATS: Final = log(1e4)
-# Of two groups that may each have moved as one the larger one stayed if it has this many times the tags of the other.
+# Of two groups that may each have moved as one, the larger is unchanged if it has this many times the other's tags.
 GROUP_MARGIN: Final = 2.0
-# For one group that moved as one there are so many cases in which each tag moved on its own.
+# Prior odds of tags that each moved alone over a group that moved as one.
 _GROUP_PRIOR_NATS: Final = log(100.0)
 
 
 class HypothesisTest:
-    """Weighs explanations of some shared tags against each other."""
+    """Compares alternative hypotheses about some shared tags."""
 
     def __init__(self, places_a: FloatArray, places_b: FloatArray) -> None:
-        """Args: places_a, places_b: (n, 2) in each map's own frame."""
+        """Args: places_a, places_b: (n, 2) tag positions in each map's own frame."""
         self.n_shared = len(places_a)
         self._chance_nats = chance_nats(places_a, places_b)
-        # By linearisation, which its explanation keeps alive, and tags.
+        # Key: id of the linearisation, which its hypothesis keeps alive, and the tags.
         self._group_nats: dict[tuple[int, bytes], float] = {}
 
     def evidence(self, explanation: Explanation) -> float:
-        """Log of the likelihood of the shared tags over that by chance; any number of them may fit alike."""
+        """Return the log Bayes factor over chance; any number of tags is a priori equally likely to be unchanged."""
         log_wrong_ones = float(explanation.log_wrong[~explanation.members].sum())
         log_choices = _log_choices(self.n_shared, explanation.n)
         return _fits_nats(explanation.held) + log_wrong_ones - log_choices - self._chance_nats
@@ -55,25 +55,25 @@ class HypothesisTest:
     def alternatives(
         self, best: Explanation, found: Sequence[tuple[float, Explanation]], groups: Sequence[Explanation]
     ) -> list[Explanation]:
-        """What leaves it open that the best is true.
+        """Return the alternatives that leave it open whether the best hypothesis is true.
 
         Args:
-            best: explanation.
-            found: others and their evidence, itself perhaps among them.
-            groups: tags of these may have moved as one.
+            best: hypothesis.
+            found: hypotheses with their evidence; may include the best.
+            groups: hypotheses whose tags may have moved as one.
         """
         evidence = self.evidence(best)
         best_worth = self._log_likelihood_ratio(best, groups)
         rivals = []
         for its, other in found:
             is_alike = its > evidence - MARGIN_NATS
-            # Outnumbered, it may explain them as well: then the tags of the best would have moved as one.
+            # With far fewer tags it may explain them as well if the tags of the best moved as one.
             if not is_alike and best.n >= GROUP_MARGIN * other.n:
                 continue
             if self.is_same_place(other, best) and not self._has_separate_group(other, best):
                 continue
             worth = self._log_likelihood_ratio(other, groups)
-            # What fits both may be of either group, unless the rest is outnumbered: then those did not stay.
+            # Tags that fit both may be of either group, unless the rest is outnumbered: then those tags moved.
             n_own = int((other.members & ~best.members).sum())
             if n_own > 1 and best.n < GROUP_MARGIN * n_own:
                 own = without(other, np.flatnonzero(other.members & best.members))
@@ -83,21 +83,21 @@ class HypothesisTest:
         return rivals
 
     def _log_likelihood_ratio(self, explanation: Explanation, groups: Sequence[Explanation]) -> float:
-        """Its evidence, with that of groups among the rest where this is more than such a group is rare."""
+        """Return its evidence plus that of groups among the other tags, where it exceeds a group's prior odds."""
         return self.evidence(explanation) + self.of_groups(explanation, groups, _GROUP_PRIOR_NATS)
 
     def _has_separate_group(self, other: Explanation, best: Explanation) -> bool:
-        """Whether tags that do not fit the best rather moved as one than each alone: they may be what stayed."""
+        """Return whether tags that contradict the best more likely moved as one than alone: they may be unchanged."""
         own = other.members & ~best.members
         if (own & ~best.fits).sum() < 2:
             return False
         return self._as_group(best, other.linear, own, self.n_shared) > 0.0
 
     def of_groups(self, explanation: Explanation, groups: Sequence[Explanation], rare_nats: float) -> float:
-        """Evidence that tags that it does not explain moved in groups, over that each did alone; 0 if less.
+        """Return the evidence that tags outside the hypothesis moved in groups rather than each alone; 0 if less.
 
-        One group after the other, the most telling first, less how rare a group is: taken for so many tags on their
-        own, a second group would count by how far off it is as often as it has tags.
+        Groups are taken greedily, the strongest first, each less the prior odds against a group. Taken as tags on their
+        own, a second group would count its distance once per tag.
         """
         rest, evidence = ~explanation.members, 0.0
         while True:
@@ -114,9 +114,9 @@ class HypothesisTest:
             rest = rest & ~moved[i][1]
 
     def _as_group(self, explanation: Explanation, linear: LinearisedFit, tags: BoolArray, n: int) -> float:
-        """Evidence that these tags, of n that may have moved, did so as one, over that each did alone.
+        """Return the evidence that these tags, of n that may have moved, moved as one rather than each alone.
 
-        Any of them went somewhere as a tag alone does, and turned anyhow; the others went along.
+        One of them has the displacement of a tag moved alone and a uniform turn; the others follow.
         """
         key = id(linear), tags.tobytes()
         if key not in self._group_nats:
@@ -126,13 +126,13 @@ class HypothesisTest:
         return self._group_nats[key] + log_motion - float(log_alone.sum()) - _log_choices(n, len(log_alone))
 
     def is_same_place(self, one: Explanation, other: Explanation) -> bool:
-        """Whether chance explains how far apart they put the other map."""
+        """Return whether two hypotheses place the other map within chance of each other."""
         off = se2.log(se2.between(one.T_a_b, other.T_a_b))
         covariance = self.covariance(one) + self.covariance(other)
         return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
 
     def covariance(self, explanation: Explanation) -> FloatArray:
-        """(3, 3) of the right tangent of T_a_b."""
+        """Return the covariance (3, 3) of the right tangent of T_a_b."""
         by_motion = np.eye(3)
         by_motion[:2, 2] = -rotate_quarter(explanation.linear.centre)
         by_motion = se2.adjoint(se2.inverse(explanation.T_a_b)) @ by_motion
@@ -141,7 +141,7 @@ class HypothesisTest:
 
 
 def _fits_nats(held: SubsetFit) -> float:
-    """Log likelihood of the tags held, over all transforms: the integral by m, m and rad."""
+    """Return the log marginal likelihood of the fitted tags, integrated over all transforms in m, m and rad."""
     log_likelihood = -0.5 * (held.cost_increase + held.log_determinant + len(held.rows) * log(2.0 * pi))
     return log_likelihood + 0.5 * (3.0 * log(2.0 * pi) - float(np.linalg.slogdet(held.information)[1]))
 
@@ -151,11 +151,11 @@ def _log_choices(n: int, k: int) -> float:
 
 
 def chance_nats(places_a: FloatArray, places_b: FloatArray) -> float:
-    """Log likelihood of tags at these places (n, 2) where none fits, or one, over all transforms as in `_fits_nats`.
+    """Return the log likelihood of tags at positions (n, 2) under chance, over all transforms as in `_fits_nats`.
 
-    With u and v how far another tag is from the one that fits, in both maps, it is off by r^2 = u^2 + v^2 - 2 u v
-    cos(phi) at a heading phi, and the mean of log r^2 over all headings is log max(u^2, v^2) (Jensen's formula). That
-    none fits is as likely as that one does: any tag is somewhere, and the others are about as far off as from there.
+    With u and v the vectors from the unchanged tag to another in both maps, that tag is off by r^2 = u^2 + v^2 - 2 u v
+    cos(phi) at a heading phi, and the mean of log r^2 over all headings is log max(u^2, v^2) (Jensen's formula). No
+    unchanged tag is as likely as one: a tag is somewhere in any case, and the others are about as far off from there.
     """
     n = len(places_a)
     u2, v2 = (((p[:, None] - p) ** 2).sum(axis=2) for p in (places_a, places_b))

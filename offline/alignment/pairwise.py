@@ -1,7 +1,7 @@
-"""How one local map lies in another, from the tags they share; or that this cannot be told, and why.
+"""Align one local map with another by the tags they share, or find that the alignment is ambiguous, and why.
 
-Hypotheses compare by their evidence: how much better they explain the shared tags than chance does. The best one is
-sure if nothing else explains the tags almost as well.
+Hypotheses are compared by the log of their Bayes factor over chance. The best one is accepted if no alternative
+explains the tags almost as well.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ from groundsbot.offline.alignment.ransac import Explanation, explanations, halve
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM
 from groundsbot.offline.measurements import REACH_M, Placement, TagKey
 
-# An alignment's covariance holds for other choices of tags as well, down to this much less likely: that costs width
-# only, and a claim is wrong where the truth is beyond it.
+# The covariance of an alignment covers other choices of tags too, down to this much less likely: too wide a covariance
+# is harmless, one that does not cover the truth is wrong.
 _DOUBT_NATS: Final = log(1e4)
-# Such choices are of so many tags fewer at most, and of each number so many.
+# Such choices drop at most this many tags, and of each number this many are kept (beam search).
 _MOST_DOUBTED: Final = 6
 _BEAM: Final = 12
 _ROUNDING_NATS: Final = 1e-3
@@ -39,16 +39,16 @@ class Alignment:
 
     Attributes:
         T_a_b: (3,)
-        covariance: (3, 3) of its right tangent; each frame lies as its map's root has it.
+        covariance: (3, 3) of its right tangent; each frame is the one that its map's root carries.
         shared: the tags in both, sorted.
-        inlier: (n_shared,) which of them lie where the others foretell them.
-        off_m: (n_shared,) how far from there those lie that do not; off_sigmas: in sigmas.
-        rmse_m: of the inliers, the maps taken as rigid.
-        rise: by which the inliers raise the cost of a joint solve over the local ones, in squared sigmas: what chance
-            explains, chi-square with 2 n - 3 degrees of freedom.
-        evidence_nats: log of how much better it explains the tags than chance does.
-        is_sure: it closes, nothing else explains the tags almost as well, and chance does not.
-        rivals: what explains them almost as well.
+        inlier: (n_shared,) which of them are consistent with the prediction from the others.
+        off_m: (n_shared,) distance of outliers from the prediction; off_sigmas: in sigmas.
+        rmse_m: of the inliers, with rigid maps.
+        rise: cost increase of a joint solve over the local ones due to the inliers, in squared sigmas: chi-square with
+            2 n - 3 degrees of freedom under the model.
+        evidence_nats: log of its Bayes factor over chance.
+        is_sure: accepted: consistent, no alternative almost as likely, and more likely than chance.
+        rivals: alternatives that explain the tags almost as well.
     """
 
     T_a_b: FloatArray
@@ -65,17 +65,17 @@ class Alignment:
 
     @property
     def n_inliers(self) -> int:
-        """How many shared tags fit."""
+        """Number of shared tags that fit."""
         return int(self.inlier.sum())
 
     @property
     def inliers(self) -> tuple[TagKey, ...]:
-        """The tags that fit."""
+        """Tags that fit."""
         return tuple(tag for tag, fits in zip(self.shared, self.inlier, strict=True) if fits)
 
     @property
     def outliers(self) -> tuple[TagKey, ...]:
-        """The tags that do not."""
+        """Tags that do not fit."""
         return tuple(tag for tag, fits in zip(self.shared, self.inlier, strict=True) if not fits)
 
 
@@ -85,16 +85,16 @@ def align(
     placement: Placement | None = None,
     effort: AlignmentBudget = UNLIMITED,
 ) -> Alignment | None:
-    """The transform that explains the shared tags best, or None where no two of them fit together.
+    """Return the most likely transform from the shared tags, or None where no two of them fit together.
 
     Args:
         a: one map.
         b: the other.
-        placement: what somebody measured of T_a_b, where the starts of both are.
-        effort: what it may take.
+        placement: measured T_a_b between the starts.
+        effort: the budget.
 
     Raises:
-        AlignmentTooLongError: it takes more.
+        AlignmentTooLongError: the budget is exhausted.
     """
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:
@@ -104,7 +104,7 @@ def align(
 
 
 class _AlignmentChoice(HypothesisTest):
-    """Weighs what the shared tags of two maps say."""
+    """Compares hypotheses about the shared tags of two maps."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class _AlignmentChoice(HypothesisTest):
         if not explained:
             return None
         if not any(self._agrees(each) for each in explained):
-            self.placement = None  # a slip of the tape or of the pen: it tells none of them from the others
+            self.placement = None  # a wrong measurement: it does not discriminate between hypotheses
         found = self._unite_groups(explained)
         evidence, best = found[0]
         groups = [each for _, each in found]
@@ -144,9 +144,9 @@ class _AlignmentChoice(HypothesisTest):
         return self._alignment(best, found, groups, told, is_sure=beats_chance and not rivals)
 
     def _drop_unneeded(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
-        """The best without tags that it gains little from, and with others that fit then.
+        """Return the best hypothesis with weakly supported tags dropped, and others that then fit.
 
-        Several together too, as two wrong ones bear each other out.
+        Several tags are dropped together too, since two wrong ones support each other.
         """
         found = last = [(evidence, best)]
         for _ in range(_MOST_DOUBTED):
@@ -158,7 +158,7 @@ class _AlignmentChoice(HypothesisTest):
                 held = np.flatnonzero(each.members)
                 most_nats = its - evidence + _DOUBT_NATS
                 if each.n == len(self.shared) and self.placement is None:
-                    # Nothing can join instead, and of what is left there are so many choices more.
+                    # No other tag can join, and the prior over choices of the remaining tags is lower.
                     most_nats -= log(each.n) - _ROUNDING_NATS
                 for tag in held[each.held.log_likelihood_ratio() < most_nats]:
                     less = without(each, tag)
@@ -180,9 +180,9 @@ class _AlignmentChoice(HypothesisTest):
         return sorted((f for f in found if f[0] > least_nats), key=lambda f: -f[0])[:_BEAM]
 
     def _unite_groups(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
-        """Best first: what was found, and what becomes of groups of tags far from each other that agree on the place.
+        """Return hypotheses, best first, with unions of those that agree on the pose.
 
-        From two tags in one corner a tag in another is foretold too ill to be counted; with two there it is told.
+        From two tags in one corner a far tag is predicted too uncertainly to join; two tags there determine it.
         """
         found = {each.members.tobytes(): (self.evidence(each), each) for each in explained}
         tried: set[bytes] = set()
@@ -203,11 +203,11 @@ class _AlignmentChoice(HypothesisTest):
                 return ranked
 
     def evidence(self, explanation: Explanation) -> float:
-        """Log of the likelihood of the shared tags over that by chance, with what was measured."""
+        """Return the log Bayes factor over chance, with the measured placement."""
         return super().evidence(explanation) + self._evidence_of_placement(explanation)
 
     def _evidence_of_placement(self, explanation: Explanation) -> float:
-        """Log likelihood of the measured placement over that of it being anywhere."""
+        """Return the log likelihood of the measured placement over that of a uniform one."""
         if self.placement is None:
             return 0.0
         off, covariance = self._from_placement(self.placement, explanation)
@@ -216,14 +216,14 @@ class _AlignmentChoice(HypothesisTest):
         return -0.5 * (square + log_determinant) + log(2.0 * pi * _AREA_M2)
 
     def _agrees(self, explanation: Explanation) -> bool:
-        """Whether chance explains how far from the measured placement it puts map b."""
+        """Return whether the hypothesis is consistent with the measured placement."""
         if self.placement is None:
             return True
         off, covariance = self._from_placement(self.placement, explanation)
         return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
 
     def _from_placement(self, placement: Placement, explanation: Explanation) -> tuple[FloatArray, FloatArray]:
-        """How far off an explanation is (3,), and the covariance of that."""
+        """Return the deviation (3,) of a hypothesis from the measured placement, and its covariance."""
         back = se2.adjoint(se2.inverse(placement.T_a_b))
         covariance = placement.covariance + self.covariance(explanation)
         covariance = covariance + back @ self.frames[0] @ back.T + self.frames[1]
@@ -232,11 +232,11 @@ class _AlignmentChoice(HypothesisTest):
     def _covering_covariance(
         self, explanation: Explanation, found: Sequence[tuple[float, Explanation]], groups: Sequence[Explanation]
     ) -> FloatArray:
-        """(3, 3) of the right tangent of T_a_b, with the doubt of which tags fit.
+        """Return the covariance (3, 3) of the right tangent of T_a_b, with the uncertainty of which tags fit.
 
-        True whichever choice of tags is that puts the map in the same place, of those that are not 10,000 times less
-        likely, tags that it leaves out as a group included; second moments about this one. A union of unions depends on
-        their order, so this is that of the tags.
+        It covers every choice of tags with the same pose that is at most 10,000 times less likely, also choices that
+        leave tags out as a group; second moments are about this one. Repeated covariance unions depend on their order,
+        so they are taken in the order of the tags.
         """
         near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
         worth = [its + self.of_groups(each, [explanation, *groups], 0.0) for its, each in near]
@@ -275,7 +275,7 @@ class _AlignmentChoice(HypothesisTest):
 
 
 def covariance_union(one: FloatArray, other: FloatArray) -> FloatArray:
-    """The least covariance (n, n) that is no less than either, in axes in which both are diagonal.
+    """Return the least covariance (n, n) that is no less than either, in axes in which both are diagonal.
 
     Uhlmann, "Covariance consistency methods for fault-tolerant distributed data fusion" (2003).
     """

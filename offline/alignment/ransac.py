@@ -1,9 +1,9 @@
-"""Hypotheses of how one local map lies in another: which of the shared tags fit together.
+"""Hypotheses of how one local map is placed in another: which of the shared tags fit together.
 
-Fischler and Bolles, "Random sample consensus" (1981), with pairs as samples. A sample is not counted through with a
-fixed gate: it grows outward, nearest tags first, and each tag is judged by where those that fit so far foretell it. So
-a long map that is bent holds together, and a tag one metre off is noticed among neighbours even where the map as a
-whole may be off by more.
+Fischler and Bolles, "Random sample consensus" (1981), with pairs as samples. Inliers of a sample are not counted with a
+fixed gate. Instead the sample is extended, most certainly predicted tags first, and each tag is tested against its
+prediction from the inliers so far. So a long map deformed by heading errors holds together, and a tag 1 m off is
+detected among its neighbours even where the map as a whole may be off by more.
 """
 
 from collections.abc import Iterator
@@ -28,24 +28,24 @@ from groundsbot.offline.alignment.tag_gate import (
     squared_sigmas,
 )
 
-# Looked for until an alignment with half the tags of the best one would be missed so rarely.
+# Probability of missing an alignment with half the tags of the best one.
 MISSED: Final = 1e-4
 
 _DISTANCE_GATE: Final = float(chi2.isf(FALSE_ALARM, 1))
-# Two tags whose distance is not known better than by this share give a heading worth nothing.
+# Two tags whose distance has a larger relative sigma give no useful heading.
 _MOST_RELATIVE_SIGMA: Final = 0.1
 _MOST_DRAWS: Final = 20_000
 _SEED: Final = 20170501
-# Of the tags not tried yet, those are next whose variance is foretold to within this factor of the least.
+# Of the tags not tried yet, those are next whose predicted variance is within this factor of the least.
 _NEXT_VARIANCE: Final = 4.0
 _MOST_CHANGES: Final = 100
-# What links two groups of tags this well keeps them together: five sigmas are as little as a wrong tag is off.
+# A more certain link keeps two groups of tags together: five sigmas are the least error of a wrong tag.
 _LOOSE_SIGMA_M: Final = 0.2 * WRONG_FROM_M
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Shared tags that fit together, and the joint fit over them."""
+    """A hypothesis: shared tags that fit together (the consensus set), and the joint fit of them."""
 
     members: BoolArray  # (n,)
     linear: LinearisedFit
@@ -53,7 +53,7 @@ class Explanation:
 
     @property
     def T_a_b(self) -> FloatArray:
-        """(3,) pose of frame b in frame a."""
+        """Pose (3,) of frame b in frame a."""
         return self.held.T_a_b
 
     @cached_property
@@ -62,38 +62,38 @@ class Explanation:
 
     @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) of each tag from where the members foretell it, and (n,) in squared sigmas; 0 for members."""
+        """Residuals (n, 2) under the prediction from the members, and (n,) their squared sigmas; 0 for members."""
         off_m, spread = self._others
         return off_m, np.where(self.members, 0.0, squared_sigmas(off_m, spread))
 
     @cached_property
     def log_wrong(self) -> FloatArray:
-        """(n,) log density of each tag, if it is wrong, where it is; of members it means nothing."""
+        """Log density (n,) of each tag's position if it is wrong; meaningless for members."""
         return log_wrong_there(*self._others)
 
     @cached_property
     def joining(self) -> BoolArray:
-        """(n,) which tags it does not count that fit it and rather stayed than are wrong."""
+        """Which tags (n,) outside the members pass the gate."""
         return ~self.members & (gate_ratio(*self._others) < 1.0)
 
     def with_more(self, tags: BoolArray) -> "Explanation":
-        """The same tags and these (n,)."""
+        """Return the hypothesis with these tags (n,) added."""
         members = self.members | tags
         return Explanation(members, self.linear, hold(self.linear, members))
 
     @property
     def fits(self) -> BoolArray:
-        """(n,) which tags do not contradict it: members, and those of whom it foretells too little."""
+        """Which tags (n,) do not contradict it: members, and those predicted too uncertainly."""
         return self.differences[1] < TAG_GATE
 
     @property
     def n(self) -> int:
-        """How many tags fit."""
+        """Number of members."""
         return int(self.members.sum())
 
 
 def explanations(fit: JointFit) -> list[Explanation]:
-    """All that was found, each pair of shared tags in one of them at most; the same for the same maps."""
+    """Return all hypotheses found, each pair of shared tags in at most one of them; deterministic."""
     found: list[Explanation] = []
     together = np.zeros((fit.n, fit.n), dtype=np.bool_)
     most = 0
@@ -111,16 +111,16 @@ def explanations(fit: JointFit) -> list[Explanation]:
 
 
 def without(explanation: Explanation, tags: IntArray) -> Explanation:
-    """The same tags but for some."""
+    """Return the hypothesis without some tags."""
     members = explanation.members.copy()
     members[tags] = False
     return Explanation(members, explanation.linear, hold(explanation.linear, members))
 
 
 def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
-    """Both parts of its tags wherever these hang together loosely: where maps bend a part may have moved as one.
+    """Yield both parts of its tags at each weak link: where maps are deformed, a part may have moved as one.
 
-    By the distances of tags: each link of the tree of the best known ones is cut in turn. Two tags are a part at least.
+    Each weak edge of the minimum spanning tree of distance variances is cut in turn. A part has at least two tags.
     """
     held = np.flatnonzero(explanation.members)
     first, second = np.triu_indices(len(held), 1)
@@ -139,12 +139,12 @@ def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
 
 
 def _n_draws(share: float) -> float:
-    """Draws of two tags until both belong to this share of all at least once, but for MISSED."""
+    """Return the number of draws after which a pair within this share is missed with probability MISSED."""
     return log(MISSED) / log(1.0 - share**2) if share > 0.0 else float("inf")
 
 
 def _random_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
-    """Pairs of tags in random order, none twice, and whether their distance is the same in both maps."""
+    """Yield distinct pairs of tags in random order, and whether their distance agrees between the maps."""
     first, second = np.triu_indices(fit.n, 1)
     order = np.random.default_rng(_SEED).permutation(len(first))[:_MOST_DRAWS]
     first, second = first[order], second[order]
@@ -155,7 +155,7 @@ def _random_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
 
 
 def is_same_distance(length_a: FloatArray, length_b: FloatArray, variance: FloatArray) -> BoolArray:
-    """(P,) whether chance explains the difference, its variance (P,), and tells a heading besides."""
+    """Return (P,) whether a difference of variance (P,) is within chance, and small enough to give a heading."""
     shorter = np.minimum(length_a, length_b)
     same = (length_a - length_b) ** 2 < _DISTANCE_GATE * variance
     return np.asarray(same & (variance < (_MOST_RELATIVE_SIGMA * shorter) ** 2))
@@ -164,7 +164,7 @@ def is_same_distance(length_a: FloatArray, length_b: FloatArray, variance: Float
 def distances(
     places: FloatArray, covariance: FloatArray, first: IntArray, second: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(P,) distances between tags, and (P,) their variances. A map that turns as a whole keeps them."""
+    """Return (P,) distances between tags, and (P,) their variances, which a rotation of the map does not change."""
     base = places[second] - places[first]
     length = np.linalg.norm(base, axis=1)
     along = base / np.maximum(length, 1e-12)[:, None]
@@ -174,7 +174,7 @@ def distances(
 
 
 def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
-    """From two tags outward, then once more over all tags until nothing changes."""
+    """Grow a hypothesis from two tags outward, then test all tags again until nothing changes."""
     members = np.zeros(fit.n, dtype=np.bool_)
     members[[i, j]] = True
     tried = members.copy()
@@ -201,7 +201,7 @@ def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
 
 
 def refine_inliers(fit: JointFit, bend: FitState, members: BoolArray) -> Explanation | None:
-    """Takes in all that fits and drops what does not; what was dropped does not come back."""
+    """Add tags that fit and drop those that do not, until nothing changes; dropped tags do not return."""
     banned = np.zeros_like(members)
     for _ in range(_MOST_CHANGES):
         linear, held = fit.solve(bend, members)
@@ -224,7 +224,7 @@ def refine_inliers(fit: JointFit, bend: FitState, members: BoolArray) -> Explana
 
 
 def _worst(held: SubsetFit, members: BoolArray) -> int | None:
-    """The tag that the others contradict most, if they do."""
+    """Return the tag that the others contradict most, if any is beyond the gate."""
     which = np.flatnonzero(members)
     if len(which) == 2:
         return None if held.closes else int(which[0])
@@ -234,7 +234,7 @@ def _worst(held: SubsetFit, members: BoolArray) -> int | None:
 
 
 def through(a: FloatArray, b: FloatArray) -> FloatArray:
-    """T_a_b by two tags (2, 2) in both maps: their middles meet, and their directions."""
+    """Return T_a_b from two tags (2, 2) in both maps, by their midpoints and directions."""
     (ax, ay), (bx, by) = a[1] - a[0], b[1] - b[0]
     turn = np.arctan2(ay, ax) - np.arctan2(by, bx)
     middle = a.mean(axis=0) - se2.apply([0.0, 0.0, turn], b.mean(axis=0))

@@ -1,4 +1,4 @@
-"""Why runs were not joined, in words."""
+"""Reasons why runs were not joined, as sentences."""
 
 from collections.abc import Sequence
 from math import degrees
@@ -11,22 +11,22 @@ _MOST_NAMED = 8
 
 
 def reason_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
-    """Why run b is not joined to a, by name; they share a tag at least."""
+    """Return why run b is not joined to a, by name; they share at least one tag."""
     if alignment is not None and alignment.rivals:
         return _ambiguous(a, b, alignment)
     if len(shared) == 1:
-        return f"{b} shares only tag {shared[0].tag_id} with {a}; one more shared tag would do"
+        return f"{b} shares only tag {shared[0].tag_id} with {a}; one more shared tag would suffice"
     if alignment is not None and alignment.is_sure:
         return f"the alignment of {b} with {a} contradicts those of other runs"
     if alignment is not None:
         return (
-            f"of the {len(shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} lie the same "
-            "way in both maps, which chance may bring about; were tags moved between the runs? One more shared tag "
-            "that stayed would do"
+            f"of the {len(shared)} tags that {b} shares with {a} only {_names(alignment.inliers)} have the same "
+            "arrangement in both maps, which may be chance; were tags moved between the runs? One more unmoved shared "
+            "tag would suffice"
         )
     return (
-        f"{b} shares {len(shared)} tags with {a}, but no two of them lie the same way in both maps: "
-        "were tags moved between the runs? Two shared tags that stayed would do"
+        f"{b} shares {len(shared)} tags with {a}, but no two of them fit together in both maps: "
+        "were tags moved between the runs? Two unmoved shared tags would suffice"
     )
 
 
@@ -38,10 +38,10 @@ def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
         f"tags {_names(tuple(tag for tag in way.inliers if tag not in first) or way.inliers)} at {_place(way.T_a_b)}"
         for way in ways[1:3]
     ]
-    more = f", and there are {len(ways) - 3} more ways" if len(ways) > 3 else ""
+    more = f", and there are {len(ways) - 3} more alternatives" if len(ways) > 3 else ""
     return (
-        f"how {b} lies in {a} is ambiguous, because {', '.join(told)}{more}: nothing tells which tags stayed and which "
-        "were moved or relabelled; a few more shared tags that stayed would do"
+        f"the place of {b} in {a} is ambiguous, because {', '.join(told)}{more}: it is unknown which tags stayed and "
+        "which were moved or relabelled; a few more unmoved shared tags would suffice"
     )
 
 

@@ -1,7 +1,7 @@
-"""All runs of a component in one solve, and what of the result to check.
+"""Joint solve of all runs of a component, and checks of the result.
 
-In: aligned local maps. Out: the jointly solved component with its typed result, its scale, its weak constraints, tape
-measurements held against it, and components joined over single tags. In the paper: the joint solve over all robots.
+In: aligned local maps. Out: the jointly solved component with its typed result, its scale, its weak constraints, tests
+of tape measurements, and components joined over single tags. In the paper: the joint solve over all robots.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""The solved graph as plain edges between poses and tags, for other tools to read."""
+"""The solved graph as edges between poses and tags, for other tools."""
 
 from dataclasses import replace
 
@@ -11,20 +11,20 @@ from groundsbot.offline.sam import Graph, Solution, State, losses_and_weights
 
 
 def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> GraphEdges:
-    """Motions and tag places with the solved calibration put in, so that the solution is their least squares.
+    """Return motions and tag positions, calibration applied, whose least-squares estimate is the solution.
 
-    A solution refined on corners pulls on headings too, which edges between places cannot say. There the edges are what
-    the refined map itself has, with the information that they have without corners.
+    A solution refined on corners also constrains headings, which edges to positions cannot represent. There the edges
+    agree with the refined map, with the information that they have without corners.
 
-    A reading is turned into a place in base such that it pulls on pose and tag as it did in the solve: the place lies
-    off where the state has the tag by what the reading's residual amounts to there. For (x, y) that is the reading
-    itself, for range and bearing it is to second order in the residual. What the solve's loss made count less has its
-    information times that weight (iteratively reweighted least squares, whose last round this is).
+    An observation becomes a position in base with the same gradient at pose and tag as in the solve: it is off the
+    state's tag position by the residual. For (x, y) that is the observation itself, for range and bearing it is to
+    second order in the residual. Information is multiplied by the weight of the solve's loss (the last round of
+    iteratively reweighted least squares).
     """
     state, columns = solution.state, graph.problem.columns
     odometry, readings = graph.problem.odometry, graph.problem.readings
     residual, blocks = readings.linearise(state, columns)
-    by_place = -blocks[0][1][..., :2]  # whitened; a step of the pose moves the place in base against it
+    by_place = -blocks[0][1][..., :2]  # whitened; the opposite sign of the derivative by the pose's position
     in_base = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
     _, motion_weight = losses_and_weights(solution.losses.odometry, odometry.residual(state))
     _, place_weight = losses_and_weights(solution.losses.readings, residual)
@@ -47,6 +47,6 @@ def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> 
 
 
 def _information(roots: FloatArray, weights: FloatArray) -> FloatArray:
-    """W W^T W (M, n, n)."""
+    """Return w W^T W (M, n, n)."""
     information: FloatArray = weights[:, None, None] * (roots.swapaxes(-1, -2) @ roots)
     return information

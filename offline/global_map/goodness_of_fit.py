@@ -1,10 +1,10 @@
-"""Do runs that fit together each by itself fit together as one map?
+"""Test whether runs that fit together each by itself also fit together as one map.
 
-From windows to runs and from runs to the map, more and more numbers become one. What each of these conditions costs is
-chi-square, and so is what all of them cost (nested linear models, see `local_map.goodness_of_fit`). What the first part
-cost, the checks of the runs alone have found; what the second does is the rise from the costs of the runs' own solves
-to that of the joint one, which are both known where the noise has been fitted. So nothing has to be solved again. Where
-sigmas are those that somebody told, or a tape holds the map too, the windows of all runs are fitted anew.
+From windows to runs and from runs to the map, more and more parameters are equated. The cost increase of each of these
+conditions is chi-square, and so is their sum (nested linear models, see `local_map.goodness_of_fit`). The first part
+was computed by the checks of the single runs. The second is the cost of the joint solve less those of the runs' own
+solves, known where the noise has been fitted, so no further solve is needed. Where sigmas were given by the user, or a
+tape measurement also constrains the map, the windows of all runs are fitted anew.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from groundsbot.offline.sam import Solution
 
 
 def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit:
-    """What it costs that all windows of several runs are one map.
+    """Return the goodness of fit of the condition that all windows of several runs are one map.
 
     Args:
-        maps: of the runs, solved under the noise that the joint solve has.
+        maps: local maps of the runs, solved under the noise of the joint solve.
         solution: of all of them.
     """
     runs = [each.goodness for each in maps]
@@ -33,10 +33,10 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
     alone = [each.solution for each in maps]
     n = max(0, freedom_of(solution.problem) - sum(freedom_of(each.problem) for each in alone))
     rise = max(0.0, 2.0 * (solution.cost - sum(each.cost for each in alone)))
-    # The noise is known as well as the conditions within the runs tell it.
+    # The noise has the degrees of freedom of the conditions within the runs.
     told = max(1, sum(each.expected for each in runs))
     bound = n * float(stats.f.isf(FALSE_ALARM, n, told)) if n else 0.0
-    # Each bound is so many sigmas above what is expected; of a sum these add up by their squares.
+    # The margins of the bounds over the expected values add in quadrature.
     parts = [(each.expected, each.bound - each.expected) for each in runs] + [(n, bound - n)]
     expected = sum(each for each, _ in parts)
     margin = float(np.linalg.norm([each for _, each in parts]))

@@ -1,4 +1,4 @@
-"""All runs of a component in one solve, and the typed result."""
+"""Joint solve of all runs of a component, and its typed result."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -28,14 +28,14 @@ from groundsbot.offline.maps import (
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.sam import COST_TOLERANCE, Graph, Parameter, Solution, State, build_graph, solve
 
-# Where many readings lie beyond the loss's threshold steps become short; a hundredth of a sigma is near enough there.
+# Where many residuals exceed the loss's threshold, steps become short; a hundredth of a sigma suffices there.
 _NOISY_COST_TOLERANCE: Final = 1e-6
 
 
 def solve_global_map(
     maps: Sequence[LocalMap], group: Group, stages: Stages, measurements: Measurements | None = None
 ) -> tuple[Graph, Solution]:
-    """Solves the members of a group together, from their local maps placed by the alignments."""
+    """Solve the members of a group together, starting from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
     with stages.stage("building the graph"):
         graph = build_graph([member.segment for member in members])
@@ -46,14 +46,14 @@ def solve_global_map(
             [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
         )
         start = graph.start(poses, _mean_tags(members, group), _mean_calibration(members))
-        _ = graph.problem.arrowhead  # the order of elimination is part of it, and made when first asked for
+        _ = graph.problem.arrowhead  # computes the elimination order, which is part of this stage
     with stages.stage("solving all runs together"):
         noisy = any(member.is_noisy for member in members)
         return graph, solve(graph.problem, start, _NOISY_COST_TOLERANCE if noisy else COST_TOLERANCE)
 
 
 def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
-    """Typed results with covariances, in the frame of the first segment's start; refined on corners where they are."""
+    """Return typed results with covariances, in the frame of the first segment's start; refined on corners if given."""
     last = refined.solution if refined else solution
     state, columns = last.state, last.problem.columns
     starts = graph.first_pose
@@ -90,7 +90,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
 def calibration_of(
     parameters: Sequence[Parameter], solution: Solution | CornerSolution, component: int
 ) -> list[CalibrationResult]:
-    """What the solve found for the calibration numbers it carried."""
+    """Return the estimates of the calibration parameters in the solve."""
     columns = solution.problem.columns.calibration
     sigmas = np.sqrt(np.diag(solution.covariance(columns)))
     return [
@@ -101,7 +101,7 @@ def calibration_of(
 
 
 def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:
-    """Tags in the group's frame, the mean over the maps that have them."""
+    """Return tag positions in the group's frame, the mean over the maps that have them."""
     places: dict[TagKey, list[FloatArray]] = {}
     for T_frame_start, member in zip(group.T_frame_start, members, strict=True):
         for tag, place in member.tags_m.items():
@@ -118,7 +118,7 @@ def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
 
 
 def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> ArchivedCalibration:
-    """Of the C numbers that the solve carried: their rows (C, 2 T + C) of the covariance of tags and calibration."""
+    """Return C calibration parameters with their rows (C, 2 T + C) of the covariance of tags and calibration."""
     n = rows.shape[1] - len(parameters)
     return ArchivedCalibration(
         owners=tuple(parameter.owner for parameter in parameters),
@@ -133,7 +133,7 @@ def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, r
 
 
 def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
-    """From right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
+    """Transform from right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
     turned = joint.copy()
     for i, theta in enumerate(start_headings_rad):
         cos, sin = np.cos(theta), np.sin(theta)
@@ -162,7 +162,7 @@ def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, 
 
 
 def _components(mount: Mount) -> FloatArray:
-    """(7,) place and quaternion x, y, z, w."""
+    """Return (7,) position and quaternion x, y, z, w."""
     place_m, turn = mount.T_base_camera.as_components()
     return np.concatenate([place_m, turn.as_quat(canonical=True)])
 

@@ -1,10 +1,10 @@
-"""By how many times a joint solve leaves over more than chance explains, so that its covariances say too little.
+"""Overdispersion of a joint solve: its residuals exceed chance by a factor, and its covariances are too small.
 
-What it costs that drives which fit together each by itself share tags and calibration is chi-square with as many
-degrees of freedom as there are conditions (nested linear models, see `local_map.goodness_of_fit`). Cost over freedom is
-by how many times errors between drives have more variance than the solve was told (Birge, "The calculation of errors by
-the method of least squares", 1932). The same holds within drives, for joining their windows. Only what chance hardly
-explains counts: else a good map's sigmas would grow by the luck of the draw.
+The cost of the conditions that drives, consistent each by itself, share tags and calibration is chi-square with as many
+degrees of freedom as there are conditions (nested linear models, see `local_map.goodness_of_fit`). Cost per degree of
+freedom is the factor on the variance of errors between drives (Birge, "The calculation of errors by the method of least
+squares", 1932). The same holds within drives, for joining their windows. A factor is applied only where chance hardly
+explains the cost: otherwise the sigmas of a good map would vary with the noise.
 """
 
 from collections.abc import Sequence
@@ -19,20 +19,20 @@ from groundsbot.offline.local_map import GoodnessOfFit, LocalMap, freedom_of
 from groundsbot.offline.maps import Misfit
 from groundsbot.offline.sam import Graph, Solution, build_graph, losses_and_weights, solve
 
-# Joins of a good map are taken for bad ones so rarely.
+# False alarm rate of the test of joins.
 _FALSE_ALARM: Final = 1e-2
 
 
 def misfit_of(
     maps: Sequence[LocalMap], graph: Graph, solution: Solution, together: GoodnessOfFit | None = None
 ) -> Misfit | None:
-    """What contradicts the model most; None where chance explains all of it.
+    """Return the largest contradiction to the model; None where chance explains all of them.
 
     Args:
-        maps: of the graph's segments in order, solved under the noise that the graph has.
+        maps: local maps of the graph's segments in order, solved under the noise of the graph.
         graph: of the component.
-        solution: of it, on places of tags.
-        together: whether all windows of several drives are one map; None where a drive alone does not fit.
+        solution: of it, on tag positions.
+        together: goodness of fit of several drives as one map; None where a drive alone does not fit.
     """
     alone = [_alone(each, graph, solution, segment) for segment, each in enumerate(maps)]
     found = (_of_joins(maps, graph, solution, alone), _of_windows(maps, graph, solution, alone, together))
@@ -41,12 +41,12 @@ def misfit_of(
 
 
 def noise_freedom(maps: Sequence[LocalMap]) -> int:
-    """What chi-square's degrees of freedom the noise is known like, by what joins the windows of drives."""
+    """Return the degrees of freedom of the noise estimate, from the conditions that join the windows of drives."""
     return max(1, sum(each.goodness.expected for each in maps))
 
 
 def _of_joins(maps: Sequence[LocalMap], graph: Graph, solution: Solution, alone: Sequence[Solution]) -> Misfit | None:
-    """What sharing tags and calibration costs; what somebody measured is not among it, and is judged on its own."""
+    """Return the cost of sharing tags and calibration, without measurements by a person, which are tested apart."""
     measured = graph.problem.measured
     n = freedom_of(graph.problem) - measured.n_residuals - sum(freedom_of(each.problem) for each in alone)
     if len(maps) == 1 or n <= 0:
@@ -64,7 +64,7 @@ def _of_windows(
     alone: Sequence[Solution],
     together: GoodnessOfFit | None,
 ) -> Misfit | None:
-    """What joining windows of a drive, or of all drives, costs."""
+    """Return the cost of joining the windows of a drive, or of all drives."""
     runs = [each.goodness for each in maps]
     if not all(each.fits for each in runs):
         cost = [_cost(each) for each in runs]
@@ -77,12 +77,12 @@ def _of_windows(
 
 
 def _cost(goodness: GoodnessOfFit) -> float:
-    """In squared sigmas of the noise that windows show, or of that which the solve had where it was told more."""
+    """Return the cost in squared sigmas of the windows' noise, or of the solve's noise where that is larger."""
     return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
 
 
 def _alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) -> Solution:
-    """Of one segment of the graph: its local map's, unless its tags were told apart otherwise since."""
+    """Return the solution of one segment alone: its local map's, unless its tags were split differently since."""
     now = graph.segments[segment]
     if _same_places(local_map.segment.readings.tag, now.readings.tag):
         return local_map.solution
@@ -98,7 +98,7 @@ def _alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) 
 
 
 def _same_places(tag: IntArray, other: IntArray) -> bool:
-    """Whether readings (M,) are gathered alike under two ways to number tags."""
+    """Return whether two numberings of tags group the observations (M,) alike."""
     if len(tag) != len(other):
         return False
     pairs = len(np.unique(np.column_stack([tag, other]), axis=0))
@@ -106,7 +106,7 @@ def _same_places(tag: IntArray, other: IntArray) -> bool:
 
 
 def _worst(graph: Graph, solution: Solution, alone: Sequence[Solution]) -> int:
-    """The segment whose motions and readings cost most beyond what they cost alone."""
+    """Return the segment whose motions and observations cost most beyond their cost alone."""
     together = np.zeros(len(alone))
     for first, losses in zip(
         (graph.problem.odometry.first, graph.problem.readings.pose), _losses(solution), strict=True
@@ -117,7 +117,7 @@ def _worst(graph: Graph, solution: Solution, alone: Sequence[Solution]) -> int:
 
 
 def _losses(solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """(M,) of motions and (N,) of readings."""
+    """Return losses (M,) of motions and (N,) of observations."""
     problem, state = solution.problem, solution.state
     odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
     readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))

@@ -1,9 +1,9 @@
-"""Tags that the drives saw in several places: how far the places of a tag by its passes scatter about the map's.
+"""Scatter of tag positions between passes, and tags whose sigmas it increases.
 
-About the solved poses each pass of a tag, the readings of it while a drive passed by once, has a place for it with the
-information of its readings. The map's place is their mean. Poses give in to readings, so the passes scatter by less
-than chi-square; what lies beyond it is in no covariance. Then the tag is known as the scatter of its passes tells, each
-of their variances grown alike (Birge, "The calculation of errors by the method of least squares", 1932).
+About the solved poses, each pass of a tag (its observations while a drive passed by once) gives a position with the
+information of these observations. The map's position is their weighted mean. Poses adapt to observations, so the passes
+scatter by less than chi-square predicts; larger scatter is in no covariance. Then the variance of all passes of the tag
+is scaled to the scatter (Birge, "The calculation of errors by the method of least squares", 1932).
 """
 
 from typing import Final
@@ -16,19 +16,19 @@ from groundsbot.offline.maps import TagScatter
 from groundsbot.offline.measurements import passes_of
 from groundsbot.offline.sam import Graph, Solution, losses_and_weights
 
-# One good map in a thousand has a tag that is taken for a bad one.
+# Share of good maps in which any tag is found to scatter.
 _FALSE_ALARM: Final = 1e-3
 _MOST_NAMED: Final = 12
 
 
 def scatter_of_passes(graph: Graph, solution: Solution, variance_factor: float, freedom: float) -> TagScatter:
-    """Of each tag of a component.
+    """Return the scatter of each tag of a component.
 
     Args:
         graph: of the component.
-        solution: of it, on places of tags.
-        variance_factor: by which all covariances of the component grow anyway.
-        freedom: what chi-square's degrees of freedom the noise is known like.
+        solution: of it, on tag positions.
+        variance_factor: by which all covariances of the component are inflated anyway.
+        freedom: degrees of freedom of the noise estimate.
     """
     n_tags = len(graph.tags)
     factors, added_m2 = np.ones(n_tags), np.zeros((n_tags, 2, 2))
@@ -50,7 +50,7 @@ def scatter_of_passes(graph: Graph, solution: Solution, variance_factor: float, 
 
 
 def scatter_warnings(graph: Graph, scatter: TagScatter) -> list[str]:
-    """Of tags whose passes contradict each other."""
+    """Return a warning that names tags whose passes contradict each other."""
     which = np.flatnonzero(scatter.factors > 1.0)
     if not len(which):
         return []
@@ -60,14 +60,14 @@ def scatter_warnings(graph: Graph, scatter: TagScatter) -> list[str]:
     ]
     more = f" and {len(worst) - _MOST_NAMED} more" if len(worst) > _MOST_NAMED else ""
     sentence = (
-        f"passes of tags {', '.join(named)}{more} scatter by so many times what chance explains: their sigmas were "
-        "made as large as that; look whether they hang firmly and flat, and drive past them again"
+        f"passes of tags {', '.join(named)}{more} scatter by these multiples of what chance explains, and their sigmas "
+        "were scaled accordingly; check that they are mounted firmly and flat, and drive past them again"
     )
     return [sentence]
 
 
 def _passes(graph: Graph) -> tuple[IntArray, IntArray]:
-    """(M,) the pass of each reading, through all segments; (P,) the tag of each pass."""
+    """Return (M,) the pass of each observation, counted through all segments, and (P,) the tag of each pass."""
     n_passes, of_pass = 0, []
     for segment in graph.segments:
         own = passes_of(segment)
@@ -80,14 +80,14 @@ def _passes(graph: Graph) -> tuple[IntArray, IntArray]:
 
 
 def _sums(graph: Graph, solution: Solution, of_pass: IntArray, n_passes: int) -> tuple[FloatArray, FloatArray]:
-    """(P, 2, 2) what the readings of each pass tell of the tag's place, about the solved poses; (P, 2) their pull."""
+    """Return each pass's information (P, 2, 2) about the tag position, about the solved poses, and gradient (P, 2)."""
     readings, state = graph.problem.readings, solution.state
     residual, blocks = readings.linearise(state, graph.problem.columns)
     _, weight = losses_and_weights(solution.losses.readings, residual)
     theta = state.poses[readings.pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     to_base = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
-    by_place = -blocks[0][1][..., :2] @ to_base  # whitened; a step of the pose moves the place in base against it
+    by_place = -blocks[0][1][..., :2] @ to_base  # whitened; the opposite sign of the derivative by the pose's position
     weighted = weight[:, None, None] * by_place.swapaxes(-1, -2)
     information, pull = np.zeros((n_passes, 2, 2)), np.zeros((n_passes, 2))
     np.add.at(information, of_pass, weighted @ by_place)

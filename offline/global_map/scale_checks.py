@@ -1,7 +1,7 @@
-"""Wheels held against tags: do both mean the same by a metre, and by a full turn? And what holds the metre at all.
+"""Consistency of wheels and tags in scale and turn, and what determines the scale of a map.
 
-Readings tell very well how a metre by the tags compares with one by the wheels, and hardly how long either is. What
-they say of that comparison is the estimate without its priors; what robot.yaml allows is the priors alone.
+Observations determine the ratio of the tags' scale to the wheels' well, and hardly either of them. Their estimate of
+the ratio is that of the solve without its priors; robot.yaml's estimate is that of the priors alone.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from groundsbot.offline.sam import Graph, Solution
 
 # The corrections that each check compares.
 COMPARED: Final = {"scale": ("wheel_scale", TAG_SCALE), "turn": ("wheel_scale", "track_scale")}
-# Priors this much weaker, in variance, are as good as none.
+# Relative information of weakened priors, in effect none.
 _WEAKENED: Final = 1e-8
-# Readings that tell the comparison no better than this many times what robot.yaml allows say nothing of it.
+# Observations whose sigma exceeds this multiple of robot.yaml's contain no information about the comparison.
 _TELLS_NOTHING: Final = 10.0
-_HELD: Final = 1e-12  # the sigma of what is held: far below any that somebody gives
+_HELD: Final = 1e-12  # sigma of fixed parameters: far below any that is given
 
 
 def checks_of(graph: Graph, solution: Solution, component: int) -> list[ConsistencyCheck]:
-    """Each robot's wheels against each batch of tags that it read, where readings compare them."""
+    """Return each robot's wheels compared with each batch of tags, where observations determine this."""
     found: dict[tuple[str, str, str | None], ConsistencyCheck] = {}
     for i, segment in enumerate(graph.segments):
         robot_id = segment.run.robot_id
@@ -40,14 +40,14 @@ def checks_of(graph: Graph, solution: Solution, component: int) -> list[Consiste
 
 
 def check_warnings(checks: Sequence[ConsistencyCheck]) -> list[str]:
-    """Where wheels and tags contradict each other, by how much, and what that usually means."""
+    """Return a warning for each contradiction between wheels and tags, with its size and usual cause."""
     return [_sentence(check) for check in checks if check.contradicts]
 
 
 def scale_budget(graph: Graph, component: int) -> ScaleBudget:
-    """How much of what holds the scale is due to what.
+    """Return the share of each prior and measurement in the information about the map's scale.
 
-    Everything can be stretched together without a reading noticing. Along that way only priors and tapes resist.
+    Scaling the whole map changes no observation's residual; only priors and tape measurements resist it.
     """
     resists = dict.fromkeys(("wheels", "track", "tags", "mount", "distances", "starts"), 0.0)
     for parameter in graph.parameters:
@@ -70,10 +70,10 @@ def scale_budget(graph: Graph, component: int) -> ScaleBudget:
 
 
 def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float] | None:
-    """First correction less the second, by readings alone, its sigma, and that of the priors; None: they do not say.
+    """Return the first correction less the second by observations alone, its sigma, and that of the priors.
 
-    With P the covariance of the priors, S that of the estimate m: readings alone have the information S^-1 - P^-1 and
-    the estimate (S^-1 - P^-1)^-1 S^-1 m, since priors are about zero.
+    With P the covariance of the priors and S that of the estimate m, observations alone have the information S^-1 -
+    P^-1 and the estimate (S^-1 - P^-1)^-1 S^-1 m, since priors have zero mean. None where they do not determine it.
     """
     prior_sigma = solution.problem.prior.sigma[indices]
     columns = solution.problem.columns.calibration[indices]
@@ -84,7 +84,7 @@ def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float
         return None
     P = np.diag(prior_sigma[free] ** 2)
     S = solution.covariance(columns[free])
-    # In sigmas of the priors all numbers are about one.
+    # In units of the prior sigmas all parameters have similar size.
     unit = np.diag(1.0 / prior_sigma[free])
     weak = np.eye(len(way)) * _WEAKENED
     information = np.linalg.inv(unit @ S @ unit)
@@ -98,7 +98,7 @@ def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float
 
 
 def _positive(matrix: FloatArray) -> FloatArray:
-    """Without what rounding left below zero."""
+    """Return the matrix with negative eigenvalues, due to rounding, set to zero."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     positive: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return positive
@@ -110,15 +110,15 @@ def _sentence(check: ConsistencyCheck) -> str:
     if check.name == "turn":
         more = "more" if check.value > 0.0 else "less"
         return (
-            f"wheels and tags contradict each other about a full turn: {check.robot_id} turns by {by} {more} than its "
-            f"wheels say ({360.0 * abs(check.value):.1f} deg a turn; {allowed}); usually track_m is wrong, or the "
+            f"wheels and tags contradict each other about a full turn: {check.robot_id} turns by {by} {more} than by "
+            f"its wheels ({360.0 * abs(check.value):.1f} deg a turn; {allowed}); usually track_m is wrong, or the "
             "wheels slip when turning"
         )
     longer = "longer" if check.value > 0.0 else "shorter"
     larger, smaller = ("larger", "smaller") if check.value > 0.0 else ("smaller", "larger")
     return (
-        f"wheels and tags contradict each other about the metre: what the tags ({check.batch}) call one is {by} "
-        f"{longer} by the wheels of {check.robot_id} ({allowed}); usually the tags are {larger} than their size says "
-        "(it is measured along the outer edge of the black border), or the wheels' radii are "
-        f"{smaller} than robot.yaml has them; a --distance settles which"
+        f"wheels and tags contradict each other about the scale: a metre by the tags ({check.batch}) is {by} "
+        f"{longer} by the wheels of {check.robot_id} ({allowed}). Usually the tags are {larger} than their given size "
+        "(along the outer edge of the black border), or the wheels' radii are "
+        f"{smaller} than in robot.yaml; measure a --distance to find out which"
     )

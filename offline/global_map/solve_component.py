@@ -1,4 +1,4 @@
-"""The components of a map: each solved on places, tags that do not belong apart, then on corners; and what they say."""
+"""Solve each component of a map: on tag positions, with outliers split off, then on corners."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
@@ -28,16 +28,16 @@ from groundsbot.offline.sam import Graph, Solution
 
 
 class SolvedComponent(NamedTuple):
-    """Runs that hang together, as they were solved.
+    """A solved component.
 
     Attributes:
         members: of the local maps.
         graph: its segments are the members' in order.
-        solution: of the graph, on places of tags.
-        suspects: tags that do not belong.
+        solution: of the graph, on tag positions.
+        suspects: outlier tags.
         refined: on corners; None where it is not.
-        told: what was left out; why it is not refined, where anybody asked; or which tags do not hang as was said.
-        left_out: family and id of tags some of whose readings, or all, are not in the graph.
+        told: sentences: what was left out, why it is not refined although requested, or which tags are not upright.
+        left_out: family and id of tags some or all of whose observations are not in the graph.
     """
 
     members: Group
@@ -59,7 +59,7 @@ def solve_group(
     corners: bool,
     upright_sigma_rad: float | None = None,
 ) -> SolvedComponent:
-    """Solves the members of a group together, tags that do not belong apart unless they are kept."""
+    """Solve the members of a group together, with outlier tags split off unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
     suspects: list[SuspectTag] = []
     told: list[str] = []
@@ -77,7 +77,7 @@ def solve_group(
         graph, solution = without_tags(graph, solution, misread)
         gone |= misread
         ids = _list_ids({(tag.family, tag.tag_id) for tag in misread})
-        told = [*told, f"tags {ids} were read once each, where another tag is: taken for misread codes, not placed"]
+        told = [*told, f"tags {ids} were each read once at another tag's place; taken for misread codes and left out"]
     left_out = frozenset((tag.family, tag.tag_id) for tag in gone)
     solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told), left_out=left_out)
     if not corners or not graph.has_corners:
@@ -88,10 +88,10 @@ def solve_group(
 
 
 def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
-    """Tags that do not belong apart; None where the drives do not fit even so.
+    """Return the search for outlier tags, which splits them off; None where the drives do not fit even then.
 
-    Where a drive whose noise was fitted does not fit, or all do not fit together, what tags seem to have done is not
-    theirs: there is something else that the model does not know.
+    Where a drive does not fit under its fitted noise, or the drives do not fit together, something else violates the
+    model, and apparent outliers are not the tags' fault.
     """
     if any(each.is_doubtful for each in maps):
         return None
@@ -104,9 +104,9 @@ def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap])
 def _outlier_report(
     searched: OutlierSearch, *, noise_is_fitted: bool
 ) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
-    """The tags that do not belong, those that are left out, and a sentence of the latter that are not named.
+    """Return the outlier tags, the tags to leave out, and a sentence about those that are not named.
 
-    Noise that was fitted has heavier tails than normal errors have: there a pass that goes astray names no tag.
+    Fitted noise has heavier tails than a normal distribution: there a deviating pass does not make its tag an outlier.
     """
     suspects, stray = outlier_report(searched), set[TagKey]()
     told = []
@@ -118,7 +118,7 @@ def _outlier_report(
         )
         told.append(
             f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'reading')}) of tags {_list_ids(ids)} "
-            "went astray from where all others have them: left out"
+            "contradict all other passes and were left out"
         )
     return suspects, stray | find_false_detections(searched.graph, suspects), told
 

@@ -1,4 +1,4 @@
-"""What a person measured, in the solve of a component: as factors, and held against the map without it."""
+"""Measurements by a person: as factors of a component's solve, and tested against the map without them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,14 +23,14 @@ from groundsbot.offline.sam import (
     whitening,
 )
 
-# A measurement that belongs is said to contradict the map so rarely.
+# False alarm rate of the test of a measurement.
 _FALSE_ALARM: Final = 1e-4
-# What all else knows a thousand times worse than the tape is as good as not known.
+# A measurement is not tested where everything else is a thousand times less certain.
 _CHECKED: Final = 1e-6
 
 
 def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
-    """The graph with those measurements whose ends it has; starts where it has the frame."""
+    """Return the graph with factors for those measurements whose ends it has; starts only if it has the frame."""
     starts, distances = _usable(graph, measurements)
     if not starts and not distances:
         return graph
@@ -62,7 +62,7 @@ def with_measurements(graph: Graph, measurements: Measurements) -> Graph:
 def compare_measurements(
     graph: Graph, solution: Solution | CornerSolution, measurements: Measurements, component: int
 ) -> list[MeasurementResult]:
-    """What the component makes of the measurements that it uses."""
+    """Return results of the measurements that a component uses, each tested against all else."""
     starts, distances = _usable(graph, measurements)
     measured, state = graph.problem.measured, solution.state
     by_start, by_distance = measured.linearise(state, solution.problem.columns)
@@ -86,14 +86,14 @@ def compare_measurements(
 
 
 def unused_measurements(measurements: Measurements, used: Sequence[MeasurementResult]) -> list[MeasurementResult]:
-    """Those whose ends lie in different components."""
+    """Return the measurements whose ends lie in different components."""
     known = {(result.kind, result.a, result.b) for result in used}
     told = _measured_values(measurements.frame, measurements.starts, measurements.distances)
     return [result for result in told if (result.kind, result.a, result.b) not in known]
 
 
 def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
-    """Of those that contradict the map, and those that are not used."""
+    """Return warnings about measurements that contradict the map, and about unused ones."""
     warnings = []
     for result in results:
         option = f"--{result.kind} {result.b if result.kind == 'start' else f'{result.a},{result.b}'}"
@@ -101,9 +101,9 @@ def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
             warnings.append(f"{option}: not used, since its ends are in different components of the map")
         elif result.contradicts:
             warnings.append(
-                f"{option}: measured {_figures(result.measured)}, and everything else says otherwise by "
-                f"{result.off_sigmas:.1f} sigma (the map, which gives in to both, has {_figures(result.in_map)}): "
-                "a slip of the tape or of the pen, sigmas too small, or a map whose scale is wrong"
+                f"{option}: measured {_figures(result.measured)}, which contradicts everything else by "
+                f"{result.off_sigmas:.1f} sigma (the map, a compromise of both, has {_figures(result.in_map)}); "
+                "check the measurement and its sigmas, or the map's scale is wrong"
             )
     return warnings
 
@@ -116,20 +116,20 @@ def _usable(graph: Graph, measurements: Measurements) -> tuple[tuple[MeasuredSta
 
 
 def _first_instances(graph: Graph) -> dict[str | TagKey, int]:
-    """The tag of each id; of one that hangs in several places the first."""
+    """Return the index of each tag id; of the first instance where it is in several places."""
     return {tag.whole: i for i, tag in reversed(list(enumerate(graph.tags)))}
 
 
 def _names(graph: Graph) -> list[str]:
-    """Of the segments: where a run has several, the first has the run's own."""
+    """Return the names of the segments; the first of several of a run has the run's own."""
     return [segment.name for segment in graph.segments]
 
 
 def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:
-    """How far a measurement lies from what all others say, in sigmas, and how far chance may put it.
+    """Return the deviation of a measurement from the prediction by all others, in sigmas, and its bound.
 
-    With S = J H^-1 J^T the share of the residual that the estimate took, r^T (I - S)^-1 r is that of a prediction
-    without the measurement (Cook and Weisberg, "Residuals and influence in regression", 1982): chi-square.
+    With S = J H^-1 J^T, r^T (I - S)^-1 r is the squared Mahalanobis distance from a prediction without the measurement
+    (Cook and Weisberg, "Residuals and influence in regression", 1982): chi-square.
     """
     columns = np.concatenate([columns[m] for columns, _ in kind.blocks])
     jacobian = np.concatenate([derivative[m] for _, derivative in kind.blocks], axis=1)
@@ -144,7 +144,7 @@ def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple
 
 
 def _lengths(distances: DistanceFactors, state: State) -> FloatArray:
-    """(D, 1) as the map has them."""
+    """Return (D, 1) lengths in the map."""
     place_a, place_b = ends_of(distances, state)
     lengths: FloatArray = np.linalg.norm(place_b - place_a, axis=1)[:, None]
     return lengths
@@ -153,7 +153,7 @@ def _lengths(distances: DistanceFactors, state: State) -> FloatArray:
 def _measured_values(
     frame: str, starts: Sequence[MeasuredStart], distances: Sequence[MeasuredDistance]
 ) -> list[MeasurementResult]:
-    """As they were measured."""
+    """Return the measurements as results without a map."""
     told = [MeasurementResult("start", frame, each.run, each.T_map_start, each.sigma, None) for each in starts]
     for each in distances:
         a, b = (end if isinstance(end, str) else f"{end.family}:{end.tag_id}" for end in (each.a, each.b))

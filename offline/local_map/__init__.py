@@ -1,4 +1,4 @@
-"""One drive alone: its local map, and whether the drive fits together in itself.
+"""The local map of a single drive, and its goodness of fit.
 
 In: a segment. Out: `LocalMap` (poses and tags in the frame of the drive's start, with their joint covariance) and its
 test of goodness of fit. In the paper: the local map of each robot.

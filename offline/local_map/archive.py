@@ -1,9 +1,9 @@
-"""Local maps from what a finished map kept of them, and what it keeps.
+"""Archive local maps in a finished map, and restore them to extend it.
 
-A kept map is extended by the same steps by which all its runs would be mapped at once: merged, solved, searched for
-tags that do not belong. So it keeps each run's measurements whole (motions and readings, some 1 MB for 100 m) and the
-solution of the run alone, which is where its solve ends again at once. Nothing is marginalised, so nothing stays
-linearised where the smaller map had it; and no log is needed.
+A map is extended by the steps by which all its runs would be mapped at once: merge, solve, search for outlier tags. So
+it archives all measurements of each run (motions and observations, some 1 MB for 100 m) and the solution of the run
+alone, from which its solve converges at once. Nothing is marginalised, so nothing stays at the linearisation point of
+the smaller map; and no log is needed.
 """
 
 import json
@@ -35,7 +35,7 @@ from groundsbot.offline.sam import State, build_graph, solve
 
 
 def archive_map(local_map: LocalMap) -> ArchivedSegment:
-    """What a later run needs of a local map."""
+    """Return what is archived of a local map."""
     segment, state = local_map.segment, local_map.solution.state
     run, odometry, readings = segment.run, segment.odometry, segment.readings
     return ArchivedSegment(
@@ -74,7 +74,7 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
 
 
 def local_map_of(kept: ArchivedSegment) -> LocalMap:
-    """The local map again, under the noise that it was kept with."""
+    """Return the archived local map, under the noise it was archived with."""
     segment = _segment(kept)
     graph = build_graph([segment])
     solution = solve(graph.problem, State(kept.poses, kept.tags_m, kept.calibration))
@@ -99,7 +99,7 @@ def segment_from_arrays(
     *,
     distance_m: FloatArray | None = None,
 ) -> Segment:
-    """A segment of motions and readings whose noise is settled, named as its run.
+    """Return a segment of motions and observations with fixed noise, named as its run.
 
     Args:
         run: whose they are.
@@ -108,12 +108,12 @@ def segment_from_arrays(
         tags: as of `Segment`.
         keyframe: as of `Readings`, and likewise the others.
         tag: index into the tags.
-        value: of each reading.
+        value: of each observation.
         covariance: of the value.
         by_camera: its derivative by the camera's parameters.
-        polar: its form.
-        in_camera: about what.
-        distance_m: (K-1,) driven; None: as far as each motion leads ahead or back.
+        polar: whether it is (range, bearing).
+        in_camera: whether it is relative to the camera.
+        distance_m: (K-1,) driven; None: the forward component of each motion.
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
@@ -136,12 +136,12 @@ def segment_from_arrays(
 
 
 def _fixed_parts(covariance: FloatArray) -> CovarianceParts:
-    """On which no noise parameter has a bearing any more."""
+    """Return a covariance that depends on no noise parameter."""
     return CovarianceParts((), np.zeros((0, *covariance.shape)), covariance)
 
 
 def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
-    """Without the wheel readings, pictures and events that only a log has."""
+    """Return a run without the wheel readings, pictures and events that only a log has."""
     none: IntArray = np.zeros(0, dtype=np.int64)
     return Run(
         name=name,
@@ -193,25 +193,25 @@ def _segment(kept: ArchivedSegment) -> Segment:
 
 
 def check_extendable(known: MapResult) -> None:
-    """Refuses a map that did not keep what its runs measured.
+    """Refuse a map without archived measurements of its runs.
 
     Raises:
         OfflineError: it was made by an older program.
     """
     if not known.kept:
         raise OfflineError(
-            "--extend: the map's map.npz does not hold what its runs measured (an older program made it); map their "
+            "--extend: the map's map.npz does not contain its runs' measurements (an older program made it); map their "
             "logs together with the new ones"
         )
 
 
 def tags_of(kept: ArchivedSegment) -> list[TagKey]:
-    """The ids of the tags that a segment read, whichever instance."""
+    """Return the ids of the tags that a segment observed, without instances."""
     return [TagKey(family, tag_id) for family, tag_id in zip(kept.tag_families, kept.tag_ids.tolist(), strict=True)]
 
 
 def check_sizes_in_map(run: Run, known: MapResult) -> None:
-    """Refuses a run whose robot.yaml gives a tag another size than the map has.
+    """Refuse a run whose robot.yaml gives a tag another size than the map has.
 
     Raises:
         OfflineError: naming run, tag and both sizes.
@@ -229,7 +229,7 @@ def check_sizes_in_map(run: Run, known: MapResult) -> None:
 
 
 def tape_options_of(known: MapResult, tape: TapeOptions) -> TapeOptions:
-    """What somebody measured for a map that is kept, and for its extension."""
+    """Return the tape measurements of an archived map together with those for its extension."""
     starts, distances = [], []
     for each in known.measurements:
         numbers = ",".join(f"{value!r}" for value in [*each.measured.tolist(), *each.sigma.tolist()])

@@ -1,12 +1,12 @@
-"""How much of their errors do neighbouring readings of a tag share?
+"""Variance components of correlated errors between neighbouring observations of a tag.
 
-A detector's bias depends on how a tag looks, and so repeats from picture to picture: the mean of m readings is then
-less certain than one reading over sqrt(m). Readings of one tag within a cell, a metre or two of the way, are taken to
-err by a part of each one's own and by a part that the cell shares. The variances of the parts follow from two squares
-of what a solve leaves over: reading by reading, and summed over cells. Each square's expectation is linear in the
-variances, with traces as coefficients, and what the estimate takes is in the traces (the minimum norm quadratic
-unbiased estimator: Rao, "Estimation of variance and covariance components", 1971). So errors that are independent give
-a shared part of zero in the mean.
+A detector's bias depends on a tag's appearance, and so repeats from picture to picture: the mean of m observations is
+then less certain than one observation over sqrt(m). The error of observations of one tag within a cell, one or two
+metres of the path, is modelled as an independent part and a part common to the cell. The variances of the parts follow
+from two sums of squared residuals: over single observations, and over the sums of cells. The expectation of each is
+linear in the variances, with traces as coefficients that include the reduction by the estimate (the minimum norm
+quadratic unbiased estimator: Rao, "Estimation of variance and covariance components", 1971). So independent errors give
+a common part of zero in the mean.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from scipy import sparse
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam import Solution, losses_and_weights, stack
 
-# What was assumed before, that readings share nothing, counts like this many cells.
+# Weight of the prior of independent errors, as a number of cells.
 _TOLD: Final = 4.0
 _TINY: Final = 1e-9
 _N_SIGNS: Final = 8
@@ -29,11 +29,11 @@ _SEED: Final = 7
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """Variances of whitened readings, by component.
+    """Variances of whitened observations, by component of the observation.
 
     Attributes:
-        own: (2,) of each reading's own part, and own_redundancy: (2,) how many measurements it rests on.
-        shared: (2,) of the part that a cell shares, and shared_redundancy: (2,) how many cells it rests on.
+        own: (2,) of the independent part, and own_redundancy: (2,) its number of measurements.
+        shared: (2,) of the part common to a cell, and shared_redundancy: (2,) its number of cells.
     """
 
     own: FloatArray
@@ -42,19 +42,18 @@ class SharedErrors:
     shared_redundancy: FloatArray
 
     def factors(self, cell: IntArray, least_shared: FloatArray | float = 0.0) -> FloatArray:
-        """(M, 2) factors on the sigmas of readings in cells (M,), with which they tell as much as independent ones.
+        """Return (M, 2) factors on sigmas that make observations equivalent to independent ones.
 
         Args:
-            cell: of each reading.
-            least_shared: (M, 2) variance that they are known to share, whatever was fitted.
+            cell: (M,) of each observation.
+            least_shared: (M, 2) lower bound on the common variance, known independently of the fit.
         """
         return np.sqrt(self.own + _n_in_cell(cell)[:, None] * np.maximum(self.shared, least_shared))
 
     def freedom(self, cell: IntArray) -> float:
-        """What chi-square's degrees of freedom the variance of readings so weighed is known like.
+        """Return the effective degrees of freedom of the inflated variance of the observations.
 
-        Welch and Satterthwaite's sum: Satterthwaite, "An approximate distribution of estimates of variance components"
-        (1946).
+        By Satterthwaite's sum: "An approximate distribution of estimates of variance components" (1946).
         """
         parts = np.concatenate([len(cell) * self.own, _n_in_cell(cell).sum() * self.shared])
         redundancy = np.concatenate([self.own_redundancy, self.shared_redundancy])
@@ -62,11 +61,11 @@ class SharedErrors:
 
 
 def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
-    """Fits both parts to what a solve left over of its readings, the noise of all else being as the solve was told.
+    """Fit both variances to the residuals of a solve's observations, with all other noise as given to the solve.
 
     Args:
-        solution: its readings weighed as independent.
-        cell: (M,) of each reading; numbers from 0 without gaps.
+        solution: with observations weighted as independent.
+        cell: (M,) of each observation; numbers from 0 without gaps.
     """
     read = _Readings(solution)
     cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
@@ -86,7 +85,7 @@ def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
 
 
 def _random_signs(cell: IntArray) -> Iterator[FloatArray]:
-    """(M, 2, n) random signs in one component, four times: reading by reading twice, then cell by cell."""
+    """Yield (M, 2, n) random signs in one component, four times: twice by observation, then twice by cell."""
     rng = np.random.default_rng(_SEED)
     for part in range(4):
         component, by_cell = part % 2, part >= 2
@@ -97,7 +96,7 @@ def _random_signs(cell: IntArray) -> Iterator[FloatArray]:
 
 
 class _Readings:
-    """The rows of a solve that are readings, weighted as it weighed them.
+    """Residual projection of the observations in a solve, with the weights of its loss.
 
     Attributes:
         residual: (2 M,)
@@ -113,10 +112,10 @@ class _Readings:
         self.residual = residual * root
 
     def residuals(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What remains of rows (2 M, k) once the estimate has taken its share, v - J H^-1 J^T v, and (k,) the squares.
+        """Return the residual projection v - J H^-1 J^T v of columns v (2 M, k), and (k,) their squared lengths.
 
-        The squares are those of all that is measured, not of readings alone: as v - J H^-1 J^T v is a projection they
-        are its product with v.
+        The lengths are those over all measurements, not of observations alone: since v - J H^-1 J^T v is a projection
+        they are its product with v.
         """
         inner = self._jacobian.T @ rows
         solved = self._factorisation.solve_many(inner)
@@ -124,20 +123,20 @@ class _Readings:
 
 
 def _squares(readings: FloatArray, cells: sparse.csr_array) -> FloatArray:
-    """(4, k) sums of squares of readings (M, 2, k): of both components one by one, then of their sums over cells."""
+    """Return (4, k) sums of squares of observations (M, 2, k): of each component, then of its sums over cells."""
     sums = [cells @ readings[:, component] for component in (0, 1)]
     return np.stack([*(readings**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
 
 
 def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:
-    """Variances (own twice, shared twice), none below zero, of traces @ variances = squares.
+    """Return variances (independent twice, common twice), none negative, of traces @ variances = squares.
 
     Args:
         traces: (4, 4)
         squares: (4,)
-        length: (4,) what each of the squares would be by own parts of variance 1.
-        size: of a cell, as the mean reading has it: the trace of a cell of which the estimate takes nothing. Where it
-            takes much, sums over cells say little, and what was assumed stands.
+        length: (4,) expectation of each of the squares for independent variances of 1.
+        size: mean size of an observation's cell: the trace of a cell without reduction by the estimate. Where the
+            reduction is large, sums over cells contain little information, and the prior dominates.
     """
     told = _TOLD * np.array([1.0, 1.0, size, size]) ** 2
     weighed = traces + np.diag(told)
@@ -149,5 +148,5 @@ def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray
 
 
 def _n_in_cell(cell: IntArray) -> FloatArray:
-    """(M,) how many readings share the cell of each."""
+    """Return (M,) the number of observations in the cell of each."""
     return np.asarray(np.bincount(cell)[cell], dtype=np.float64)

@@ -1,12 +1,12 @@
-"""Does a solve fit together? A check that knows no truth, for solves that may have ended in a wrong place.
+"""Test of goodness of fit without ground truth, for solves that may have converged to a wrong local minimum.
 
-The segments are cut into windows of a few metres, each with its own start and its own place for each tag. In whichever
-valley the whole ended, a window is solved right, and what it leaves over shows how large the noise of wheels and
-readings is. The whole is the same problem under conditions: windows join, and a tag has one place. What the conditions
-cost, in squared sigmas of the noise so fitted, is chi-square with as many degrees of freedom as there are conditions
-(the test of nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise
-is fitted. A reading that is simply wrong costs the same on either side. Errors that neighbouring readings of a tag
-share are invisible one by one, but not where a tag is met again; `correlated_errors` fits how large they are.
+The segments are cut into windows of a few metres, each with its own start and tag positions. Whichever minimum the
+whole converged to, windows converge correctly, and their residuals determine the noise of wheels and observations. The
+whole is the same problem under conditions: windows join, and a tag has one position. The cost of these conditions, in
+squared sigmas of the fitted noise, is chi-square with as many degrees of freedom as there are conditions (the test of
+nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise is fitted. A
+single wrong observation costs the same on either side. Correlated errors of neighbouring observations of a tag do not
+show one by one, but do where a tag is observed again; `correlated_errors` fits their size.
 """
 
 import math
@@ -35,20 +35,20 @@ from groundsbot.offline.sam import (
     stack,
 )
 
-# Long enough for a tag to pass by, short enough that dead reckoning is in the right basin.
+# Long enough for a pass of a tag, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
-# Over which readings of a tag share an error; a window has several to compare.
+# Length over which observations of a tag have correlated errors; a window has several such cells to compare.
 _CELL_M: Final = WINDOW_M / 4.0
-# Once in a thousand good maps.
+# False alarm rate for a good map.
 FALSE_ALARM: Final = 1e-3
-# The sigmas that the estimate was told count like this many measurements of each kind, but not where measurements say
-# that they are ten times off: what counts is drawn to the measurements first, in the same proportion (a prior of which
-# the scale is uncertain too: Gelman et al., "Bayesian Data Analysis", 2013, chapter 5).
+# The prior sigmas count as this many measurements of each kind, unless the data contradict them by a factor of ten: the
+# prior mean is first drawn to the data in the same proportion (a prior with uncertain scale: Gelman et al., "Bayesian
+# Data Analysis", 2013, chapter 5).
 _TOLD: Final = 4.0
-# Fits end where a factor changes by less than this share; far below what the factors' own uncertainty moves the bound.
+# The fit ends when a factor changes by less than this share; far below the effect of its own uncertainty.
 _FACTOR_TOLERANCE: Final = 0.02
 _MAX_FITS: Final = 20
-# Of the solves whose residuals are asked for: what their squares are off by is the root of it.
+# Tolerance of the solves whose residuals are used: the relative error of the squares is its root.
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
 _ROUNDING: Final = 1e-6
@@ -61,14 +61,14 @@ _SEED: Final = 7
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """What it costs that all windows are one map.
+    """Cost of the condition that all windows are one map.
 
     Attributes:
         chi_square: in squared sigmas of the fitted noise.
-        expected: how much of it noise accounts for: the number of conditions.
-        bound: what a good map exceeds once in a thousand times.
-        odometry_factor: the wheels' noise as a multiple of the sigmas that the estimate was told.
-        reading_factor: that of the readings.
+        expected: its expectation: the number of conditions.
+        bound: exceeded by a good map once in a thousand times.
+        odometry_factor: fitted noise of the wheels as a multiple of the given sigmas.
+        reading_factor: that of the observations.
     """
 
     chi_square: float
@@ -79,37 +79,37 @@ class GoodnessOfFit:
 
     @property
     def fits(self) -> bool:
-        """Whether noise accounts for it."""
+        """Whether noise explains the cost."""
         return self.chi_square <= self.bound + _ROUNDING
 
     def warnings(self, name: str) -> list[str]:
-        """A sentence where it does not; `name` is the run's or the component's."""
+        """Return a warning if it does not fit; `name` is the run's or the component's."""
         if self.fits:
             return []
         sentence = (
             f"{name}: its readings contradict each other by more than their noise allows (chi-square "
-            f"{self.chi_square:.0f}, expected {self.expected}, at most {self.bound:.0f}): the solve may have ended in "
-            "a wrong place, tags may have been moved, or wheels or readings err in ways of their own; look at the map "
-            "before you trust it, and drive past known tags more often"
+            f"{self.chi_square:.0f}, expected {self.expected}, at most {self.bound:.0f}): the solve may have converged "
+            "to a wrong place, tags may have been moved, or wheels or tag readings have unmodelled errors. Check the "
+            "map before you use it, and drive past known tags more often"
         )
         return [sentence]
 
 
 @dataclass(frozen=True)
 class Windows:
-    """What the windows of a problem say, whichever valley the whole may end in.
+    """Noise and cost of a problem's windows, independent of the minimum that the whole converges to.
 
     Attributes:
-        problem: the whole, by the sigmas that the estimate was told.
-        losses: of wheels and readings.
-        factors: (2,) the noise of wheels and of readings as a multiple of those sigmas.
-        usual_factors: (2,) the same in most windows, less those that leave most over: a tag that moves, or a robot that
-            is carried, spoils a few of them. 0 where there are too few windows.
-        sharing: (M, 2) what else multiplies each reading's sigmas, for errors that it shares with its neighbours.
-        freedom: what chi-square's degrees of freedom the noise is known like.
-        cost: of all windows apart, under that noise.
-        n_conditions: how many numbers more the windows have to fit with than the whole.
-        effort: what the logs are worth, without end where None, and the share of it that a solve of the whole may take.
+        problem: the whole, under the given sigmas.
+        losses: of wheels and observations.
+        factors: (2,) noise of wheels and of observations as a multiple of the given sigmas.
+        usual_factors: (2,) the same without the windows of largest cost, since a tag that moves or a robot that is
+            carried corrupts a few of them. 0 where there are too few windows.
+        sharing: (M, 2) further factors on each observation's sigmas, for correlated errors of its neighbours.
+        freedom: effective degrees of freedom of the noise estimate.
+        cost: of the separate windows under that noise.
+        n_conditions: number of parameters by which the windows exceed the whole.
+        effort: solve budget of the logs, None if unlimited, and the share of it for a solve of the whole.
     """
 
     problem: Problem
@@ -124,7 +124,7 @@ class Windows:
     share: float = 1.0
 
     def judge(self, state: State) -> GoodnessOfFit:
-        """What it costs to join them in the valley of a state."""
+        """Return the cost of joining the windows at the minimum near a state."""
         problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.sharing)
         most_tries = self.effort.max_linearisations(problem, self.share) if self.effort else MAX_TRIES
         together = solve(problem, state, losses=self.losses, most_tries=most_tries)
@@ -150,20 +150,20 @@ def fit_windows(
     *,
     least_factor: float = 0.0,
 ) -> Windows:
-    """Solves the windows of a problem on their own, from dead reckoning, and fits the noise to what they leave over.
+    """Solve the windows of a problem separately, from dead reckoning, and fit the noise to their residuals.
 
-    What somebody measured is left out on both sides: it is held against the map on its own.
+    Measurements by a person are left out on both sides: they are tested on their own.
 
     Args:
         problem: the whole.
-        losses: of wheels and readings.
-        effort: what the logs are worth, of which a share is for this; without end where None. Where it does not suffice
-            windows are longer, or not solved to their end: the whole then seems to fit better than it does.
-        share: of it.
-        least_shared: (M, 2) variance that a reading shares with its neighbours at least, as a multiple of the told one,
-            by component.
-        least_factor: the noise is taken to be so many times as large as told at least. Where errors last, windows show
-            too little of them: what was fitted to whole drives is then the least.
+        losses: of wheels and observations.
+        effort: solve budget of the logs, of which a share is for this; None: unlimited. Where it does not suffice
+            windows are longer, or not solved to convergence: the whole then seems to fit better than it does.
+        share: of the budget.
+        least_shared: (M, 2) lower bound on the variance that an observation has in common with its neighbours, as a
+            multiple of the given one, by component.
+        least_factor: lower bound on the noise factors. Windows underestimate errors that persist; the noise fitted to
+            whole drives is then a lower bound.
     """
     problem = replace(problem, measured=NO_PRIORS) if len(problem.measured) else problem
     apart = _affordable_windows(problem, effort)
@@ -180,14 +180,15 @@ def fit_windows(
         squares = squares * factors**2
         believed = (squares + _TOLD) / (redundancy + _TOLD)
         found = np.maximum(np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD)), least_factor)
-        # Wheels and readings share out what is left over: one that turns back had gone too far, and half is taken.
+        # Wheels and observations compete for the residuals: a factor that reverses had overshot, so half a step is
+        # taken.
         turns_back = (found / factors - 1.0) * (factors / last - 1.0) < 0.0
         last, factors = factors, np.where(turns_back, np.sqrt(found * factors), found)
         state = solution.state
-        del solution  # and what it takes, before the next one
+        del solution  # frees its memory before the next one
         if left <= 0 or np.abs(factors / last - 1.0).max() < _FACTOR_TOLERANCE:
             break
-    # Drives that only a tape joins have more unknowns together than apart.
+    # Drives that only a tape measurement joins have more unknowns together than apart.
     n_conditions = max(0, freedom_of(problem) - freedom_of(apart))
     sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
     most_tries = max(1, min(left, MAX_TRIES))
@@ -210,7 +211,7 @@ def fit_windows(
 
 
 def _without_the_worst(solution: Solution) -> FloatArray:
-    """(2,) how many times the sigmas of wheels and of readings what windows leave over has, the worst fifth aside."""
+    """Return (2,) factors on the noise of wheels and of observations when the fifth of worst windows is left out."""
     problem, state = solution.problem, solution.state
     begins = np.ones(len(state.poses), dtype=np.bool_)
     begins[problem.odometry.first + 1] = False
@@ -225,28 +226,28 @@ def _without_the_worst(solution: Solution) -> FloatArray:
         n = n[n > 0.0]
         kept = np.argsort(left / n, kind="stable")[: len(n) - math.ceil(_WORST_SHARE * len(n))]
         if len(n) < _FEWEST_WINDOWS:
-            found[kind] = 0.0  # nobody knows what is usual
+            found[kind] = 0.0  # too few windows
         elif left.sum() > 0.0:
             found[kind] = np.sqrt(left[kept].sum() / n[kept].sum() * n.sum() / left.sum())
     return found
 
 
 def _sharing(problem: Problem, solution: Solution, least_shared: FloatArray | float) -> tuple[FloatArray, float]:
-    """Factors on the sigmas of readings, for what neighbours share, and what freedom their variance is known like."""
+    """Return factors on the sigmas of observations for correlated errors, and their effective degrees of freedom."""
     cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
     errors = fit_shared_errors(solution, cell)
     return errors.factors(cell, least_shared), errors.freedom(cell)
 
 
 def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
-    """To where its cost is not yet that of the end, but squares of what is left over are."""
+    """Solve until the squares of the residuals have converged, not yet the cost."""
     solution = solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries)
-    problem.arrowhead.without_scratch()  # who looks at what is left over needs as much room again
+    problem.arrowhead.without_scratch()  # using the residuals needs as much memory again
     return solution
 
 
 def _affordable_windows(problem: Problem, effort: SolveBudget | None) -> Problem:
-    """In windows, which are longer where there is not enough effort for so many tags of their own."""
+    """Return the problem in windows, longer ones where the budget does not suffice for so many separate tags."""
     window_m = WINDOW_M
     apart = in_windows(problem)
     driven_m = float(np.hypot(problem.odometry.motion[:, 0], problem.odometry.motion[:, 1]).sum())
@@ -257,7 +258,7 @@ def _affordable_windows(problem: Problem, effort: SolveBudget | None) -> Problem
 
 
 def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
-    """The same poses cut into windows: no motion leads from one to the next, and each has tags of its own."""
+    """Return the same poses cut into windows: no motion connects two windows, and each has its own tags."""
     window = _window_of_pose(problem, window_m)
     odometry, readings = problem.odometry, problem.readings
     inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
@@ -284,7 +285,7 @@ def _part(odometry: OdometryFactors, which: BoolArray | slice) -> OdometryFactor
 
 
 def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
-    """(P,) rising numbers, a new one at each segment's start."""
+    """Return (P,) increasing window numbers, a new one at each segment's start."""
     n_poses = len(problem.columns.poses)
     driven_m, follows = np.zeros(n_poses), np.zeros(n_poses, dtype=np.bool_)
     after = problem.odometry.first + 1
@@ -300,13 +301,13 @@ def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
 
 
 def _track_numbers(part: IntArray, tag: IntArray) -> IntArray:
-    """(M,) a number of its own for each tag in each part of the way, from 0 without gaps."""
+    """Return (M,) a number for each tag in each part of the path, from 0 without gaps."""
     _, number = np.unique(part * (int(tag.max(initial=0)) + 1) + tag, return_inverse=True)
     return np.asarray(number, dtype=np.int64)
 
 
 def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
-    """Each window's first pose is held."""
+    """Return the columns of free variables; each window's first pose is fixed."""
     free = np.append(False, window[1:] == window[:-1])
     poses = np.where(free[:, None], 3 * (np.cumsum(free) - 1)[:, None] + np.arange(3), -1)
     n = 3 * int(free.sum())
@@ -316,7 +317,7 @@ def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
 
 
 def _dead_reckon(problem: Problem, windows: Problem) -> State:
-    """Motions one after the other, by nominal calibration; tags where their readings put them on average."""
+    """Return the state of dead reckoning at nominal calibration, with tags at the mean of their observations."""
     first, motion = problem.odometry.first, problem.odometry.motion
     poses = np.zeros((len(problem.columns.poses), 3))
     for part in np.split(np.arange(len(first)), np.flatnonzero(np.diff(first) != 1) + 1):
@@ -331,22 +332,22 @@ def _dead_reckon(problem: Problem, windows: Problem) -> State:
 
 
 def _scale_noise(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
-    """With the noise of wheels and readings so many times as large; (M, 2) where readings differ in that."""
+    """Return the problem with the noise of wheels and observations scaled; (M, 2) where observations differ."""
     by_row = np.broadcast_to(reading_factor, problem.readings.value.shape)[..., None]
     odometry, readings = problem.odometry.whitening / odometry_factor, problem.readings.whitening / by_row
     return problem.reweigh(odometry, readings)
 
 
 def freedom_of(problem: Problem) -> int:
-    """Measured numbers, priors included, over unknowns."""
+    """Return the number of measurements, priors included, less the number of unknowns."""
     return problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
 
 
 def _mean_squares(solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """Losses (2,) of wheels and readings at the solution, and how much of them noise accounts for.
+    """Return losses (2,) of wheels and observations at the solution, and their redundancies (2,).
 
-    The latter is the number of residuals less the trace of J H^-1 J^T, an average over random signs z of
-    z^T J H^-1 J^T z (Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1989).
+    The redundancy is the number of residuals less the trace of J H^-1 J^T, an average over random signs z of z^T J H^-1
+    J^T z (Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1989).
     """
     problem, state = solution.problem, solution.state
     odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))

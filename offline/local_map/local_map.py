@@ -1,12 +1,10 @@
-"""One segment solved alone, in the frame of its start.
+"""Solve one segment alone, in the frame of its start.
 
-A long drive past few tags has many valleys. It is built up piece by piece on a few of its keyframes; where the solve
-from there does not fit together, the drive is built up again under the noise that its windows show, with other draws of
-the wheels' errors, until one fits.
+A long drive past few tags has many local minima. It is solved incrementally on a few of its keyframes. Where the solve
+from there does not fit, this is repeated under the noise of its windows, with perturbed odometry, until one fits.
 
-Readings that contradict each other everywhere make each of these solves take a hundred steps, where those of a drive
-take four. So that a small file of them does not take minutes, all of it shares the effort that the log is worth: solves
-end early, and the map says that they did.
+Where observations contradict each other everywhere, each of these solves takes a hundred steps instead of four. So that
+a small file of them does not take minutes, all share the log's budget: they end early, and the map reports it.
 """
 
 from dataclasses import dataclass, replace
@@ -40,31 +38,31 @@ from groundsbot.offline.sam import (
     solve,
 )
 
-# A segment is built up in pieces over which dead reckoning stays near the right minimum: no longer than this, and no
-# farther than its heading is known to this sigma, under the noise and the wheels' calibration as the pieces before tell
-# it. They grow with the distance, so that the time does not grow with its square.
+# A segment is solved incrementally in pieces over which dead reckoning stays in the basin of the right minimum: at most
+# this long, and at most as long as its heading is known to this sigma, under the noise and the wheel calibration from
+# the previous pieces. They grow with the distance, so that the time does not grow with its square.
 _PIECE_M: Final = 10.0
 _PIECE_SHARE: Final = 0.01
 _PIECE_HEADING_RAD: Final = 0.3
-# In squared sigmas: a piece is only the next one's start.
+# In squared sigmas: a piece only initialises the next.
 _PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
-# A piece takes three to five steps on any drive, of one try each.
+# A piece takes three to five steps on any drive, with one linearisation each.
 _MOST_TRIES_A_PIECE: Final = 60
-# Of the effort that a log is worth.
+# Shares of the log's solve budget.
 _BUILDING_SHARE: Final = 0.5
 _WINDOWS_SHARE: Final = 0.2
-_SOLVING_SHARE: Final = 0.1  # it is solved some times
-# Where windows show that the noise is far larger than told, other starts end with the first that does not lower the
-# cost by this share: it is noise that is left.
+_SOLVING_SHARE: Final = 0.1  # it is solved several times
+# Where windows show far more noise than given, other starts end with the first that does not lower the cost by this
+# share: what remains is noise.
 _MOST_IN_VAIN: Final = 1
 _LEAST_GAIN: Final = 0.01
-# Building up allows for the noise that windows show where it is so many times as large as told. Where it is not much
-# more, that would leave room for wrong places.
+# The incremental solve uses the noise of the windows where it is larger than given by this factor. Below it, the larger
+# noise would admit wrong minima.
 _FAR_LARGER: Final = 1.5
-# Of pixels: what corners err by beyond that is something else's error, the stamp's, the tag's or the mount's.
+# Corner errors in pixels beyond this have another cause: the stamp, the tag or the mount.
 _MOST_CORNER_PX: Final = 1.0
-# Keyframes that the test of goodness looks at, spread over the drive where there are more.
+# Largest number of keyframes for the test of goodness of fit, spread over the drive.
 _MOST_CHECKED: Final = 2500
 _LEAST_SHARE: Final = 0.25
 _NEXT_SHARE: Final = 1.4
@@ -72,39 +70,39 @@ _NEXT_SHARE: Final = 1.4
 
 @dataclass(frozen=True)
 class LocalMap:
-    """A segment in the frame of its start, and whether its readings fit together there."""
+    """A segment solved in the frame of its start, and its goodness of fit."""
 
     segment: Segment
     graph: Graph
     solution: Solution
     goodness: GoodnessOfFit
-    is_noisy: bool = False  # its windows show far more noise than was told: that comes first, what does not fit after
-    whole: Segment | None = None  # with readings that nothing confirms, where these were left out of a noisy one
-    n_misread: int = 0  # readings that were left out of it since they are of another tag, or of none
-    is_doubtful: bool = False  # it does not fit even under the noise that was fitted to it: no tag of it is named
+    is_noisy: bool = False  # its windows show far more noise than given, so the noise is fitted before outliers
+    whole: Segment | None = None  # with unconfirmed observations, where these were left out of a noisy segment
+    n_misread: int = 0  # observations left out as those of another tag, or of none
+    is_doubtful: bool = False  # it does not fit even under its fitted noise, so none of its tags is named an outlier
 
     @property
     def T_start_base(self) -> FloatArray:
-        """(K, 3) of the keyframes."""
+        """Poses (K, 3) of the keyframes."""
         return self.solution.state.poses
 
     @property
     def tags_m(self) -> dict[TagKey, FloatArray]:
-        """Each tag (2,) in the frame of the start."""
+        """Position (2,) of each tag in the frame of the start."""
         return self.graph.tags_of(self.solution.state)
 
     @property
     def calibration(self) -> dict[Parameter, float]:
-        """What the segment says of the calibration."""
+        """Calibration estimated from the segment."""
         return self.graph.calibration_of(self.solution.state)
 
     def without_factors(self) -> "LocalMap":
-        """The same, less the factorisation that its solution keeps for whoever asks again: it may be most of a map."""
+        """Return the map without the cached factorisation of its solution, which may be most of its memory."""
         return replace(self, solution=replace(self.solution))
 
 
 class _PartialMap(NamedTuple):
-    """What is known of a segment as far as it has been built up."""
+    """Incremental solution of a segment so far."""
 
     poses: FloatArray
     odometry_calibration: FloatArray
@@ -113,19 +111,19 @@ class _PartialMap(NamedTuple):
 
 
 def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
-    """Solves the whole segment from where building up leads.
+    """Solve the whole segment from the incremental solution.
 
-    Where the result does not fit together, other starts are tried, as long as there is effort for building up; the
-    first that fits counts, else the one of least cost, whose `goodness` then says that it does not fit.
+    Where the result does not fit, other starts are tried as long as the budget for incremental solves lasts. The first
+    that fits is returned, else that of least cost, whose `goodness` then does not fit.
 
     Args:
-        segment: what was measured.
-        effort: what the segment is worth; the whole log's where None.
-        noise_is_open: the noise that the segment is under is a first guess, to be fitted later. Where its windows show
-            far more, it is taken for unknown, as it always is for robots that nobody measured.
+        segment: the measurements.
+        effort: budget of the segment; the whole log's where None.
+        noise_is_open: the segment's noise is a first guess, to be fitted later. Where its windows show far more, it is
+            taken as unknown, as it always is for uncalibrated robots.
 
     Raises:
-        OfflineError: there are more readings than a log of this size can be worth.
+        OfflineError: there are more observations than a log of this size can pay for.
     """
     effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     effort.check(build_graph([segment]).problem, segment.run.log, segment.name)
@@ -161,7 +159,7 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
 
 
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
-    """The map of noisy ranges solved again, with what depends on ranges taken at those of the map."""
+    """Return the map of noisy ranges solved again, with what depends on ranges evaluated at those of the map."""
 
     def with_solved_ranges(segment: Segment) -> Segment:
         graph = build_graph([segment])
@@ -182,12 +180,12 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> Lo
 
 
 class WindowNoise(NamedTuple):
-    """What the windows of a segment show of its noise.
+    """Noise of a segment estimated from its windows.
 
     Attributes:
-        is_far_larger: far larger than was told, so that it is taken for unknown.
-        factors: of wheels and readings, as multiples of what was told.
-        added: names of the noise of positions that corners err by besides.
+        is_far_larger: far larger than given, so that it is taken as unknown.
+        factors: of wheels and observations, as multiples of the given noise.
+        added: names of the position noise that corners have in addition.
     """
 
     is_far_larger: bool
@@ -195,7 +193,7 @@ class WindowNoise(NamedTuple):
     added: tuple[str, ...]
 
     def apply_to(self, segment: Segment) -> tuple[Segment, Segment | None]:
-        """The segment to solve and, where its noise is unknown, the one with readings that nothing confirms."""
+        """Return the segment to solve and, where its noise is unknown, the one with unconfirmed observations."""
         if not self.is_far_larger:
             return segment, None
         whole = segment.with_position_noise(self.added)
@@ -203,19 +201,17 @@ class WindowNoise(NamedTuple):
 
 
 def noise_of_windows(segment: Segment) -> WindowNoise:
-    """What the windows show, where the noise that the segment is under is a first guess."""
+    """Return the noise from windows of a segment whose given noise is a first guess."""
     effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     return _noise_of_windows(segment, effort, noise_is_open=True)[0]
 
 
 def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solution]:
-    """The segment solved once from where building up leads, whether it fits together or not."""
+    """Solve the segment once from the incremental solution, whether it fits or not."""
     effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
-    if shown.is_far_larger:  # under too small a noise a wrong minimum far off the priors costs less than the right one
-        wheels, readings = (
-            shown.factors
-        )  # within a window errors that last do not show: readings are no better than told
+    if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
+        wheels, readings = shown.factors  # persistent errors do not show in windows: never below the given noise
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, readings)))
     graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
     known = _build_up(coarsen(segment, keyframes), effort)
@@ -225,7 +221,7 @@ def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solutio
 
 
 def with_goodness_of_fit(local_map: LocalMap, effort: SolveBudget | None = None) -> LocalMap:
-    """The map with its test of goodness of fit made again, under the noise that was fitted to whole drives."""
+    """Return the map with a new test of goodness of fit, under the noise that was fitted to whole drives."""
     segment = local_map.segment
     effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, effort, least_factor=1.0)
@@ -235,7 +231,7 @@ def with_goodness_of_fit(local_map: LocalMap, effort: SolveBudget | None = None)
 
 
 def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
-    """What the windows show, and the check of solutions of the segment that `ShownNoise.applied_to` returns."""
+    """Return the noise from windows, and the test for solutions of the segment that `WindowNoise.apply_to` returns."""
     is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
     likely = without_unconfirmed_tracks(segment) if is_left_open else segment
@@ -252,7 +248,7 @@ def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: b
 
 
 class _Check:
-    """Tests the goodness of fit of solutions of a segment, without most of the poses from which no tag was observed."""
+    """Test of solutions of a segment, without most of the poses that observe no tag and have little information."""
 
     def __init__(self, graph: Graph, effort: SolveBudget, least_factor: float = 0.0) -> None:
         (segment,) = graph.segments
@@ -265,7 +261,7 @@ class _Check:
         if len(self._keyframes) < len(segment.stamps_ns):
             segment = coarsen(segment, self._keyframes)
             graph = build_graph([segment])
-        # Tags whose few readings all fall out are not in the windows, nor is what only these depend on.
+        # Tags that lose all observations are not in the windows, nor are parameters that only these depend on.
         self._tags = np.array([whole.tags.index(tag) for tag in graph.tags], dtype=np.int64)
         self._calibration = np.array([whole.parameters.index(each) for each in graph.parameters], dtype=np.int64)
         self._windows: Windows = fit_windows(
@@ -278,13 +274,13 @@ class _Check:
 
     @property
     def noise_factors(self) -> tuple[float, float]:
-        """The noise of wheels and of readings as a multiple of what was told."""
+        """Noise of wheels and of observations as a multiple of the given noise."""
         wheels, readings = self._windows.factors.tolist()
         return wheels, readings
 
     @property
     def usual_noise_factors(self) -> tuple[float, float]:
-        """The same in most of the windows."""
+        """The same without the worst windows."""
         wheels, readings = self._windows.usual_factors.tolist()
         return wheels, readings
 
@@ -296,7 +292,7 @@ class _Check:
 
 
 def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
-    """The segment under the noise that its windows show: where far more is allowed for, wrong valleys fit as well."""
+    """Return the segment under the noise that its windows show: too large a noise makes wrong minima fit as well."""
     of_wheels, of_readings = factors
     return replace(
         segment,
@@ -306,14 +302,14 @@ def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
 
 
 def _redrawn(segment: Segment, rng: np.random.Generator) -> Segment:
-    """The segment with one more draw of the wheels' noise: as likely a drive, whose valleys lie elsewhere."""
+    """Return the segment with another draw of the wheels' noise: an equally likely drive with other local minima."""
     odometry = segment.odometry
     error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
 def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
-    """Solves the segment piece by piece, each from the solution of the last; dead reckoning where effort ends."""
+    """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget."""
     known = _PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
     pieces, n_keyframes = _BuildUpSteps(segment), 1
@@ -336,22 +332,22 @@ def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
 
 
 class _BuildUpSteps:
-    """Numbers of keyframes at which building up stops and solves; the last is all of them.
+    """Numbers of keyframes at which the incremental solve stops; the last is all of them.
 
     Attributes:
-        covariance: (P, P) of the odometry's parameters, as far as they are known; at first as robot.yaml says.
+        covariance: (P, P) of the odometry's parameters, as estimated so far; initially that of robot.yaml.
     """
 
     def __init__(self, segment: Segment) -> None:
         self._along_m = segment.along_m
         odometry = segment.odometry
-        # Of the heading at each keyframe: its derivative by the wheels' parameters, and the variance of its noise.
+        # Of the heading at each keyframe: its derivative by the wheels' parameters, and its noise variance.
         self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
         self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
         self.covariance = np.diag([each.sigma**2 for each in odometry_parameters_of(segment)])
 
     def next_end(self, n_keyframes: int) -> int:
-        """Where the piece after so many keyframes ends."""
+        """Return the end of the piece after this many keyframes."""
         last, rest = n_keyframes - 1, slice(n_keyframes, None)
         way_m, grown_m = self._along_m[rest] - self._along_m[last], _PIECE_SHARE * self._along_m[rest]
         by_wheels = self._by_wheels[rest] - self._by_wheels[last]
@@ -363,7 +359,7 @@ class _BuildUpSteps:
 
 
 def _extend(part: Segment, poses: FloatArray, odometry_calibration: FloatArray) -> FloatArray:
-    """Poses of a longer segment: those known, then dead reckoning from the last one."""
+    """Return poses of a longer segment: the known ones, then dead reckoning from the last one."""
     n_known = len(poses)
     rest = part.odometry.motion[n_known - 1 :]
     if not len(rest):

@@ -1,4 +1,4 @@
-"""The conductor: runs in, a map out, each block called in order.
+"""The mapping pipeline: calls each block in order.
 
 In: runs and options. Out: `MapResult`, with the findings of each block as warnings. In the paper: the figure of the
 whole system. Read `pipeline.build_map` first.

@@ -1,4 +1,4 @@
-"""What the components of a map say, gathered for the result."""
+"""Results and warnings of a map's components, collected for the typed result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,7 @@ from groundsbot.offline.sam import Solution
 
 @dataclass
 class Findings:
-    """What the components gave, one after the other."""
+    """Results of the components, in their order."""
 
     components: list[Component] = field(default_factory=list)
     suspects: list[SuspectTag] = field(default_factory=list)
@@ -52,7 +52,7 @@ class Findings:
     def take(
         self, maps: Sequence[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
     ) -> SolvedGroup:
-        """Takes what one more component says."""
+        """Add the results of one more component."""
         index = len(self.components)
         members, graph, solution, suspects, refined, told, left_out = solved
         self.suspects += suspects
@@ -73,8 +73,8 @@ class Findings:
             self.checks += [replace(each, sigma=factor**0.5 * each.sigma) for each in checks_of(graph, solution, index)]
             self.metres.append(scale_budget(graph, index))
         is_refined, poses = refined is not None, last.state.poses
-        del solved, refined, last  # the factor on corners, which nothing below asks
-        if not is_refined:  # else the map's sigmas are not those that advice is foretold from
+        del solved, refined, last  # frees the factorisation on corners, unused below
+        if not is_refined:  # else the map's sigmas are not those that advice predicts from
             with stages.stage("advice"):
                 self.advice += [_inflate_sigmas(each, factor**0.5) for each in advise(graph, solution, index)]
         if not solution.converged:
@@ -87,18 +87,18 @@ class Findings:
 
 
 def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
-    """Whether several drives fit together that do so each by itself; None where there are none."""
+    """Return the goodness of fit of several drives together; None for one drive, or if one alone does not fit."""
     if len(maps) == 1 or not all(each.goodness.fits for each in maps):
         return None
     return joint_goodness_of_fit(maps, solution)
 
 
 def _contradictions(maps: Sequence[LocalMap], component: int, together: GoodnessOfFit | None) -> list[str]:
-    """Drives that do not fit together in themselves, and a component that does not though its drives do."""
+    """Return warnings about drives that do not fit alone, or about a component whose drives fit only alone."""
     found = [w for each in maps for w in each.goodness.warnings(each.segment.name)]
     return found if together is None else found + together.warnings(f"component {component}")
 
 
 def _inflate_sigmas(advice: AdviceResult, sigma_factor: float) -> AdviceResult:
-    """What it tells of sigmas, in those that are reported."""
+    """Return advice with its sigmas scaled to the reported ones."""
     return replace(advice, sigma_m=sigma_factor * advice.sigma_m, sigma_then_m=sigma_factor * advice.sigma_then_m)

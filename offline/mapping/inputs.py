@@ -1,4 +1,4 @@
-"""The runs of a map: read, and refused where they cannot go into one map, or not into a kept one."""
+"""Read the runs of a map, and refuse those that cannot go into one map, or not into an archived one."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from groundsbot.onboard.log import Allowance
 
 
 def check_distinct(runs: Sequence[Run]) -> None:
-    """Refuses a drive that is given twice, and runs and segments that would have one name."""
+    """Refuse a drive that is given twice, and runs and segments that would have the same name."""
     if not runs:
         raise OfflineError("no log given; name at least one log file or run folder")
     seen: dict[str, Run] = {}
@@ -28,11 +28,11 @@ def check_distinct(runs: Sequence[Run]) -> None:
             if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
                 raise OfflineError(
                     f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
-                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them apart"
+                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them separately"
                 )
             raise OfflineError(
                 f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
-                "leave one out, or a drive would count as two"
+                "leave one out"
             )
         seen[run.name] = run
     for run in runs:
@@ -40,27 +40,26 @@ def check_distinct(runs: Sequence[Run]) -> None:
         if later and later[1] in seen:
             raise OfflineError(
                 f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a segment of {later[1]}, which "
-                f"{seen[later[1]].log} is; map them apart"
+                f"{seen[later[1]].log} is; map them separately"
             )
 
 
 def check_new(
     runs: Sequence[Run], extending: MapResult, noise: NoiseParameters | None, *, corners: bool, calibrate: Calibrate
 ) -> None:
-    """Refuses runs that a map has already, such as say other sizes of its tags, other noise, corners, calibrating."""
+    """Refuse runs that the map has already, other tag sizes, and options that extending does not support."""
     check_extendable(extending)
     if corners:
-        raise OfflineError("--model corners: a kept map does not hold corners; map all logs anew, or leave it out")
+        raise OfflineError("--model corners: the map to extend has no corners; map all logs anew, or leave it out")
     if calibrate.names:
-        raise OfflineError("--calibrate: a kept map has its calibration; map all logs anew, or leave it out")
+        raise OfflineError("--calibrate: the map to extend is calibrated already; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
     names = {name for each in extending.kept for name in (each.run, each.name)}
     for run in runs:
         if run.name in names:
             raise OfflineError(
-                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out, or a drive "
-                "would count as two"
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already; leave it out"
             )
         check_sizes_in_map(run, extending)
 
@@ -68,12 +67,12 @@ def check_new(
 def read_runs(
     logs: Sequence[Path], robot_files: Mapping[str, RobotFile] | None = None, stages: Stages | None = None
 ) -> list[Run]:
-    """Reads logs for `build_map`, which sets the map in the frame of the first one's start.
+    """Read logs for `build_map`, whose frame is the start of the first.
 
     Args:
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
-        stages: told what is being done, and keeps what it took.
+        stages: notified of progress, and records times.
 
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.
@@ -92,7 +91,7 @@ def read_runs(
 
 
 def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:
-    """Refuses a robot.yaml that no log is of.
+    """Refuse a robot.yaml of a robot that is in no log.
 
     Raises:
         OfflineError: naming it, and the robots of the logs.
@@ -107,7 +106,7 @@ def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> N
 
 
 def check_tag_sizes(runs: Sequence[Run]) -> None:
-    """Refuses detections whose tag has no size, and runs that disagree about a tag's size.
+    """Refuse detections whose tag has no size, and runs that disagree about a tag's size.
 
     Raises:
         GroundsbotError: naming the run, the tag and the sizes.

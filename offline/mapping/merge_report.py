@@ -1,4 +1,4 @@
-"""What merging found, in words for a person and typed for the result."""
+"""Result of merging, as warnings and as typed results."""
 
 from collections.abc import Collection, Sequence
 from math import degrees
@@ -10,12 +10,12 @@ from groundsbot.offline.maps import AlignmentResult, AlternativeResult
 from groundsbot.offline.measurements import TagKey
 
 _TOO_LONG = (
-    "that takes more work than logs of their size are worth; map fewer drives at once and add the others by --extend"
+    "this exceeds the work budget for logs of their size; map fewer drives at once and add the others by --extend"
 )
 
 
 def alignment_results(maps: Sequence[LocalMap], merged: Merge) -> tuple[AlignmentResult, ...]:
-    """Each pair in which any two tags fit together."""
+    """Return a result for each pair in which any two tags fit together."""
     return tuple(_result(maps, pair, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
 
 
@@ -25,12 +25,12 @@ def merge_warnings(
     named: Collection[tuple[str, int]] = (),
     not_joined: Sequence[TagJoin] | None = None,
 ) -> list[str]:
-    """Tags that lie elsewhere, alignments that are ambiguous or contradict others, and why components are apart.
+    """Return warnings about moved tags, ambiguous or contradictory alignments, and components that are not joined.
 
     Args:
         maps: that were merged.
         merged: the result.
-        named: family and id of tags of which nothing more is to be said.
+        named: family and id of tags that other warnings name.
         not_joined: over single tags, with their reasons; None: that was not tried.
     """
     component = {m: i for i, group in enumerate(merged.groups) for m in group.members}
@@ -42,7 +42,7 @@ def merge_warnings(
         if alignment.is_sure:
             warnings += _elsewhere(maps, pair, alignment, named)
         elif component[pair.a] == component[pair.b]:
-            warnings.append(f"{_reason_not_joined(maps, pair)}; other runs join them")
+            warnings.append(f"{_reason_not_joined(maps, pair)}; they are joined by other runs")
     warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
     for i, group in enumerate(merged.groups[1:], start=1):
         warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
@@ -52,7 +52,7 @@ def merge_warnings(
 def reason_apart(
     maps: Sequence[LocalMap], merged: Merge, group: Group, not_joined: Sequence[TagJoin] | None = None
 ) -> str:
-    """Why a component is one of its own, told of the pair that is nearest to joining it, and what would help."""
+    """Return why a component is not joined, for the pair that is nearest to joining it, and what would help."""
     crossing = [pair for pair in merged.pairs if (pair.a in group.members) != (pair.b in group.members)]
     if crossing:
         names = {maps[m].segment.name for m in group.members}
@@ -61,12 +61,12 @@ def reason_apart(
         if len(nearest.shared) > 1:
             return why
         if not_joined is None and all(maps[m].graph.has_corners for m in (nearest.a, nearest.b)):
-            return f"{why}, and --model corners may do with the one"
+            return f"{why}, and with --model corners the one may suffice"
         tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
         return tried[0] if tried else why
     name = maps[group.members[0]].segment.name
     if not any(maps[m].graph.tags for m in group.members):
-        return f"{name} saw no tag, so nothing ties it to the other runs; it is kept as a trajectory of its own"
+        return f"{name} saw no tag, so nothing connects it to the other runs; it is a separate trajectory"
     return f"{name} shares no tag with the others; drive it past two tags that another run saw"
 
 
@@ -75,7 +75,7 @@ def _not_searched(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
     if not left:
         return []
     a, b = (maps[m].segment.name for m in (left[0].a, left[0].b))
-    told = f"{len(left)} of {len(merged.pairs)} pairs of drives that share tags were not laid over each other"
+    told = f"{len(left)} of {len(merged.pairs)} pairs of drives that share tags were not aligned with each other"
     return [f"{told}, {a} and {b} among them: {_TOO_LONG}"]
 
 
@@ -85,12 +85,12 @@ def _nearness(pair: PairAlignment) -> tuple[float, int]:
 
 
 def _reason_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
-    """Why a pair is not joined; the first name is one of `told_of`."""
+    """Return why a pair is not joined; the first name is one of `told_of`."""
     a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
     if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
         a, b = b, a
     if not pair.is_searched:
-        return f"{b} shares {len(pair.shared)} tags with {a}, but was not laid over it: {_TOO_LONG}"
+        return f"{b} shares {len(pair.shared)} tags with {a}, but was not aligned with it: {_TOO_LONG}"
     return reason_not_joined(a, b, pair.shared, pair.alignment)
 
 
@@ -99,8 +99,8 @@ def _elsewhere(
 ) -> list[str]:
     a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
     return [
-        f"tag {tag.tag_id} lies {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
-        "moved between the runs, or carried about?"
+        f"tag {tag.tag_id} is {off_m:.2f} m ({sigmas:.0f} sigma) elsewhere in {b} than in {a}: "
+        "was it moved between or during the runs?"
         for tag, fits, off_m, sigmas in zip(
             alignment.shared, alignment.inlier, alignment.off_m, alignment.off_sigmas, strict=True
         )
@@ -115,7 +115,7 @@ def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
         gap_m, turn_deg = float((each.gap[:2] ** 2).sum() ** 0.5), abs(degrees(each.gap[2]))
         a, b = (maps[m].segment.name for m in (each.link.a, each.link.b))
         warnings.append(
-            f"the alignments of {ring} contradict each other (their ring gapes by {gap_m:.2f} m and {turn_deg:.1f} "
+            f"the alignments of {ring} contradict each other (around the cycle by {gap_m:.2f} m and {turn_deg:.1f} "
             f"deg, {each.sigmas:.0f} sigma); that of {a} with {b} was left out"
         )
     return warnings

@@ -1,4 +1,4 @@
-"""Logs in, map out: runs -> segments -> local maps -> alignments -> components -> one global solve each."""
+"""The mapping pipeline: runs -> segments -> local maps -> alignments -> components -> one joint solve each."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -65,21 +65,21 @@ def build_map(
     workings: Diagnostics | None = None,
     extending: MapResult | None = None,
 ) -> MapResult:
-    """Turns runs into one map in the frame of the first run's start.
+    """Turn runs into one map in the frame of the first run's start.
 
     Args:
         runs: of `load_run` or `read_runs`.
-        noise: sigmas of wheels and readings; None: they are fitted to the runs.
-        stages: told what is being done, and keeps what it took.
-        tape: what somebody measured.
-        prior_noise: where the fit begins, and what stays where the runs tell nothing.
-        keep_suspects: tags that do not belong are named only, not told apart from what they were.
-        corners: the solved map is refined on the tags' corners, where logs have them.
-        upright_sigma_rad: to which tags are known to hang upright, which corners then respect; None: they may hang
-            anyhow.
-        calibrate: which numbers of robot.yaml the drives may set.
-        workings: takes what the map was made from.
-        extending: a map that was kept, whose runs come first, and under whose noise all is solved.
+        noise: sigmas of wheels and tag observations; None: they are fitted to the runs.
+        stages: notified of progress, and records times.
+        tape: measurements by a person.
+        prior_noise: initial value of the fit, and prior where the runs contain no information.
+        keep_suspects: only name outlier tags, without splitting them off.
+        corners: refine the solved map on the tags' corners, where logs have them.
+        upright_sigma_rad: sigma of the tags' tilt where they are known to be upright, used with corners; None: any
+            tilt.
+        calibrate: which parameters of robot.yaml the drives may correct.
+        workings: filled with diagnostics of the map.
+        extending: an archived map, whose runs come first, and under whose noise all is solved.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -90,7 +90,7 @@ def build_map(
     noise_fit = None
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
-        calibrate = Calibrate()  # a kept map has its calibration
+        calibrate = Calibrate()  # an archived map has its calibration
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_options_of(extending, tape)
     workings = workings or Diagnostics()
     workings.runs += runs
@@ -117,7 +117,7 @@ def build_map(
     workings.maps += maps
     joined = join_results(components, joins)
     found = Findings()
-    while components:  # each is let go of where it has told its part: a factor on corners may take 100 MiB
+    while components:  # each is freed once it is reported: its factor on corners may take 100 MiB
         workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
     found.measured += unused_measurements(measurements, found.measured)
     found.warnings += join_warnings(joins, joined)
@@ -147,7 +147,7 @@ def build_map(
 def _calibrate_runs(
     runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
 ) -> tuple[FreedRobots, list[Segment]]:
-    """The runs as their robots are to be taken, and their segments."""
+    """Return the runs with start values and freed parameters, and their segments."""
     with stages.stage("start values of robots"):
         runs, started, searches = start_left_open(runs, noise)
     found = FreedRobots(runs, started, put_right(started), searches)
@@ -161,7 +161,7 @@ def _calibrate_runs(
 
 
 def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Segment]:
-    """All segments of the runs, two tags with one id apart."""
+    """Return all segments of the runs, with two tags of the same id split."""
     segments: list[Segment] = []
     with stages.stage("keyframes and readings", len(runs)) as done:
         for run in runs:
@@ -181,7 +181,7 @@ def _measurements(
 
 
 def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMap]:
-    """The local maps of a map that is extended, under the noise that it was kept with."""
+    """Return the local maps of a map that is extended, under the noise they were archived with."""
     if extending is None:
         return []
     with stages.stage("the map that is extended"):
@@ -189,9 +189,9 @@ def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMa
 
 
 class _SolvedTogether(NamedTuple):
-    """Local maps, how they were aligned and solved together, and which single tags were asked to join components."""
+    """Local maps, their merge and solved components, and the single tags that were tried to join components."""
 
-    maps: list[LocalMap]  # tags apart that lie elsewhere than in the other maps
+    maps: list[LocalMap]  # with tags split that are elsewhere in other maps
     merged: Merge
     components: list[SolvedComponent]
     joins: list[TagJoin]
@@ -206,7 +206,7 @@ def _align_and_solve(
     corners: bool,
     upright_sigma_rad: float | None,
 ) -> _SolvedTogether:
-    """Aligns local maps and solves each group that hangs together; on corners a single tag may join two of them."""
+    """Align local maps and solve each group; on corners a single tag may join two groups."""
     with stages.stage("aligning local maps"):
         merged = merge(maps, measurements.placements([each.segment.name for each in maps]))
         maps = with_outliers_apart(maps, merged)

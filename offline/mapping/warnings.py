@@ -1,4 +1,4 @@
-"""All that a person must be told of a map, in one list."""
+"""All warnings of a map, in one list."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ def map_warnings(
     found: Findings,
     not_joined: Sequence[TagJoin] | None,
 ) -> tuple[str, ...]:
-    """All that a person must be told, in the order in which it came up, each sentence once."""
+    """Return all warnings in the order of their origin, each sentence once."""
     segments = [each.segment for each in maps]
     warnings = (
         [w for run in runs for w in run.warnings] + [*broken] + [w for segment in segments for w in segment.warnings]
@@ -35,14 +35,14 @@ def map_warnings(
 
 
 def _in_one_place(found: Findings) -> set[tuple[str, int]]:
-    """Family and id of tags that all drives of a component together have in one place, whatever two of them had."""
+    """Return family and id of tags that are in one place in every component, whatever two of its drives had."""
     n_places = [Counter((tag.family, tag.tag_id) for tag in component.tags) for component in found.components]
     several = {each for counts in n_places for each, n in counts.items() if n > 1}
     return {each for counts in n_places for each in counts} - several
 
 
 def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Sequence[ConsistencyCheck]) -> list[str]:
-    """Corrections that what was known beforehand makes all but impossible, but for those that a check tells of."""
+    """Return warnings about corrections that the priors make nearly impossible, unless a check reports them."""
     told = {
         (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)
         for check in checks
@@ -50,8 +50,8 @@ def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Seque
         for name in COMPARED[check.name]
     }
     return [
-        f"{entry.name} of {entry.owner} came out at {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} "
-        "times the sigma it was given: wheels and tags contradict each other, or the file is of another robot"
+        f"{entry.name} of {entry.owner} is {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} times its "
+        "given sigma: wheels and tags contradict each other, or the file is of another robot"
         for entry in calibration
         if abs(entry.value) > MAX_SIGMAS * entry.prior_sigma and (entry.component, entry.owner, entry.name) not in told
     ]
@@ -63,9 +63,9 @@ def _segment_warnings(segments: Sequence[Segment]) -> list[str]:
         if segment.along_m[-1] < 0.05:
             warnings.append(f"{segment.name} never moves (its wheels turned less than 5 cm)")
         if not segment.tags and len(segments) == 1:
-            warnings.append(f"{segment.name} saw no tag: its trajectory is what the wheels say, nothing corrects them")
+            warnings.append(f"{segment.name} saw no tag: its trajectory is dead reckoning by the wheels, uncorrected")
         if len(segment.tags) == 1:
             warnings.append(
-                f"{segment.name} saw a single tag, {segment.tags[0].tag_id}; two would fix its place among other runs"
+                f"{segment.name} saw a single tag, {segment.tags[0].tag_id}; two are needed to align it with other runs"
             )
     return warnings

@@ -1,4 +1,4 @@
-"""What a map was made from, kept for those who want to look inside: the report and the advice."""
+"""Diagnostics of a map, for the report and the advice."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,10 +15,10 @@ class SolvedGroup(NamedTuple):
     """One component, as it was solved.
 
     Attributes:
-        group: indices into `Workings.maps`, and where the alignments put their starts.
+        group: indices into `Diagnostics.maps`, and where the alignments put their starts.
         graph: its segments are the group's members in order, its tags those of the component in order.
         solution: of that graph.
-        poses: (P, 3) of its keyframes as the map has them: refined on corners where that was possible.
+        poses: (P, 3) of its keyframes in the map: refined on corners where possible.
     """
 
     group: Group
@@ -27,7 +27,7 @@ class SolvedGroup(NamedTuple):
     poses: FloatArray
 
     def poses_of(self, segment: int) -> FloatArray:
-        """(K, 3) of one segment."""
+        """Return poses (K, 3) of one segment."""
         first = int(self.graph.first_pose[segment])
         return self.poses[first : first + len(self.graph.segments[segment].stamps_ns)]
 
@@ -40,7 +40,7 @@ class Diagnostics:
         maps: the local maps as they were aligned.
         solved: the components, largest first.
         runs: as they were given.
-        searches: for time offsets, by robot.
+        searches: time offset searches by robot.
     """
 
     maps: list[LocalMap] = field(default_factory=list)

@@ -1,7 +1,7 @@
-"""Which numbers of robot.yaml the drives overrule, and a robot.yaml with what they found.
+"""Self-calibration: which calibration parameters the drives estimate better than robot.yaml gives them.
 
-In: runs and segments. Out: runs with parameters freed, the reasons, and corrected robot files. The paper takes its
-robot as calibrated.
+In: runs and segments. Out: runs with freed parameters, the reasons, and corrected robot files. Not in the paper, which
+assumes calibrated robots.
 """
 
 from lazy_loader import attach_stub

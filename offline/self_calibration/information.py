@@ -1,10 +1,9 @@
-"""What segments of drives tell of the calibration, each on its own.
+"""Information about the calibration from sections of segments, each section solved on its own.
 
-A drive is cut into a few segments. Each is solved with a start and a place for each tag of its own, and with every
-number that might be freed open as far as it could be off at all. What it tells of the calibration is the information of
-that estimate less what it was given: no map is needed, no alignment, and a tag moved in between spoils nothing. The
-noise is the one that windows of the drive leave over (`local_map.goodness_of_fit`), so that it matters little what was
-told of it.
+Each segment is cut into a few sections. A section is solved with its own start, its own tag positions and every
+parameter that might be freed under a wide prior. Its information about the calibration is the information of this
+estimate less the prior. This needs no map and no alignment, and a tag moved between sections does no harm. The noise is
+fitted to windows of the segment (`local_map.goodness_of_fit`), so the given noise matters little.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,20 +22,19 @@ from groundsbot.offline.noise import in_cell, inflation_of_corners
 from groundsbot.offline.sam import Parameter, Solution, SolveBudget, build_graph, solve
 from groundsbot.offline.self_calibration.selection import CalibrationInformation
 
-# Of each drive, where it is as long as so many windows: of five the usual share is held out, a fifth at a time.
+# Sections of a segment, where it is as long as this many windows. Holding out one of five is the usual share.
 _STRETCHES: Final = 5
-_FEWEST: Final = 2  # of a short one
-# Of what a drive is worth: for its windows, and for each segment, which are smaller by as much.
+_FEWEST: Final = 2  # of a short segment
+# Shares of a segment's solve budget: for its windows, and for each section, whose solve is correspondingly smaller.
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.2
 
-# Where robot.yaml does not say how good a number is: what a calibration of the camera with a board is good for, and
-# what tags' prints lie before or behind the places they stand for.
+# Sigmas where robot.yaml gives none: a board calibration's focal length, and the depth error of tag prints.
 _SIGMAS_NOT_GIVEN: Final[Mapping[str, float]] = MappingProxyType({FOCAL_SCALE: 1e-3, RANGE_OFFSET: 0.002})
 
 
 class _SegmentInformation(NamedTuple):
-    """What one segment tells: information (C, C) and vector (C,) of parameters, which have the sigmas it was given."""
+    """Information (C, C) and information vector (C,) of one section, and their parameters with the sigmas given."""
 
     parameters: tuple[Parameter, ...]
     information: FloatArray
@@ -51,14 +49,14 @@ def information_of(
     *,
     corners: bool,
 ) -> CalibrationInformation:
-    """What all segments of some runs tell.
+    """Return the information of all sections of some runs about the calibration.
 
     Args:
-        maps: of the runs, solved alone, with all open that may ever be freed.
-        robots: by the runs' names, with the sigmas that robot.yaml gives.
-        noise: under which.
-        efforts: what is left of what each of them is worth.
-        corners: ask the tags' corners in pixels where logs have them, else their places on the floor.
+        maps: local maps of the runs, solved with every parameter free that may ever be freed.
+        robots: robots by run name, with the sigmas of robot.yaml.
+        noise: the noise model at which the fit of each segment's noise starts.
+        efforts: the remaining solve budget of each map.
+        corners: use the tags' corners in pixels where logs have them, else tag positions on the floor.
     """
     parts: list[_SegmentInformation] = []
     priors: dict[tuple[object, ...], Parameter] = {}
@@ -83,7 +81,7 @@ def information_of(
 
 
 def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
-    """One that a map holds unless the file leaves it open, with the sigma that it has where it is asked for."""
+    """Return the parameter with the sigma under which freeing it is judged, which robot.yaml may not give."""
     given = {FOCAL_SCALE: robot.focal_scale_sigma, RANGE_OFFSET: robot.range_offset_m_sigma}
     if parameter.name not in given:
         return parameter
@@ -91,7 +89,7 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
 
 
 def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
-    """The segment under the noise that its windows leave over, errors that neighbouring readings share included."""
+    """Return the segment under the noise fitted to its windows, including correlated errors of observations."""
     least = least_shared_variance(local_map.segment.readings)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_readings = windows.factors.tolist()
@@ -106,7 +104,7 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveB
 
 
 def _cuts(segment: Segment) -> list[tuple[int, int]]:
-    """First keyframe and end of each segment; they are equally long."""
+    """Return the first keyframe and the end of each section; all are equally long."""
     along_m = segment.along_m
     n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _STRETCHES))
     ends = np.searchsorted(along_m, along_m[-1] * np.arange(1, n) / n, side="right").tolist()
@@ -116,7 +114,7 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 def _information_of_segment(
     segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, corners: bool
 ) -> _SegmentInformation | None:
-    """None where a segment reads no tag or cannot be solved alone."""
+    """Return the information of one section; None if it observes no tag or its solve does not converge."""
     part = segment.part(first, end)
     if not len(part.readings):
         return None
@@ -142,10 +140,10 @@ def _information_of_segment(
 
 
 def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _SegmentInformation:
-    """What an estimate (C,) with its covariance says beyond the sigmas about zero that its parameters were given."""
+    """Return the information of an estimate (C,) with its covariance (C, C), less that of its zero-mean priors."""
     sigma = np.array([each.sigma for each in parameters])
     information = np.linalg.inv(covariance / np.outer(sigma, sigma))  # in these sigmas
     vector = information @ (value / sigma)
     values, vectors = np.linalg.eigh(information - np.eye(len(sigma)))
-    own = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding may leave less than nothing
+    own = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding may make eigenvalues negative
     return _SegmentInformation(parameters, own / np.outer(sigma, sigma), vector / sigma)

@@ -1,6 +1,6 @@
-"""Robots whose file leaves their clock or track open, as those of imported recordings: start values for both.
+"""Start values for robots whose file leaves the time offset or the track open, such as those of imported recordings.
 
-Their wide sigmas stay as they are: the map estimates them with everything else.
+The wide sigmas of the file stay: the map estimates both with everything else.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSea
 
 
 class StartedRobots(NamedTuple):
-    """Runs of robots with start values in their files, what was put in, and the searches for time offsets by robot."""
+    """Runs with start values in their robots' files, these corrections, and the time offset searches by robot."""
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
@@ -25,7 +25,7 @@ class StartedRobots(NamedTuple):
 
 
 def by_robot(runs: Sequence[Run]) -> list[list[int]]:
-    """Indices of runs whose robots have one file."""
+    """Return indices of runs, grouped by robot file."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(runs):
         groups.setdefault((run.robot_id, run.robot.model_dump_json()), []).append(i)
@@ -33,11 +33,11 @@ def by_robot(runs: Sequence[Run]) -> list[list[int]]:
 
 
 def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> StartedRobots:
-    """Estimates what files leave open, robot by robot; robots whose files do not stay as they are.
+    """Estimate start values robot by robot; robots whose file leaves nothing open are not changed.
 
     Args:
         runs: of any robots.
-        noise: where the noise of wheels and readings begins.
+        noise: initial noise of wheels and tag observations.
     """
     found = list(runs)
     choices: list[CalibrationChoice] = []

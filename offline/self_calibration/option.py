@@ -1,4 +1,4 @@
-"""What `--calibrate` says: off, auto, or names of numbers. Imports nothing heavy, for the command line."""
+"""The value of `--calibrate`: off, auto, or parameter names. Imports nothing heavy, for the command line."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -7,7 +7,7 @@ from groundsbot.offline.errors import OfflineError
 
 OFF: Final = "off"
 AUTO: Final = "auto"
-# Names of what may be freed; camera height is held, and with it the principal point.
+# Parameters that may be freed. Camera height, not observable on a floor, stays fixed, and so does the principal point.
 NAMES: Final = (
     "wheel_scale",
     "wheel_ratio",
@@ -27,11 +27,11 @@ NAMES: Final = (
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Whether drives may set numbers of robot.yaml, and which.
+    """Whether drives may correct parameters of robot.yaml, and which.
 
     Attributes:
-        is_on: else calibration is a nuisance under robot.yaml's sigmas.
-        names: what to free where drives tell it; none: what they contradict.
+        is_on: if False, calibration is a nuisance parameter under robot.yaml's sigmas.
+        names: parameters to free where the drives observe them; if empty, those that contradict robot.yaml.
     """
 
     is_on: bool = False
@@ -39,10 +39,10 @@ class Calibrate:
 
 
 def parse_calibrate(text: str) -> Calibrate:
-    """Of the command line.
+    """Parse the command-line value.
 
     Raises:
-        OfflineError: a name that is none.
+        OfflineError: a name is unknown.
     """
     if text in (OFF, AUTO):
         return Calibrate(text == AUTO)
@@ -50,7 +50,7 @@ def parse_calibrate(text: str) -> Calibrate:
     for name in names:
         if name not in NAMES:
             raise OfflineError(
-                f"--calibrate: {name!r} is neither {OFF} nor {AUTO} nor a number that drives can set; those are "
-                f"{', '.join(NAMES)}"
+                f"--calibrate: {name!r} is neither {OFF} nor {AUTO} nor a parameter that drives can calibrate; those "
+                f"are {', '.join(NAMES)}"
             )
     return Calibrate(is_on=True, names=names)

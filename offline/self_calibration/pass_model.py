@@ -1,7 +1,7 @@
-"""What a robot with given calibration would have read in passes of tags, and how that changes with the calibration.
+"""Predicted tag observations in passes of tags, and their derivatives by the calibration.
 
-Wheels are exact within a pass, as are the arcs between its stations (calib.geometry.wheels). With the pose p of base in
-the frame of the pass's first station, tag t, mount m and rotations R:
+Wheels are taken as exact within a pass, and so are the arcs between its stations (calib.geometry.wheels). With the base
+pose p in the frame of the pass's first station, tag t, mount m and rotations R:
 
     q = R(m)' (R(p)' (t - p) - m),  range = |q| / (1 + tag scale) + range offset,  bearing = atan2(q_y, q_x)
 """
@@ -15,8 +15,8 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.self_calibration.passes import Passes
 
-# Corrections to robot.yaml, in this order. All but the first are there to take what would else go into it; how far they
-# may be off bounds them where passes do not tell them.
+# Corrections to robot.yaml, in this order. All but the first are nuisance parameters here; their priors bound them
+# where passes do not observe them.
 PARAMETERS: Final = (
     "time_offset_s",
     "wheel_ratio",
@@ -34,11 +34,11 @@ _NEAREST_M: Final = 1e-3
 
 @dataclass(frozen=True)
 class LinearisedTracks:
-    """Residuals of M readings, predicted less read, and their derivatives.
+    """Residuals of M observations, predicted less observed, and their derivatives.
 
     Attributes:
         residual: (M, 2) m and rad.
-        by_tag: (M, 2, 2) by the place of the pass's tag in the frame of its first station.
+        by_tag: (M, 2, 2) by the position of the pass's tag in the frame of its first station.
         by_parameters: (M, 2, 8) by PARAMETERS.
     """
 
@@ -48,7 +48,7 @@ class LinearisedTracks:
 
 
 def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses (3, M) of base at the readings, in the frame of the first station of each pass.
+    """Return base poses (3, M) at the observations, in the frame of the first station of each pass.
 
     Returns:
         The poses (x_m, y_m, theta_rad), and (3, 3, M) their derivatives by time offset, wheel ratio and turn factor.
@@ -61,7 +61,7 @@ def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArra
     by_time = -np.stack([0.5 * (left * left_m_s + right * right_m_s), turns * (right * right_m_s - left * left_m_s)])
     by_ratio = np.stack([0.25 * (right_m - left_m), 0.5 * turns * (right_m + left_m)])
     by_turn = np.stack([np.zeros_like(left_m), sums[1] / (1.0 + turn)])
-    # Of each (way, heading): from the station before, and the heading since the pass began.
+    # Of (way, heading): the step from the previous station, and the heading since the pass began.
     all_sums = np.stack([sums, by_time, by_ratio, by_turn])
     steps = np.diff(all_sums, axis=-1, prepend=0.0)
     steps[..., passes.first_station] = 0.0
@@ -81,7 +81,7 @@ def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def places_of_tags(passes: Passes, parameters: FloatArray) -> FloatArray:
-    """(G, 2) mean over each pass of where its readings put the tag, in the frame of its first station."""
+    """Return (G, 2) tag positions, the mean over the observations of each pass, in the frame of its first station."""
     base, _ = poses(passes, parameters)
     range_m = (passes.value[:, 0] - parameters[6]) * (1.0 + parameters[7])
     mount = passes.sensor + parameters[3:6]
@@ -91,12 +91,12 @@ def places_of_tags(passes: Passes, parameters: FloatArray) -> FloatArray:
 
 
 def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> LinearisedTracks:
-    """Residuals and derivatives.
+    """Return residuals and derivatives.
 
     Args:
-        passes: M readings.
+        passes: M observations in G passes.
         parameters: (8,) in order of PARAMETERS.
-        tags_m: (G, 2) as of `places_of_tags`.
+        tags_m: (G, 2) as from `places_of_tags`.
     """
     (x, y, theta), by_motion = poses(passes, parameters)
     mount = passes.sensor + parameters[3:6]

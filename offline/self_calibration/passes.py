@@ -1,7 +1,7 @@
-"""Passes of tags: short segments of readings of one tag, and the wheel readings under them.
+"""Passes of tags: short runs of observations of one tag, with the wheel readings of that time.
 
-Within a pass wheels err by little, so that what its readings tell of the sensor needs no map: each pass has a place of
-its own for its tag. They are chosen by stamps alone, and only chosen readings are worked out: a log may have millions.
+Wheels err little within a pass, so its observations calibrate the sensor without a map: each pass has a tag position of
+its own. Passes are selected by stamps alone, and only selected observations are computed: a log may have millions.
 """
 
 from collections.abc import Sequence
@@ -15,37 +15,37 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.measurements import Readings, Run, read_detections, read_positions
 
-# Where a pass ends.
+# A pass ends after a gap, or at these lengths.
 _GAP_S: Final = 2.0
 _PASS_S: Final = 20.0
 _PASS_M: Final = 3.0
 _PASS_RAD: Final = 1.5
 
-_FEWEST_READINGS: Final = 3  # two are spent on the place of the tag
-_MOST_READINGS: Final = 8  # of a pass: neighbours share their errors
+_FEWEST_READINGS: Final = 3  # two determine the tag position
+_MOST_READINGS: Final = 8  # of a pass: errors of neighbours are correlated
 _LEAST_MOTION_M: Final = 0.1
-_M_PER_RAD: Final = 0.5  # what a turn counts for beside a way
-# Evenly spread over the drives: sigma falls with the root of their number only, and the time grows with it.
+_M_PER_RAD: Final = 0.5  # weight of a turn relative to distance
+# Evenly spread over the drives: sigma falls only with the root of their number, and the time grows with it.
 _MOST_PASSES: Final = 200
 
-REACH_S: Final = 1.0  # a reading may have been taken so much earlier or later, so wheels must be known around it
+REACH_S: Final = 1.0  # largest time offset searched, so wheels must be known this long before and after an observation
 _BETWEEN_STRETCHES_S: Final = 10.0
-_RATE_OVER_S: Final = 0.05  # longer than a tick takes, shorter than a robot takes to change its speed
+_RATE_OVER_S: Final = 0.05  # longer than an encoder tick, shorter than a change of speed
 _STATION_S: Final = 0.25
 
-# Below these nothing in a drive is known; covariances of imported positions can be of any size.
+# Lower bounds on observation sigmas; covariances of imported positions can have any size.
 _LEAST_SIGMA: Final = (0.005, 0.002)  # m, rad
 
 
 @dataclass(frozen=True)
 class WheelAxis:
-    """Wheel readings of all segments on one time axis, with pauses of 10 s, of which nothing is used.
+    """Wheel readings of all segments on one time axis, separated by unused pauses of 10 s.
 
     Attributes:
-        time_s: (N,) rising.
+        time_s: (N,) increasing.
         motion: (N, 4) cumulative distances of the left and of the right wheel in m, and their speeds in m/s.
-        begins_s: of each segment on this axis, in order of runs and of their segments.
-        track_m: between the wheels, by robot.yaml.
+        begins_s: start of each segment on this axis, in order of runs and of their segments.
+        track_m: distance between the wheels, by robot.yaml.
     """
 
     time_s: FloatArray
@@ -54,36 +54,36 @@ class WheelAxis:
     track_m: float
 
     def at(self, time_s: FloatArray) -> FloatArray:
-        """(K, 4) motion at some times; linear between readings."""
+        """Return (K, 4) motion at the given times, linearly interpolated."""
         index = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         begin_s = self.time_s[index]
         share = np.clip((time_s - begin_s) / (self.time_s[index + 1] - begin_s), 0.0, 1.0)[:, None]
         return np.asarray((1.0 - share) * self.motion[index] + share * self.motion[index + 1])
 
     def twist_at(self, time_s: FloatArray) -> FloatArray:
-        """(K, 2) speed in m/s and turning rate in rad/s at some times."""
+        """Return (K, 2) speed in m/s and turning rate in rad/s at the given times."""
         left_m_s, right_m_s = self.at(time_s)[:, 2:].T
         return np.stack([0.5 * (left_m_s + right_m_s), (right_m_s - left_m_s) / self.track_m], axis=-1)
 
 
 @dataclass(frozen=True)
 class Passes:
-    """M readings in G passes of tags, ordered by pass, passes by their beginning.
+    """M observations in G passes of tags, ordered by pass; passes are ordered by their start.
 
-    A station is a time at which the robot's pose is worked out: each reading's, and others between, at most 0.25 s
-    apart.
+    A station is a time at which the robot's pose is computed: that of each observation, and others between, at most
+    0.25 s apart.
 
     Attributes:
-        wheels: of the drives.
-        group: (M,) the pass of each reading.
-        first: (G,) the first reading of each pass.
+        wheels: wheel readings of the drives.
+        group: (M,) the pass of each observation.
+        first: (G,) the first observation of each pass.
         value: (M, 2) range in m and bearing in rad about the sensor, positive to the left.
-        sigma: (M, 2) of these, with what wheels add from the middle of the pass on.
-        sensor: (M, 3) place and yaw of the sensor in base, by robot.yaml.
-        stations_s: (S,) on the axis of the wheels, by stamps of the readings.
-        station_group: (S,) the pass of each.
-        first_station: (G,) of each pass.
-        at: (M,) the station of each reading.
+        sigma: (M, 2) of these, including the wheels' error since the middle of the pass.
+        sensor: (M, 3) position and yaw of the sensor in base, by robot.yaml.
+        stations_s: (S,) on the time axis of the wheels, by stamps of the observations.
+        station_group: (S,) the pass of each station.
+        first_station: (G,) the first station of each pass.
+        at: (M,) the station of each observation.
     """
 
     wheels: WheelAxis
@@ -104,11 +104,11 @@ class Passes:
 
 @dataclass(frozen=True)
 class _Stamps:
-    """M readings by their stamps alone: when, of which tag, and where they are in their run."""
+    """M observations by their stamps alone: time, tag, and position in their run."""
 
     time_s: FloatArray
-    way_m: FloatArray  # driven until then
-    turn_rad: FloatArray  # turned until then, to either side
+    way_m: FloatArray  # distance driven until then
+    turn_rad: FloatArray  # absolute angle turned until then
     tag: IntArray
     run: IntArray
     index: IntArray  # into its positions, and after these into its detections
@@ -125,7 +125,7 @@ class _Stamps:
 
 
 def gather_passes(runs: Sequence[Run]) -> Passes | None:
-    """The passes of tags in some runs of one robot; None where there are none in which it moves or turns.
+    """Return the passes of tags in some runs of one robot; None if the robot moves or turns in none of them.
 
     Args:
         runs: all with the same robot.yaml.
@@ -167,12 +167,12 @@ def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
         for apart_s in (_RATE_OVER_S, -_RATE_OVER_S)
     )
     speeds_m_s = (later - earlier) / (2.0 * _RATE_OVER_S)
-    motion = np.concatenate([wheels_m, speeds_m_s]).T.copy()  # in memory by time, as it is asked for
+    motion = np.concatenate([wheels_m, speeds_m_s]).T.copy()  # contiguous by time, as lookups need it
     return WheelAxis(time_s, motion, tuple(begins_s), runs[0].robot.wheels.track_m)
 
 
 def _stamps(runs: Sequence[Run], wheels: WheelAxis) -> _Stamps:
-    """All readings around which wheels are known."""
+    """Return all observations around which wheel readings are known."""
     left_m, right_m = np.diff(wheels.motion[:, :2], axis=0, prepend=wheels.motion[:1, :2]).T
     way_m, turn_rad = np.cumsum(np.abs(left_m + right_m) / 2), np.cumsum(np.abs(right_m - left_m) / wheels.track_m)
     moved: list[FloatArray] = [np.zeros((3, 0))]
@@ -194,7 +194,7 @@ def _stamps(runs: Sequence[Run], wheels: WheelAxis) -> _Stamps:
 
 
 def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
-    """Readings of passes that tell something, by pass, and the pass of each; passes by their beginning."""
+    """Return the observations of informative passes, ordered by pass, and the pass of each; passes by their start."""
     looks = looks.where(np.lexsort((looks.time_s, looks.tag)))
     begins = np.ones(len(looks.tag), dtype=np.bool_)
     begins[1:] = (np.diff(looks.tag) != 0) | (np.diff(looks.time_s) > _GAP_S) | (np.diff(looks.run) != 0)
@@ -217,7 +217,7 @@ def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
 
 
 def _read(run: Run, index: IntArray, twist: FloatArray) -> list[Readings]:
-    """Readings of a run whose keyframe is the place in `index`: each has its own, so that none are averaged."""
+    """Return observations of a run; each has its index in `index` as its keyframe, so that none are averaged."""
     noise, n = NoiseParameters(), len(run.positions.stamps_ns)
     order = np.argsort(index)
     of_positions, of_detections = np.split(order, [int((index < n).sum())])
@@ -232,7 +232,7 @@ def _read(run: Run, index: IntArray, twist: FloatArray) -> list[Readings]:
 
 
 def _polar(readings: Readings) -> tuple[FloatArray, FloatArray]:
-    """(M, 2) range and bearing of readings in either form, and (M, 2) their sigmas."""
+    """Return (M, 2) range and bearing of observations in either form, and (M, 2) their sigmas."""
     x, y = readings.value.T
     range_m = np.maximum(np.hypot(x, y), 1e-6)
     along = np.stack([x, y], axis=-1) / range_m[:, None]
@@ -248,7 +248,7 @@ def _polar(readings: Readings) -> tuple[FloatArray, FloatArray]:
 def _passes(
     wheels: WheelAxis, looks: _Stamps, group: IntArray, value: FloatArray, sigma: FloatArray, sensor: FloatArray
 ) -> Passes:
-    """Adds stations, and what wheels add to the sigmas."""
+    """Return the passes with stations added and the sigmas increased by the wheels' error."""
     noise, n = NoiseParameters(), np.bincount(group)
     first = np.cumsum(n) - n
     middle = (first + n // 2)[group]

@@ -1,4 +1,4 @@
-"""What self-calibration does to a robot's file: sigmas of what is freed opened, and what was learnt written in."""
+"""Changes that self-calibration makes to a robot's file: wide sigmas for freed parameters, and corrections applied."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -22,45 +22,45 @@ from groundsbot.calib.robot import (
 _WHEEL_SCALE, _WHEEL_RATIO, TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"
 
-# What may be freed, and the sigma that a freed number has: as robots are of which somebody believes to know it. Beside
-# it what drives tell is everything. Camera height is not among them: a floor shows only differences of it.
+# Parameters that may be freed, and their prior sigma when freed: that of a robot believed to be calibrated, so wide
+# that the data dominate it. Camera height is not among them: on a floor only differences of heights are observable.
 OPEN_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     {
         _WHEEL_SCALE: 0.05,
         _WHEEL_RATIO: 0.05,
-        TRACK_SCALE: 0.25,  # tracked and skidding robots turn half as far again as wheels at their track would
+        TRACK_SCALE: 0.25,  # tracked and skidding robots turn half as far again as their wheels' track implies
         **dict.fromkeys((*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad"), 0.15),  # rad; 9 degrees
         "mount_x_m": 0.5,
         "mount_y_m": 0.5,
         TIME_OFFSET: 0.3,
         EDGE_SHIFT: 1.0,
         RANGE_OFFSET: 0.1,
-        TAG_SCALE: 0.15,  # measured over the white margin a tag of ten cells is 25 % too large
+        TAG_SCALE: 0.15,  # a tag of ten cells measured over the white margin comes out 25 % too large
         FOCAL_SCALE: 0.05,
     }
 )
-# Of these a robot may be off by so much that nothing can be said to first order about what its file says.
+# Parameters whose error may be too large for a first-order judgement of robot.yaml.
 OFF_BY_FAR: Final = (TIME_OFFSET, TRACK_SCALE, *MOUNT_PARAMETERS)
-# What is off by more is no error of calibration but the file of another robot.
+# A larger error means the file of another robot, not a calibration error.
 MOST_SIGMAS: Final = 3.0
 
 
 class Correction(NamedTuple):
-    """A correction to what a robot.yaml says, and how well it is known."""
+    """A correction to a number of robot.yaml, and its sigma."""
 
     value: float
     sigma: float
 
 
 class OwnedParameter(NamedTuple):
-    """A calibration number by name, and whose it is: a robot id, or a batch of tags with its family."""
+    """A calibration parameter by owner (a robot id, or a batch of tags with its family) and name."""
 
     owner: str
     name: str
 
 
 def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robot:
-    """The robot whose file leaves open what is freed, with these sigmas; its values stay."""
+    """Return the robot with these sigmas for freed parameters; its values stay."""
 
     def sigma(name: str) -> float | None:
         return freed.get(OwnedParameter(robot.robot_id, name))
@@ -91,14 +91,14 @@ def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robo
 
 
 def as_if_unknown(robot: Robot) -> Robot:
-    """The robot as if nobody had measured what is off by far where it is off at all; the focal length is open too."""
+    """Return the robot with wide sigmas for every parameter that may be grossly wrong, and for the focal length."""
     own = {OwnedParameter(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
     batches = [*(_of_batch(batch) for batch in robot.tags), OwnedParameter(IMPORTED_BATCH, TAG_SCALE)]
     return open_parameters(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
 
 
 def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> Robot:
-    """The robot with what was learnt for its values and sigmas; what was not learnt stays. Its camera is not in it."""
+    """Return the robot with corrections applied to values and sigmas; the camera is not part of it."""
 
     def of(name: str) -> Correction | None:
         return learnt.get(OwnedParameter(robot.robot_id, name))
@@ -120,7 +120,7 @@ def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> 
 
 
 def _mount_fields() -> list[str]:
-    """Those of a mount that can be freed, without their `mount_`."""
+    """Return the fields of a mount that can be freed, without their `mount_`."""
     return [name.removeprefix(_MOUNT) for name in OPEN_SIGMAS if name.startswith(_MOUNT)]
 
 
@@ -139,7 +139,7 @@ def _correct_wheels(
 ) -> Wheels:
     changed: dict[str, float] = {}
     if scale and ratio:
-        of_one = (scale.sigma**2 + 0.25 * ratio.sigma**2) ** 0.5  # as a share, of one radius
+        of_one = (scale.sigma**2 + 0.25 * ratio.sigma**2) ** 0.5  # relative sigma of one radius
         for side, sign in (("left", -1.0), ("right", 1.0)):
             radius_m = getattr(wheels, f"radius_{side}_m") * (1.0 + scale.value) * (1.0 + sign * 0.5 * ratio.value)
             changed |= {f"radius_{side}_m": radius_m, f"radius_{side}_m_sigma": radius_m * of_one}

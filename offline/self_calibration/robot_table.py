@@ -1,4 +1,4 @@
-"""What drives say of robots' files: each number as its file has it, as the map found it, and what to make of that."""
+"""Table of calibration parameters: robot file, estimate of the map, and a verdict on the difference."""
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -22,19 +22,19 @@ from groundsbot.offline.self_calibration.robot import OwnedParameter
 from groundsbot.offline.self_calibration.selection import DOUBTED, TELLS_LESS
 from groundsbot.offline.self_calibration.words import DRIVES
 
-FOUND: Final = "found; nobody had measured it"
+FOUND: Final = "estimated; it had not been measured"
 WRONG: Final = "robot.yaml is wrong"
-ASKED: Final = "freed, as was asked"
+ASKED: Final = "estimated as requested"
 AGREES: Final = "agrees"
-NOT_TOLD: Final = "not told by these drives"
-NOT_BELIEVED: Final = "not believed, since another number is wrong by far"
-CONTRADICTED: Final = "contradicts robot.yaml, which was held"
+NOT_TOLD: Final = "not observable in these drives"
+NOT_BELIEVED: Final = "estimated, since another number is grossly wrong"
+CONTRADICTED: Final = "contradicts robot.yaml, which was kept as prior"
 
-_WRITE: Final = "write what was found into robot.yaml, as groundsbot-offline calibrate does"
+_WRITE: Final = "write the estimate into robot.yaml, as groundsbot-offline calibrate does"
 _MOST_SIGMAS: Final = 3.0
-_TOLD_SHARE: Final = 0.7  # of the sigma before, that a number that is told has at most
+_TOLD_SHARE: Final = 0.7  # an observed parameter has at most this share of its prior sigma
 _SCALES: Final = frozenset({*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE})
-# What a file says of each number of a robot.
+# Value of each parameter in a robot's file.
 _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
     {
         WHEEL_PARAMETERS[0]: lambda r: 0.5 * (r.wheels.radius_left_m + r.wheels.radius_right_m),
@@ -59,7 +59,7 @@ WHAT: Final[Mapping[str, str]] = MappingProxyType(
         TIME_OFFSET: "time_offset_s",
         EDGE_SHIFT: "edge_shift_px",
         RANGE_OFFSET: "range_offset_m",
-        FOCAL_SCALE: "focal length, as a share",
+        FOCAL_SCALE: "focal length, relative",
     }
 )
 
@@ -67,12 +67,12 @@ WHAT: Final[Mapping[str, str]] = MappingProxyType(
 def verdicts(
     runs: Sequence[Run], calibration: Sequence[CalibrationResult], choices: Sequence[CalibrationChoice]
 ) -> tuple[RobotNumber, ...]:
-    """A row for each number that the map estimated.
+    """Return a row for each parameter that the map estimated.
 
     Args:
         runs: with the robots' files as they were given.
         calibration: corrections to these files.
-        choices: of self-calibration, and start values of what files leave open.
+        choices: of self-calibration, and start values of parameters that files leave open.
     """
     robots = {run.robot_id: run.robot for run in runs}
     chosen = {OwnedParameter(each.owner, each.name): each for each in choices}
@@ -101,18 +101,18 @@ def verdicts(
 
 
 def is_news(number: RobotNumber) -> bool:
-    """Whether the file did not have it so."""
+    """Return whether the estimate differs from the file."""
     return number.verdict in (FOUND, WRONG, ASKED, NOT_BELIEVED, CONTRADICTED)
 
 
 def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
-    """For a terminal: a table of what files did not have so; none where they had all."""
+    """Return a terminal table of parameters that differ from robot.yaml, or one line if none does."""
     rows = [each for each in numbers if is_news(each)]
     if not rows:
-        return ["what these drives say of the robots: all as robot.yaml has it"] if numbers else []
+        return ["robot parameters: these drives agree with robot.yaml in all of them"] if numbers else []
     owner = max(len(each.owner) for each in rows)
     what = max(len(each.what) for each in rows)
-    lines = ["what these drives say of the robots (robot.yaml -> found, sigma; all numbers are in the report):"]
+    lines = ["robot parameters that differ (robot.yaml -> estimate, sigma; the report lists all):"]
     lines += [
         f"  {each.owner:<{owner}}  {each.what:<{what}}  {each.in_file:8.4f} -> {each.found:8.4f}  {each.sigma:.4f}  "
         f"{each.verdict}"
@@ -122,7 +122,7 @@ def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
 
 
 def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | None:
-    """What a file says of it; None of tags of several sizes."""
+    """Return the value in the file; 1 for scales of tags of several sizes, None if no file has the parameter."""
     if entry.name != TAG_SCALE:
         value = _OF_ROBOT.get(entry.name)
         return None if value is None or entry.owner not in robots else float(value(robots[entry.owner]))
@@ -136,7 +136,7 @@ def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | N
 
 def _what(entry: CalibrationResult) -> str:
     if entry.owner.startswith(IMPORTED_BATCH):
-        return "ranges, as a share"
+        return "ranges, relative"
     return WHAT.get(entry.name, f"mount.{entry.name.removeprefix('mount_')}")
 
 

@@ -1,8 +1,8 @@
-"""Which calibration numbers the drives may set themselves, and why the others stay as robot.yaml has them.
+"""Which calibration parameters the drives may correct, and why the others stay as robot.yaml has them.
 
-What a segment of a drive tells of the calibration c, everything else eliminated, is a quadratic form: information L_k
-and a vector h_k with log p(segment | c) = h_k^T c - c^T L_k c / 2 + constant. Segments have starts and tags of their
-own, so they are independent given c, and all questions below are asked of sums of these forms.
+The log likelihood of a section of a segment, with everything but the calibration c eliminated, is a quadratic form with
+information L_k and vector h_k: log p(section | c) = h_k^T c - c^T L_k c / 2 + constant. Sections have their own starts
+and tags, so they are independent given c, and all tests below use sums of these forms.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -19,25 +19,25 @@ from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
 from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, OwnedParameter
 
-# Of maps whose robot.yaml is right, one in so many has a number freed that need not have been.
+# Share of maps with a correct robot.yaml in which any parameter is freed.
 _FALSE_ALARM: Final = 0.01
-_NOTHING: Final = 1e-9  # information, as a share of what the sigmas of open numbers hold: rounding
+_NOTHING: Final = 1e-9  # information relative to the prior of freed parameters: rounding
 _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
-# What is off by so many of the sigmas that open ones have is off by far.
+# An error beyond this many of the sigmas of freed parameters is a gross error.
 _BY_FAR: Final = 0.5
-# A number that drives know worse than robot.yaml claims to is freed only where it is off by so many times what is more
-# than chance: then the claim is wrong. Not those of which readings on the floor tell with a bias, as roll and pitch.
+# A parameter less certain from data than from robot.yaml is freed only beyond the threshold times this: then the
+# claimed sigma is wrong. Roll and pitch, which floor observations estimate with a bias, are excluded.
 OFF_BY_ALL: Final = frozenset({*OFF_BY_FAR, RANGE_OFFSET, TAG_SCALE})
 _CERTAINLY: Final = 1.5
-DOUBTED: Final = "robot.yaml has another number wrong by far, so this one is not believed either"
-TELLS_LESS: Final = "the drives tell less of it than robot.yaml does"
+DOUBTED: Final = "robot.yaml has a gross error in another number, so this one is not trusted either"
+TELLS_LESS: Final = "the drives determine it less well than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
-_NOT_ASKED: Final = "it was not asked for"
+_NOT_ASKED: Final = "it was not requested"
 
 
 @dataclass(frozen=True)
 class CalibrationInformation:
-    """What S segments tell of C numbers.
+    """Information of S sections about C parameters.
 
     Attributes:
         parameters: C, each with the sigma that robot.yaml gives it.
@@ -49,13 +49,13 @@ class CalibrationInformation:
     vector: FloatArray
 
     def about(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
-        """The same of numbers that are so much larger, by owner and name: about the files before these were put in."""
+        """Return the same relative to the files before these corrections, by owner and name, were applied."""
         shift = np.array([values.get(OwnedParameter(each.owner, each.name), 0.0) for each in self.parameters])
         return replace(self, vector=self.vector + self.information @ shift)
 
 
 class _NumberEstimate(NamedTuple):
-    """Of one number by data alone; of a variance beyond all measure where they say nothing."""
+    """Estimate of one parameter by data alone; its variance is huge where the data contain no information."""
 
     value: float
     variance: float
@@ -64,17 +64,17 @@ class _NumberEstimate(NamedTuple):
 def choose(
     told: CalibrationInformation, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
 ) -> list[CalibrationChoice]:
-    """What becomes of each number that could be freed.
+    """Decide for each candidate parameter whether it is freed.
 
-    First what robot.yaml has wrong by far. With it what the files of these robots say else is not believed either:
-    nobody measured the one number and not the other, and one hand writes the files of a fleet. Then what contradicts
-    robot.yaml, the worst first; the others are judged with it free.
+    First find gross errors of robot.yaml. If there is one, the other parameters that may be grossly wrong are not
+    trusted either: they were hardly measured separately, and the files of a fleet usually have one author. Then free
+    the parameters that contradict robot.yaml, the worst first; the others are judged with these free.
 
     Args:
-        told: by all drives.
-        asked: names of those to be freed whether robot.yaml is contradicted or not; where empty those where it is.
-        late_s: by robot, the time offset that passes of tags tell alone: a robot that drives at one speed all the time
-            sees no difference between a camera that is late and one that sits elsewhere.
+        told: information of all drives.
+        asked: names of parameters to free whether or not they contradict robot.yaml; if empty, those that do.
+        late_s: time offset by robot, estimated from passes of tags alone. At constant speed a late camera and a
+            displaced camera cannot be distinguished.
     """
     candidates = [i for i, each in enumerate(told.parameters) if each.name in OPEN_SIGMAS]
     judge = _Selection(told, candidates, asked, late_s)
@@ -89,16 +89,16 @@ def choose(
 
 
 def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
-    """Whether robots' files are not believed at all."""
+    """Return whether every parameter that may be grossly wrong was freed."""
     return all(each.is_freed for each in choices if each.name in OFF_BY_FAR)
 
 
 class _Selection:
-    """Which numbers are open, and what is to be said of each as that is.
+    """Which parameters are free, and the assessment of each given these.
 
     Attributes:
-        open: indices.
-        at_least: by so many sigmas a number contradicts robot.yaml.
+        open: indices of free parameters.
+        at_least: the number of sigmas at which a parameter contradicts robot.yaml.
     """
 
     def __init__(
@@ -113,10 +113,11 @@ class _Selection:
         self.open: list[int] = []
 
     def off_by_far(self) -> list[int]:
-        """Opens what is off by so much that robot.yaml cannot be meant, and what then is not believed either.
+        """Free parameters with a gross error, and return those that are then not trusted either.
 
-        All that may be is open at first. What is off least is held by robot.yaml, and the others are judged anew, until
-        all that are left are off by far. So where several explain the same, one is left.
+        By backward elimination: all candidates are free at first. The one with the smallest deviation is fixed and the
+        others are judged again, until all free ones are grossly wrong. So of several that explain the same, one
+        remains.
         """
         names, parameters = OFF_BY_ALL, self._told.parameters
         self.open = [i for i in self._candidates if parameters[i].name in names]
@@ -129,13 +130,13 @@ class _Selection:
         return self.open_all() if any(parameters[i].name in OFF_BY_FAR for i in self.open) else self.open.copy()
 
     def open_all(self) -> list[int]:
-        """Opens what is not believed where anything is off by far, besides what is open."""
+        """Free what is not trusted after a gross error, besides what is free; return the former."""
         doubted = [i for i in self._candidates if self._told.parameters[i].name in OFF_BY_ALL]
         self.open = [*doubted, *(i for i in self.open if i not in doubted)]
         return doubted
 
     def open_what_contradicts(self) -> None:
-        """Opens what contradicts robot.yaml, the worst first."""
+        """Free parameters that contradict robot.yaml, the worst first."""
         while True:
             able = {i: each for i in self._candidates if i not in self.open and not (each := self.look(i)).reason}
             if not able:
@@ -143,7 +144,7 @@ class _Selection:
             self.open.append(max(able, key=lambda i: _plausible(able[i])))
 
     def is_any_by_far(self) -> bool:
-        """Whether what is open is off by so much that robot.yaml cannot be meant."""
+        """Return whether a free parameter is a gross error."""
         is_one = (self._told.parameters[i].name in OFF_BY_FAR for i in self.open)
         return any(own and self._is_by_far(self.look(i)) for i, own in zip(self.open, is_one, strict=True))
 
@@ -155,7 +156,7 @@ class _Selection:
         return is_far and choice.off_sigmas > self.at_least and (choice.held_out_gain or 0.0) > 0.0
 
     def look(self, index: int) -> CalibrationChoice:
-        """One number, judged with the others open or not; with the reason why it may not be freed, if there is one."""
+        """Return the assessment of one parameter given the free ones, with the reason if it may not be freed."""
         told, parameter = self._told, self._told.parameters[index]
         sigmas = np.array([each.sigma for each in told.parameters])
         sigmas[self.open] = [OPEN_SIGMAS[told.parameters[i].name] for i in self.open]
@@ -166,16 +167,16 @@ class _Selection:
         most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
         reason = ""
         is_wrong = parameter.name in OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
-        if parameter.name == TIME_OFFSET:  # passes of tags must say so too
+        if parameter.name == TIME_OFFSET:  # passes of tags must agree
             is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
         if whole.variance >= prior**2 and not is_wrong:
             reason = TELLS_LESS
         elif gain is None:
-            reason = "a single segment tells of it, and nothing bears that out"
+            reason = "only one section of the drives determines it, and no other confirms that"
         elif gain <= 0.0:
-            reason = "what some segments tell of it does not foretell the others better than robot.yaml does"
+            reason = "its estimates from some sections of the drives predict the others no better than robot.yaml does"
         elif abs(whole.value) > most:
-            reason = f"it would be off by more than {most:g}, no error of calibration; is the file this robot's?"
+            reason = f"its error would exceed {most:g}, too much for a calibration error; is the file this robot's?"
         elif self._asked and not is_asked:
             reason = _NOT_ASKED
         elif not is_asked and off_sigmas <= self.at_least:
@@ -195,25 +196,26 @@ class _Selection:
 
 
 def _free(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
-    """The choice to free a number; with what it is under the sigma that it has from then on."""
+    """Return the choice to free a parameter, with its estimate under the prior that it then has."""
     limit = OPEN_SIGMAS[choice.name]
     share = limit**2 / (limit**2 + choice.sigma**2)
     return replace(choice, is_freed=True, value=share * choice.value, sigma=share**0.5 * choice.sigma, reason=reason)
 
 
 def _plausible(choice: CalibrationChoice) -> float:
-    """By how much a number contradicts robot.yaml, in squared sigmas, less what speaks against its being wrong.
+    """Return the squared sigmas of the contradiction with robot.yaml, less the prior log odds against an error.
 
-    Wheels and tags that contradict each other about the metre contradict robot.yaml by the same sigmas. A radius is
-    measured over many turns; tags are printed at another scale, or measured along another edge, ten times as often.
+    A contradiction between wheels and tags about the scale has the same sigmas for both. A radius is measured over many
+    turns; tags are ten times as often printed at another scale or measured along another edge.
     """
     return choice.off_sigmas**2 - (_ODDS_OF_WHEELS if choice.name == WHEEL_PARAMETERS[0] else 0.0)
 
 
 def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, index: int) -> float | None:
-    """Log likelihood of each segment by what all others tell of the number, over that by robot.yaml; summed.
+    """Return the leave-one-out log-likelihood gain over robot.yaml, summed over sections.
 
-    None where no two segments tell anything of it.
+    Each section's likelihood is taken under the estimate of all others, and under robot.yaml. None where no two
+    sections have information about the parameter.
     """
     prior, limit, gains = told.parameters[index].sigma, OPEN_SIGMAS[told.parameters[index].name], []
     for k in range(len(told.vector)):
@@ -228,7 +230,7 @@ def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, inde
 
 
 def _estimate(told: CalibrationInformation, which: BoolArray, sigmas: FloatArray, index: int) -> _NumberEstimate:
-    """By some segments (S,), the others at their sigmas about zero and this one without what holds it."""
+    """Estimate a parameter from some sections (S,), without a prior on it and with those of the others."""
     limit = OPEN_SIGMAS[told.parameters[index].name]
     unit = sigmas.copy()
     unit[index] = limit

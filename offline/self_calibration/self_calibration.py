@@ -1,4 +1,4 @@
-"""Robots and tags calibrated by their own drives, as far as these know better than robot.yaml."""
+"""Calibration of robots and tags by their own drives, where these are more certain than robot.yaml."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -32,10 +32,10 @@ from groundsbot.offline.self_calibration.selection import OFF_BY_ALL, choose, is
 from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
-# Put right before the map is made, which takes them to first order, or on the floor not at all. Wheel readings are in
-# metres by then, and stamps on one clock; both are as good to first order.
+# Corrected before the map is made, which estimates them to first order or, on the floor, not at all. Wheel readings are
+# in metres and stamps on one clock by then; both remain estimated to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
-TIMES_MAPPED: Final = 2  # the runs are, where this comes before their map
+TIMES_MAPPED: Final = 2  # how often runs are mapped when self-calibration precedes their map
 _ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, RANGE_OFFSET})
 
 
@@ -43,13 +43,13 @@ _NOTHING: Final = Correction(0.0, 0.0)
 
 
 class FreedRobots(NamedTuple):
-    """What became of robots' files.
+    """Result of self-calibration.
 
     Attributes:
-        runs: with what was freed left open in their files.
-        choices: what was freed, and why the rest was not.
-        put_in: corrections to the files that the runs have already.
-        searches: for time offsets, by robot.
+        runs: with wide sigmas for freed parameters in their files.
+        choices: which parameters were freed, and why the others were not.
+        put_in: corrections already applied to the runs' files.
+        searches: time offset searches by robot.
     """
 
     runs: list[Run]
@@ -61,17 +61,17 @@ class FreedRobots(NamedTuple):
 def free_parameters(
     runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool
 ) -> FreedRobots:
-    """Frees what the drives can tell and robot.yaml has wrong.
+    """Free the parameters that the drives observe and robot.yaml has wrong.
 
-    Each robot is first estimated as if nobody had measured it; what segments of its drives tell is then a quadratic
-    form about these values, and of that the numbers of robot.yaml are asked one by one (`selection`). Robots whose file
-    leaves them open have their say in the map as they are.
+    Each robot is first solved with wide sigmas. The information of sections of its drives is a quadratic form about
+    these estimates, against which the numbers of robot.yaml are tested one by one (`selection`). Robots whose file
+    leaves them open are estimated in the map as they are.
 
     Args:
-        runs: with what robot.yaml says.
-        noise: of wheels and readings, or where it begins.
-        names: what to free whether robot.yaml is contradicted or not; where empty what drives contradict.
-        corners: the map will be refined on corners, which tell of the focal length too.
+        runs: with the numbers of robot.yaml.
+        noise: noise of wheels and tag observations, or its initial value.
+        names: parameters to free whether or not they contradict robot.yaml; if empty, those that do.
+        corners: the map will be refined on corners, which also observe the focal length.
     """
     started, searches = _as_if_unknown(runs, noise)
     if not started:
@@ -90,7 +90,8 @@ def free_parameters(
     freed = {OwnedParameter(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
     right = put_right(choices)
     if is_overruled(choices):
-        # What pieces of drives tell of a robot that is off by metres is of different minima; all of them have a say.
+        # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
+        # numbers.
         right = {owned: each for owned, each in right.items() if owned.name not in OFF_BY_ALL} | starts
     return FreedRobots(
         [
@@ -112,9 +113,9 @@ def free_parameters(
 def _as_if_unknown(
     runs: Sequence[Run], noise: NoiseParameters
 ) -> tuple[list[tuple[Run, dict[OwnedParameter, Correction]]], dict[str, TimeOffsetSearch]]:
-    """Runs of robots that somebody measured, with time offset and track put in as their drives have them.
+    """Return runs of calibrated robots with start values, these corrections, and time offset searches by robot.
 
-    With each run what was put in, and besides the searches for time offsets by robot. The sigmas are robot.yaml's.
+    The sigmas stay those of robot.yaml.
     """
     found: list[tuple[Run, dict[OwnedParameter, Correction]]] = []
     searches: dict[str, TimeOffsetSearch] = {}
@@ -131,7 +132,7 @@ def _as_if_unknown(
 
 
 def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> CameraModel | None:
-    """The camera with the focal lengths that were found."""
+    """Return the camera with corrected focal lengths."""
     if camera is None or focal is None:
         return camera
     return replace(camera, fx_px=camera.fx_px * (1.0 + focal.value), fy_px=camera.fy_px * (1.0 + focal.value))
@@ -140,7 +141,7 @@ def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> 
 def about_the_files(
     calibration: Sequence[CalibrationResult], put_in: Mapping[OwnedParameter, Correction]
 ) -> list[CalibrationResult]:
-    """Corrections to the files as they were given: what was put in before is part of them."""
+    """Return corrections relative to the files as they were given: those applied before plus the map's."""
     found = []
     for each in calibration:
         before = put_in.get(OwnedParameter(each.owner, each.name), _NOTHING).value
@@ -149,7 +150,7 @@ def about_the_files(
 
 
 def put_right(choices: Sequence[CalibrationChoice]) -> dict[OwnedParameter, Correction]:
-    """What was put into robots' files before the map was made; of a number that was twice, both together."""
+    """Return the corrections applied to robots' files before the map; two of one parameter are composed."""
     right: dict[OwnedParameter, Correction] = {}
     for each in choices:
         if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH):
@@ -160,5 +161,5 @@ def put_right(choices: Sequence[CalibrationChoice]) -> dict[OwnedParameter, Corr
 
 
 def _one_after_the_other(name: str, before: float, after: float) -> float:
-    """Two corrections of one number: shares of shares, or sums."""
+    """Return the composition of two corrections of one parameter: relative ones multiply, others add."""
     return before + after + (before * after if name in _SCALES else 0.0)

@@ -1,9 +1,9 @@
-"""Time offset and track of a robot of which both are unknown: before anything else, since the rest is to first order.
+"""Start values of time offset and track, for robots of which both are unknown; everything later is to first order.
 
-A camera that is half a second late, or wheels that turn the robot by half as much again as they say, would lead every
-later stage astray. The time offset is searched for in passes of tags (`time_offset_search`); then each drive is solved
-alone at few keyframes, with all that its file leaves open, and what enters the motions to first order only, the track
-and the time offset, is put into the file, until it stays. The sigmas of the file stay as they are.
+A camera that is half a second late, or a track wrong by half, would make every later stage fail. The time offset is
+found by a search in passes of tags (`time_offset_search`). Then each drive is solved alone on few keyframes with
+everything free that its file leaves open. Track and time offset enter the motions to first order only, so they are
+applied to the file and solved again until they converge. The sigmas of the file stay.
 """
 
 from collections.abc import Sequence
@@ -20,23 +20,23 @@ from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 
 _MOST_ROUNDS: Final = 4
-# What is left to first order then errs by its square: a percent of the turn, a millimetre at a metre a second.
+# The remaining second-order errors are the squares of these: a thousandth of the turn, a millimetre at 1 m/s.
 _SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
 
 
 class StartValues(NamedTuple):
-    """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the search that they began with."""
+    """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the time offset search."""
 
     learnt: dict[str, Correction]
     searched: TimeOffsetSearch | None
 
 
 def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
-    """Estimates both from the drives of one robot, whose file leaves them open.
+    """Estimate time offset and track from the drives of one robot, whose file leaves them open.
 
     Args:
         runs: all with the same robot.yaml.
-        noise: where the noise of wheels and readings begins.
+        noise: initial noise of wheels and tag observations.
     """
     searched = search_time_offset(runs)
     found = dict.fromkeys(_SMALL, Correction(0.0, 0.0))
@@ -52,7 +52,7 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
 
 
 def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
-    """The run with time offset and track put into its robot's file, whose sigmas stay."""
+    """Return the run with time offset and track corrected in its robot's file; the sigmas stay."""
     late_s, track = learnt[TIME_OFFSET].value, learnt[TRACK_SCALE].value
     robot = run.robot
     wheels = robot.wheels.model_copy(
@@ -66,12 +66,12 @@ def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
 
 
 def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise]) -> dict[str, Correction]:
-    """Time offset and track by each drive alone, the mean by their information.
+    """Return the information-weighted mean of time offset and track over drives that are solved alone.
 
     Args:
         runs: of one robot.
-        noise: where the noise begins.
-        shown: by segment, what windows show of it; what is missing is added.
+        noise: initial noise.
+        shown: noise estimated from windows, by segment; missing ones are added.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:
@@ -103,7 +103,7 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Wind
 
 
 def _together(name: str, before: Correction, more: Correction | None) -> Correction:
-    """Two corrections, one after the other; a turn of c to first order is one of 1 / (1 - c) of the track."""
+    """Return the composition of two corrections; a turn of c is to first order a track scale of 1 / (1 - c)."""
     if more is None:
         return before
     if name == TRACK_SCALE:

@@ -1,10 +1,10 @@
-"""By how much the stamps of a robot's sensor of tags are late, over two seconds, from passes of tags alone.
+"""Time offset between tag sensor and wheels, searched within a second of robot.yaml's, from passes of tags alone.
 
-The likelihood of all passes is profiled over a grid of offsets: at each offset the other parameters (pass_model) and
-the places of tags are estimated. From the best points of the grid on the offset is estimated with them. Errors have
-Student's t distribution, so that false readings have a bounded force (Lange, Little and Taylor 1989, Robust statistical
-modeling using the t distribution); its scales are estimated too. Only the offset is of use: wheels err within a pass,
-and the other parameters take that up.
+The likelihood of all passes is profiled over a grid of offsets: at each offset the other parameters (`pass_model`) and
+the tag positions are estimated. From the best grid points the offset is estimated too. Errors have Student's t
+distribution, so that outliers have bounded influence (Lange, Little and Taylor 1989, Robust statistical modeling using
+the t distribution); its scales are estimated. Only the offset is used: the other parameters also absorb wheel errors
+within a pass.
 """
 
 from collections.abc import Sequence
@@ -28,24 +28,24 @@ _STEP_S: Final = 0.1
 _GRID_STEPS: Final = 5
 _FINAL_STEPS: Final = 15
 _MOST_STARTS: Final = 2
-_CONVERGED: Final = 1e-3  # in sigmas of the prior
-_NEARLY: Final = 1e-2  # good enough for the curve
-# One Gauss-Newton step goes no farther.
+_CONVERGED: Final = 1e-3  # in prior sigmas
+_NEARLY: Final = 1e-2  # sufficient for the profile
+# Bounds on one Gauss-Newton step.
 _LONGEST_STEP: Final = np.array([0.2, 0.02, 0.2, 0.3, 0.3, 0.1, 0.1, 0.1])
 _LONGEST_TAG_STEP_M: Final = 1.0
-# Farther off no step takes them: at -1 turn factor and tag scale make no sense.
+# Bounds on the parameters: at -1 turn factor and tag scale are singular.
 _LARGEST: Final = np.array([2.0, 0.5, 0.9, 5.0, 5.0, 2.0, 5.0, 0.9])
 _DEGREES_OF_FREEDOM: Final = 3.0
 
-# Fewer have no blocks to compare.
+# Fewer passes do not form enough blocks.
 _FEWEST_PASSES: Final = 12
 _BLOCKS: Final = 20
 _PASSES_OF_A_BLOCK: Final = 2
 _FEWEST_BLOCKS: Final = 4
-# What all blocks err by alike: a driver who answers what the floor does to the robot makes stamps look late. In ten
-# simulated floors of the paper it is 4 ms on average.
+# Error common to all blocks: a driver who corrects for the floor's disturbances makes stamps look late, by 4 ms on
+# average in ten simulated floors of the paper.
 _COMMON_SIGMA_S: Final = 0.005
-# All offsets so far from the best one must be worse by so much in chi-square, dependent errors taken into account.
+# All offsets farther than this must be worse by this chi-square, corrected for correlated errors.
 _APART_S: Final = 0.3
 _CLEAR_CHI2: Final = 10.0
 _LARGEST_SIGMA_S: Final = 0.1
@@ -53,14 +53,14 @@ _LARGEST_SIGMA_S: Final = 0.1
 
 @dataclass(frozen=True)
 class TimeOffsetSearch:
-    """A time offset of a robot's sensor of tags against its wheels.
+    """Time offset of a robot's tag sensor against its wheels.
 
     Attributes:
-        offset_s: by so much stamps are late, beyond what robot.yaml says.
-        sigma_s: its standard deviation, by how blocks of the drives differ.
-        grid_s: (G,) offsets that were tried, rising.
-        cost: (G,) negative log-likelihood at each, less that of `offset_s` and divided by how many times errors within
-            a block are repeated: 0.5 is one sigma.
+        offset_s: delay of the stamps beyond robot.yaml's value.
+        sigma_s: its standard deviation, from the differences between blocks of the drives.
+        grid_s: (G,) offsets tried, increasing.
+        cost: (G,) negative log-likelihood at each, relative to `offset_s` and divided by the variance inflation of
+            correlated errors within blocks: 0.5 is one sigma.
     """
 
     offset_s: float
@@ -70,7 +70,7 @@ class TimeOffsetSearch:
 
 
 class _OffsetEstimate(NamedTuple):
-    """Where an iteration is: parameters (8,), places of tags (G, 2) and scales (2,) of the sigmas."""
+    """An iterate: parameters (8,), tag positions (G, 2) and scales (2,) of the sigmas."""
 
     parameters: FloatArray
     tags_m: FloatArray
@@ -81,26 +81,26 @@ class _OffsetEstimate(NamedTuple):
 
 
 class _Pulls(NamedTuple):
-    """What each of G passes says of the parameters, its tag's place eliminated."""
+    """Normal equations of the parameters from each of G passes, its tag position eliminated."""
 
     information: FloatArray  # (G, 8, 8)
     gradient: FloatArray  # (G, 8)
-    tag_step_m: FloatArray  # (G, 2) to the best place by the parameters as they are
-    tag_by_parameters: FloatArray  # (G, 2, 8) by which the best place moves with them
+    tag_step_m: FloatArray  # to the optimal position at the current parameters
+    tag_by_parameters: FloatArray  # derivative of the optimal position
 
 
 def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
-    """The time offset that drives of one robot tell, within a second to either side of robot.yaml's.
+    """Return the time offset of one robot, within a second to either side of robot.yaml's.
 
-    Neither a map nor a good guess is needed: in each pass of a tag the wheels carry the robot on, and only with the
-    right offset do readings of all passes agree with one mounting of the sensor.
+    Neither a map nor a good initial guess is needed: the wheels carry the robot through each pass of a tag, and only at
+    the right offset do the observations of all passes agree with one mounting of the sensor.
 
     Args:
         runs: all with the same robot.yaml, their stamps shifted by its time_offset_s as `load_run` does.
 
     Returns:
-        None where drives do not tell it: robots that stand, or drive all the time at one speed and turning rate; too
-        few readings; an offset beyond a second; several offsets that are as good.
+        None where it is not observable: for robots that stand still or drive at one speed and turning rate, too few
+        observations, an offset beyond a second, or several equally good offsets.
     """
     passes = gather_passes(runs)
     if passes is None or len(passes) < _FEWEST_PASSES:
@@ -123,7 +123,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
 
 
 def _curve(passes: Passes) -> dict[float, tuple[_OffsetEstimate, float]]:
-    """By offset what is best there, and its cost; each begins where its neighbour towards zero ended."""
+    """Return the optimum and its cost by offset; each starts from its neighbour's towards zero."""
     zero = np.zeros(len(PARAMETERS))
     start = _OffsetEstimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
     found = {0.0: _iterate(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
@@ -137,7 +137,7 @@ def _curve(passes: Passes) -> dict[float, tuple[_OffsetEstimate, float]]:
 
 
 def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
-    """The lowest minima of the curve."""
+    """Return the offsets of the lowest minima."""
     padded = np.pad(costs, 1, constant_values=np.inf)
     minima = np.flatnonzero((costs <= padded[:-2]) & (costs <= padded[2:]))
     lowest = minima[np.argsort(costs[minima])][:_MOST_STARTS]
@@ -147,7 +147,7 @@ def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
 def _iterate(
     passes: Passes, estimate: _OffsetEstimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
 ) -> tuple[_OffsetEstimate, float]:
-    """Gauss-Newton steps under weights of Student's t; the estimate, and its cost."""
+    """Return the estimate after Gauss-Newton steps with Student's t weights, and its cost."""
     free = slice(0 if free_offset else 1, None)
     for _ in range(most_steps):
         model = linearise(passes, estimate.parameters, estimate.tags_m)
@@ -170,7 +170,7 @@ def _iterate(
 
 
 def _scale(passes: Passes, residual: FloatArray, scale: FloatArray) -> FloatArray:
-    """(2,) maximum likelihood scales of the sigmas, by a few steps of expectation maximisation; a pass spends one."""
+    """Return (2,) maximum-likelihood scales of the sigmas, by three EM steps; each pass costs a degree of freedom."""
     square = (residual / passes.sigma) ** 2
     for _ in range(3):
         weighed = (_DEGREES_OF_FREEDOM + 1.0) / (_DEGREES_OF_FREEDOM + square / scale**2) * square
@@ -179,7 +179,7 @@ def _scale(passes: Passes, residual: FloatArray, scale: FloatArray) -> FloatArra
 
 
 def _weights(passes: Passes, residual: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(M, 2) weights of squared residuals, and (2,) by how much less than that errors of this spread curve the cost."""
+    """Return (M, 2) weights of squared residuals, and (2,) mean curvature of the loss relative to these weights."""
     sigma, nu = passes.sigma * scale, _DEGREES_OF_FREEDOM
     square = (residual / sigma) ** 2
     weights = (nu + 1.0) / (nu + square)
@@ -188,7 +188,7 @@ def _weights(passes: Passes, residual: FloatArray, scale: FloatArray) -> tuple[F
 
 
 def _cost(passes: Passes, estimate: _OffsetEstimate) -> float:
-    """Negative log-likelihood with the priors, but for a constant."""
+    """Return the negative log-likelihood with the priors, up to a constant."""
     residual, nu = linearise(passes, estimate.parameters, estimate.tags_m).residual, _DEGREES_OF_FREEDOM
     losses = 0.5 * (nu + 1.0) * np.log1p((residual / (passes.sigma * estimate.scale)) ** 2 / nu)
     of_scales = (len(residual) - len(passes)) * np.log(estimate.scale).sum()
@@ -196,7 +196,7 @@ def _cost(passes: Passes, estimate: _OffsetEstimate) -> float:
 
 
 def _pulls(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _Pulls:
-    """Sums of weighed squares (M, 2) over each pass, and the place of its tag eliminated by Schur's complement."""
+    """Return normal equations of each pass from weights (M, 2), its tag position eliminated by the Schur complement."""
     rows = np.concatenate([model.by_tag, model.by_parameters, model.residual[..., None]], axis=-1)
     squares = (rows * weights[..., None]).swapaxes(-1, -2) @ rows
     sums = np.add.reduceat(squares, passes.first)
@@ -208,11 +208,11 @@ def _pulls(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _Pul
 
 
 def _scatter(passes: Passes, found: _OffsetEstimate) -> tuple[float, float]:
-    """Sigma of the offset, and how many times errors within blocks of the drives are repeated, at least once.
+    """Return the offset's sigma, and the variance inflation by correlated errors within blocks, at least 1.
 
-    By the jackknife: by how much the estimate moves when a block of passes is left out, to first order (CR3 of Bell and
-    McCaffrey 2002, Bias reduction in standard errors for linear regression with multi-stage samples). A block is a
-    segment of the drives, and all blocks tell about as much of the offset. Infinite where there are too few of them.
+    By the jackknife: the change of the estimate, to first order, when a block of passes is left out (CR3 of Bell and
+    McCaffrey 2002, Bias reduction in standard errors for linear regression with multi-stage samples). A block is
+    contiguous in time, and all have about the same information about the offset. Infinite if there are too few blocks.
     """
     model = linearise(passes, found.parameters, found.tags_m)
     weights, curvature = _weights(passes, model.residual, found.scale)

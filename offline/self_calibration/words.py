@@ -1,4 +1,4 @@
-"""What self-calibration did, in words: corrections, why a number stayed, and which drive would tell it."""
+"""Sentences about self-calibration: corrections, why a parameter was not freed, and which drive would determine it."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -7,28 +7,28 @@ from typing import Final
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, MapResult
 from groundsbot.offline.self_calibration.selection import TELLS_LESS
 
-# How to drive so that it can be told.
+# Drives that determine each parameter.
 DRIVES: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "wheel_scale": "give a measured --distance, or exact tag sizes: wheels and tags can be stretched together",
+        "wheel_scale": "give a measured --distance, or exact tag sizes: wheels and tags can be scaled together",
         "wheel_ratio": "drive straight for 20 m and more, past tags at both ends",
         "track_scale": "turn on the spot, whole turns to either side, in view of tags",
-        "tag_scale": "give a measured --distance, or exact wheel radii: wheels and tags can be stretched together",
+        "tag_scale": "give a measured --distance, or exact wheel radii: wheels and tags can be scaled together",
         "mount_x_m": "turn on the spot, whole turns to either side, with tags near",
         "mount_y_m": "turn on the spot, whole turns to either side, with tags near",
         "mount_yaw_rad": "drive straight towards tags and past them",
-        "mount_roll_rad": "pass tags that hang at different heights, near, and far to either side; add --model corners",
+        "mount_roll_rad": "pass tags mounted at different heights, near, and far to either side; add --model corners",
         "mount_pitch_rad": "drive towards tags from afar until they are near; add --model corners",
         "time_offset_s": "turn on the spot to and fro, fast, in view of tags",
         "range_offset_m": "see the same tags from near and from afar",
         "edge_shift_px": "see the same tags from near and from afar; add --model corners",
-        "focal_scale": "drive straight towards tags from afar until they are near; only --model corners tells it",
+        "focal_scale": "drive straight towards tags from afar until they are near, and map with --model corners",
     }
 )
 
 
 def refusal_lines(result: MapResult) -> list[str]:
-    """Why what was asked for by name was not freed, for a terminal."""
+    """Return terminal lines with the reason for each requested parameter that was not freed."""
     return [
         f"not freed: {each.name} of {each.owner}: {choice_words(each)}"
         for each in result.choices
@@ -37,20 +37,20 @@ def refusal_lines(result: MapResult) -> list[str]:
 
 
 def correction_words(entry: CalibrationResult) -> str:
-    """A correction with its sigma."""
+    """Return a correction with its sigma."""
     return f"{entry.name} of {entry.owner}: {entry.value:+.5f} (sigma {entry.sigma:.5f})"
 
 
 def choice_words(choice: CalibrationChoice) -> str:
-    """Freed, or why not and what to drive."""
+    """Return that a parameter was freed, or why not and what to drive."""
     if choice.is_freed:
         return "freed"
-    drive = f"; to tell it, {DRIVES[choice.name]}" if choice.reason == TELLS_LESS else ""
-    return f"held by robot.yaml's sigma {choice.prior_sigma:.5f}: {choice.reason}{drive}"
+    drive = f"; to determine it, {DRIVES[choice.name]}" if choice.reason == TELLS_LESS else ""
+    return f"kept at robot.yaml's sigma {choice.prior_sigma:.5f}: {choice.reason}{drive}"
 
 
 def learnt_lines(result: MapResult, chosen: Sequence[CalibrationResult]) -> list[str]:
-    """A line for each number that was learnt, and what became of it."""
+    """Return a line for each correction, with the decision about it."""
     words = {(each.owner, each.name): choice_words(each) for each in result.choices}
     return [
         f"{correction_words(entry)}; {words.get((entry.owner, entry.name), 'held: not seen from a floor')}"

@@ -1,1 +1,1 @@
-"""Components joined over the single tags that they share, once each is solved on corners."""
+"""Join components over the single tags that they share, once each is solved on corners."""

@@ -1,11 +1,11 @@
-"""How one solved component lies in another by tags that hang in both: place, height and orientation of each.
+"""Transform between two solved components from tags in both: position, height and orientation of each.
 
-A tag in space has six numbers, a floor's transform three. So one shared tag gives the whole transform, and three
-numbers are left to hold against chance: the tag must hang at one height and lean one way in both. The least squares of
-the six differences under their joint covariance (generalised least squares, Gauss-Newton) gives all of that.
+A tag in space has six parameters, a transform of the floor three. So one shared tag determines the transform, and three
+degrees of freedom remain for a test: the tag must have one height and one tilt in both. The fit is generalised least
+squares of the six differences under their joint covariance (Gauss-Newton).
 
-Each component is taken about a pose that saw the tags, which has no error there: how its start lies to that pose is no
-business of the tags, and a long way's bend would not be a small error.
+Each component is expressed relative to a pose that observed the tags and that has no error there. The error between its
+start and this pose does not matter for the tags, and after a long drive it would not be small.
 """
 
 from collections.abc import Sequence
@@ -24,22 +24,22 @@ from groundsbot.offline.measurements import REACH_M, UNMODELLED_SIGMA_M
 
 _STEPS: Final = 6
 _STRAIGHT_SIGMAS: Final = 2.0
-# Squared sigmas between two ways that are equally likely: together they vary by an eighth more than either.
+# Squared sigmas between two equally likely hypotheses: together their variance is an eighth larger.
 _COVERED: Final = 0.5
 
 
 @dataclass(frozen=True)
 class PlacedTags:
-    """K tags of a component about one of its poses.
+    """K tags of a component relative to one of its poses.
 
     Attributes:
         T_map_anchor: (3,) the pose.
         place_m: (K, 3) in its frame, height above the floor.
         turn: (K, 3, 3) R_anchor_tag.
-        covariance: (6 K, 6 K) of place and of a small turn about the anchor's axes, tag by tag.
-        nats: by how much less likely the looks are if the tags hang so, than as they fit best.
-        straightness: how much less likely they truly become where the first tag turns by two sigmas to the worse side,
-            over what first order foretells.
+        covariance: (6 K, 6 K) of position and of a small rotation about the anchor's axes, tag by tag.
+        nats: negative log likelihood of the corners with the tags in this pose, relative to their best pose.
+        straightness: true cost increase for a rotation of the first tag by two sigmas, to the side of the smaller one,
+            over the quadratic prediction.
     """
 
     T_map_anchor: FloatArray
@@ -51,21 +51,21 @@ class PlacedTags:
 
     @property
     def is_known(self) -> bool:
-        """Whether the tags are within reach at all, rather than far off where no look says anything."""
+        """Whether the tags are within reach at all, rather than far off where corners contain no information."""
         return float(np.trace(self.covariance)) < REACH_M**2
 
 
 @dataclass(frozen=True)
 class TagFit:
-    """One component in another.
+    """Transform of one component in another.
 
     Attributes:
         a: the tags in one, b: in the other.
         T_a_b: (3,) pose of b's map in a's.
         T_anchors: (3,) of b's anchor in a's.
-        covariance: (3, 3) of T_anchors as x, y, theta; with what is unmodelled.
-        rise: squared sigmas, chi-square with `freedom` where the tags hang alike in both.
-        nats: minus the log likelihood, up to a constant that all ways of the same tags share.
+        covariance: (3, 3) of T_anchors as x, y, theta; includes unmodelled errors.
+        cost_increase: squared sigmas, chi-square with `freedom` where the tags have the same pose in both.
+        nats: negative log likelihood, up to a constant common to all hypotheses about the same tags.
     """
 
     a: PlacedTags
@@ -78,21 +78,21 @@ class TagFit:
 
     @property
     def T_a_b(self) -> FloatArray:
-        """(3,) pose of map b in map a."""
+        """Pose (3,) of map b in map a."""
         return se2.compose(se2.compose(self.a.T_map_anchor, self.T_anchors), se2.inverse(self.b.T_map_anchor))
 
     @property
     def heading_sigma_rad(self) -> float:
-        """How well it is known how one is turned against the other."""
+        """Sigma of the heading of one relative to the other."""
         return float(self.covariance[2, 2] ** 0.5)
 
     @property
     def closes(self) -> bool:
-        """Whether chance explains how the tags differ."""
+        """Whether the differences of the tags pass the chi-square test."""
         return self.cost_increase < float(chi2.isf(FALSE_ALARM, self.freedom))
 
     def covers(self, other: "TagFit") -> bool:
-        """Whether this covariance will do for both ways, whichever is true."""
+        """Return whether this covariance suffices for both hypotheses, whichever is true."""
         off = self.T_anchors - other.T_anchors
         off[2] = se2.wrap_angle(off[2])
         return float(off @ np.linalg.solve(self.covariance, off)) < _COVERED
@@ -101,13 +101,13 @@ class TagFit:
 def placed_tags(
     solution: CornerSolution, tags: IntArray, anchor: int, variance_factor: float, nats: float
 ) -> PlacedTags:
-    """Some tags of a converged solution about a pose.
+    """Return some tags of a converged solution relative to a pose.
 
     Args:
         solution: on corners.
         tags: (K,) indices.
         anchor: index of the pose.
-        variance_factor: the covariance's.
+        variance_factor: of the covariance.
         nats: see `PlacedTags`.
     """
     state, columns = solution.state, solution.problem.columns
@@ -130,7 +130,7 @@ def placed_tags(
 
 
 def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
-    """Near a frontal view a tag's turn shows in second order only, and its sigma there is not what it is beside it."""
+    """Return the cost increase for a two-sigma rotation of the tag over its prediction (see `PlacedTags`)."""
     if solution.factor is None:
         return 0.0
     state, columns = solution.state, solution.problem.columns
@@ -148,7 +148,7 @@ def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
 
 
 def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
-    """The transform that brings the tags of b onto those of a."""
+    """Return the transform that aligns the tags of b with those of a."""
     k = len(a.place_m)
     relative = a.turn @ b.turn.swapaxes(-1, -2)
     theta = float(
@@ -164,14 +164,14 @@ def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
     residual, by_transform, S = _linearise(a, b, T)
     information = by_transform.T @ np.linalg.solve(S, by_transform)
     rise = float(residual @ np.linalg.solve(S, residual))
-    # The likelihood of all poses of the tags and of all transforms, each as likely as any other (Laplace).
+    # The likelihood integrated over all poses of the tags and over all transforms, with uniform priors (Laplace).
     logarithms = [float(np.linalg.slogdet(each)[1]) for each in (S, information, a.covariance, b.covariance)]
     nats = 0.5 * (rise + logarithms[0] + logarithms[1] - logarithms[2] - logarithms[3]) + a.nats + b.nats
     return TagFit(a, b, T, np.linalg.inv(information), rise, 6 * k - 3, nats)
 
 
 def _linearise(a: PlacedTags, b: PlacedTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
+    """Return differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
     k = len(a.place_m)
     turned = Rotation.from_euler("z", T[2]).as_matrix()
     in_a = b.place_m @ turned.T
@@ -187,9 +187,9 @@ def _linearise(a: PlacedTags, b: PlacedTags, T: FloatArray) -> tuple[FloatArray,
 
 
 def _unmodelled_covariance(a: PlacedTags, b: PlacedTags) -> FloatArray:
-    """(6 K,) sigmas beyond what covariances say, of each difference: a centimetre, and what moves a tag by that.
+    """Return (6 K,) unmodelled sigmas of the differences: a centimetre, and the rotation of a tag that goes with it.
 
-    What a mount's pitch or a lens's remains shift by a centimetre at its range, they turn by that over the range.
+    A mount's pitch or residual lens distortion that shifts a tag by a centimetre rotates it by that over its range.
     """
     range_m = np.minimum(*(np.linalg.norm(each.place_m[:, :2], axis=1) for each in (a, b)))
     turned = UNMODELLED_SIGMA_M / np.maximum(range_m, UNMODELLED_SIGMA_M)
@@ -197,7 +197,7 @@ def _unmodelled_covariance(a: PlacedTags, b: PlacedTags) -> FloatArray:
 
 
 def radial_sigmas(solution: CornerSolution, anchor: int, starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """How far tags and some poses lie from a pose (N,), and how well that distance is known (N,)."""
+    """Return (N,) distances of tags and some poses from a pose, and (N,) their sigmas."""
     state, columns = solution.state, solution.problem.columns
     pose = state.poses[anchor]
     points = np.concatenate([state.tags, state.poses[list(starts), :2]]) - pose[:2]
@@ -205,7 +205,7 @@ def radial_sigmas(solution: CornerSolution, anchor: int, starts: Sequence[int]) 
     way = points / np.maximum(far_m, 1e-9)[:, None]
     which = np.concatenate([columns.poses[anchor, :2], columns.tags.ravel(), columns.poses[list(starts), :2].ravel()])
     joint = solution.covariance(which)
-    # A pose's columns are along its own axes, a tag's along map's.
+    # A pose's columns are along its own axes, a tag's along those of the map.
     axes = [pose[2], *np.zeros(len(state.tags)), *state.poses[list(starts), 2]]
     turn = Rotation.from_euler("z", np.array(axes)[:, None]).as_matrix()[:, :2, :2]
     by = np.zeros((len(points), len(which)))

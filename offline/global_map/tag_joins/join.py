@@ -1,7 +1,7 @@
-"""Components joined over the single tags that they share, once each is solved on corners and its tags hang in space.
+"""Join components over single shared tags, once each is solved on corners and its tags have poses in space.
 
-About a shared place two maps may still turn; about a tag's pose they may not. What one tag cannot tell is whether it
-was moved in between: a join over one is weak, and said to be. Two that agree bear each other out.
+About a shared point two maps may still rotate; about a tag's pose they may not. A single tag cannot show whether it was
+moved in between: a join over one is weak, and reported as such. Two that agree confirm each other.
 """
 
 from collections.abc import Sequence
@@ -23,19 +23,19 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.sam import Graph, Parameter, StartFactors, State, build_graph, solve
 
-# Against what tags and wheels tell of headings this is nothing; it is there for what they do not.
+# Negligible against the heading information of tags and wheels; it acts only where they have none.
 _HELD_RAD: Final = 1.0
 
 
 @dataclass(frozen=True)
 class TagJoin:
-    """What tags that two components share say of how these lie to each other.
+    """A join of two components over tags that they share.
 
     Attributes:
-        a: a run that saw the first of the tags; b: one of the other component, by name.
+        a: a run that observed the first of the tags; b: one of the other component, by name.
         tags: that both have.
         T_a_b: (3,) pose of b's start in a's.
-        rivals: likewise, other ways to lay them that explain the corners as well.
+        rivals: likewise, of alternatives that explain the corners as well.
         verdict: of the components' own maps.
         reason: why they are not joined; empty where they are.
     """
@@ -50,11 +50,11 @@ class TagJoin:
 
     @property
     def is_weak(self) -> bool:
-        """Nothing would show that the tag was moved in between."""
+        """Whether it would go unnoticed that the tag was moved in between."""
         return len(self.tags) == 1
 
     def refuse(self, why: str) -> "TagJoin":
-        """Not made after all."""
+        """Return the join as not made, with the reason."""
         ids = ", ".join(str(tag.tag_id) for tag in self.tags)
         return replace(self, reason=f"{self.b} shares only tag{'s' * (not self.is_weak)} {ids} with {self.a}: {why}")
 
@@ -67,15 +67,15 @@ def join_over_tags(
     stages: Stages,
     upright_sigma_rad: float | None = None,
 ) -> tuple[list[SolvedComponent], list[TagJoin]]:
-    """Joins components of which no two runs share more than a tag, as far as the tags tell how they lie.
+    """Join components of which no two runs share more than a tag, where the tags determine their transform.
 
     Args:
         maps: local maps.
-        merged: how their components came about.
+        merged: the merge that gave their components.
         solved: these, refined on corners.
-        measurements: what somebody measured.
-        stages: told what is being done.
-        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
+        measurements: by a person.
+        stages: notified of progress.
+        upright_sigma_rad: sigma of the tags' tilt where they are known to be upright; None: any tilt.
 
     Returns:
         The components, largest first, and all joins tried: those made, then those not made with their reasons.
@@ -103,14 +103,14 @@ class _Joiner:
         self, maps: Sequence[LocalMap], merged: Merge, measurements: Measurements, upright_sigma_rad: float | None
     ) -> None:
         self._maps, self._measurements, self._upright_sigma_rad = maps, measurements, upright_sigma_rad
-        # Where a pair of runs shares more than a tag, alignment had the say.
+        # Runs that share more than a tag were decided by the alignment.
         self._decided = {frozenset((pair.a, pair.b)) for pair in merged.pairs if len(pair.shared) > 1}
         self._judged: dict[_Key, TagJoin | None] = {}
         self.made: dict[_Key, TagJoin] = {}
         self.refused: dict[_Key, TagJoin] = {}
 
     def join(self, solved: list[SolvedComponent]) -> list[SolvedComponent]:
-        """The surest first, until none is left; where several contradict each other, none of them is made."""
+        """Join components, most certain first, until no join is left; of contradicting joins none is made."""
         components, self.made = solved, {}
         while True:
             tries = [each for a, b in combinations(components, 2) if (each := self._try(a, b)) is not None]
@@ -129,13 +129,13 @@ class _Joiner:
                 components = [whole, *(each for each in components if each is not a and each is not b)]
 
     def _undo_weak_joins(self, tries: Sequence[_Try]) -> bool:
-        """Takes weak joins back on which components rest whose shared tags contradict each other; whether any were."""
+        """Withdraw weak joins whose components share tags that contradict each other; return whether there were any."""
         wrong = {
             m for a, b, join in tries if join.reason and not join.is_weak for m in (*_key(a, b)[0], *_key(a, b)[1])
         }
         back = {key: join for key, join in self.made.items() if join.is_weak and wrong.issuperset((*key[0], *key[1]))}
         for key, join in back.items():
-            self.refused[key] = join.refuse("other tags that their runs share contradict that it stayed where it was")
+            self.refused[key] = join.refuse("other tags that their runs share contradict that it stayed in place")
         return bool(back)
 
     def _try(self, a: SolvedComponent, b: SolvedComponent) -> _Try | None:
@@ -149,7 +149,7 @@ class _Joiner:
         return None if join is None else _Try(a, b, join)
 
     def _judge(self, a: SolvedComponent, b: SolvedComponent) -> TagJoin | None:
-        """None where they share no tag that both know in space, or one that either has in several places."""
+        """Return the join; None where no shared tag has a pose in space in both, or one is in several places."""
         tags = tuple(sorted({tag.whole for tag in a.graph.tags} & {tag.whole for tag in b.graph.tags}))
         if not tags or not all(tag in each.graph.tags for tag in tags for each in (a, b)):
             return None
@@ -165,7 +165,7 @@ class _Joiner:
         return TagJoin(names[0], names[1], tags, T_a_b, tuple(rivals), found, found.reason(names[0], names[1], tags))
 
     def _together(self, a: SolvedComponent, b: SolvedComponent, T_a_b: FloatArray) -> SolvedComponent:
-        """Both solved in one; on the floor, where they may turn about a single tag, held as they lie."""
+        """Solve both in one. On the floor they may rotate about a single tag, so headings get weak priors."""
         if b.members.members[0] < a.members.members[0]:
             return self._together(b, a, se2.inverse(T_a_b))
         placed = [(a, np.zeros(3)), (b, T_a_b)]
@@ -193,7 +193,7 @@ class _Joiner:
 
 
 def _with_heading_priors(graph: Graph, start: State) -> Graph:
-    """The graph with the headings of all segments held softly where they start."""
+    """Return the graph with weak heading priors at the starts of all segments."""
     poses = graph.first_pose[1:]
     measured = graph.problem.measured
     softly = np.tile(np.diag([0.0, 0.0, 1.0 / _HELD_RAD]), (len(poses), 1, 1))
@@ -210,10 +210,10 @@ def _key(a: SolvedComponent, b: SolvedComponent) -> _Key:
 
 
 def _state(component: SolvedComponent) -> State:
-    """As the map has it."""
+    """Return the state of the map."""
     return component.solution.state if component.refined is None else component.refined.solution.state
 
 
 def _poses(component: SolvedComponent) -> FloatArray:
-    """(P, 3) as the map has them."""
+    """Return (P, 3) poses of the map."""
     return _state(component).poses

@@ -1,4 +1,4 @@
-"""What joining over single tags found, in words for a person and typed for the result."""
+"""Joins over single tags, as sentences and as typed results."""
 
 from collections.abc import Sequence
 from math import degrees
@@ -13,12 +13,12 @@ from groundsbot.offline.maps import AlignmentResult, AlternativeResult
 
 
 def join_results(components: Sequence[SolvedComponent], joins: Sequence[TagJoin]) -> tuple[AlignmentResult, ...]:
-    """One for each join made, as the map has it, and for each that is ambiguous."""
+    """Return a result for each join made, as in the map, and for each ambiguous one."""
     return tuple(_result(components, join) for join in joins if not join.reason or join.rivals)
 
 
 def join_warnings(joins: Sequence[TagJoin], results: Sequence[AlignmentResult]) -> list[str]:
-    """Of the joins made that rest on one tag.
+    """Return warnings about joins made over one tag.
 
     Args:
         joins: all.
@@ -27,7 +27,7 @@ def join_warnings(joins: Sequence[TagJoin], results: Sequence[AlignmentResult]) 
     covariance = {(each.from_run, each.to_run): each.covariance for each in results}
     return [
         f"{join.b} is joined to {join.a} by tag {join.tags[0].tag_id} alone ({_sigmas(covariance[join.a, join.b])}): "
-        "if that was moved in between, nothing shows it; one more shared tag would make it sure"
+        "a move of that tag in between would go unnoticed; drive past one more shared tag to confirm the join"
         for join in joins
         if join.is_weak and not join.reason
     ]
@@ -54,7 +54,7 @@ def _result(components: Sequence[SolvedComponent], join: TagJoin) -> AlignmentRe
 
 
 def _in_map(components: Sequence[SolvedComponent], join: TagJoin) -> tuple[FloatArray, FloatArray | None]:
-    """T_a_b (3,) of two starts as the map has it, and its covariance (3, 3) as x, y, theta in a's frame."""
+    """Return T_a_b (3,) of two starts in the map, and its covariance (3, 3) as x, y, theta in a's frame."""
     for graph, refined in ((each.graph, each.refined) for each in components):
         names = [segment.name for segment in graph.segments]
         if refined is None or not {join.a, join.b} <= {*names}:

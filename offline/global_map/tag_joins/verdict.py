@@ -1,4 +1,4 @@
-"""Whether shared tags tell how two components lie to each other: well enough, in one way only, and as one."""
+"""Decide whether shared tags determine the transform between two components: accurately, uniquely and consistently."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,21 +23,21 @@ from groundsbot.offline.global_map.tag_joins.fit import (
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 
-# Then sigma is no more than 1.4 times what first order says of it; where a tag is seen squarely it may be anything.
+# Then sigma is at most 1.4 times its first-order value; where a tag is seen frontally it may be anything.
 _LEAST_STRAIGHTNESS: Final = 0.5
-_SAME_RAD: Final = 1e-3  # solves that end nearer than this are one
-# Mean square of a turn's second-order part phi^2 / 2, over sigma^4: E phi^4 / 4 = 3/4.
+_SAME_RAD: Final = 1e-3  # optima closer than this are one
+# Root mean square of a rotation's second-order part phi^2 / 2, over sigma^2: E phi^4 / 4 = 3/4 sigma^4.
 _BENT: Final = 0.75**0.5
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How one component lies in another by the tags of both.
+    """Transform of one component in another from the tags of both.
 
     Attributes:
-        best: the likeliest way.
-        rivals: other ways that are not a hundred times less likely: a picture of a tag allows two poses.
-        most_heading_sigma_rad: how well its turn must be known.
+        best: the most likely hypothesis.
+        rivals: alternatives at least a hundredth as likely: a picture of a tag allows two poses.
+        most_heading_sigma_rad: upper bound on the heading sigma.
     """
 
     best: TagFit
@@ -45,7 +45,7 @@ class Verdict:
     most_heading_sigma_rad: float
 
     def reason(self, a: str, b: str, tags: Sequence[TagKey]) -> str:
-        """Why component b, by the name of a run that saw the tags, is not joined to a; empty where it is."""
+        """Return why component b, by the name of a run that saw the tags, is not joined to a; empty where it is."""
         ids = ", ".join(str(tag.tag_id) for tag in tags)
         head = f"{b} shares only tag{'s' * (len(tags) > 1)} {ids} with {a}"
         fit = self.best
@@ -53,29 +53,29 @@ class Verdict:
             off = f"{fit.cost_increase:.0f} squared sigmas, where chance explains {fit.freedom}"
             if len(tags) > 1:
                 return f"{head}, each run one of them, and they contradict each other ({off}): were tags moved?"
-            return f"{head}, which hangs at another height there or leans another way ({off}): was it moved?"
+            return f"{head}, which has another height or another tilt there ({off}): was it moved?"
         if fit.heading_sigma_rad > self.most_heading_sigma_rad:
             known, wanted = degrees(fit.heading_sigma_rad), degrees(self.most_heading_sigma_rad)
             return (
-                f"{head}, seen too poorly to join them: it tells how they are turned to {known:.1f} deg, and "
-                f"{wanted:.1f} deg would do; look at it from near and from the side, or drive past one more shared tag"
+                f"{head}, seen too poorly to join them: it gives their relative heading to {known:.1f} deg, and "
+                f"{wanted:.1f} deg are needed; view it from near and from the side, or drive past one more shared tag"
             )
         if min(fit.a.straightness, fit.b.straightness) < _LEAST_STRAIGHTNESS:
             return (
-                f"{head}, seen too squarely to join them: how it is turned hardly shows; look at it from the side, or "
+                f"{head}, seen too frontally to join them: its orientation hardly shows; view it from the side, or "
                 "drive past one more shared tag"
             )
         if self.rivals:
             turns = ", ".join(f"{degrees(each.T_a_b[2]):.1f}" for each in (fit, *self.rivals))
             return (
-                f"{head}, which by its corners may hang in {1 + len(self.rivals)} ways, and {b} be turned by {turns} "
-                "deg: look at it from the side, or drive past one more shared tag"
+                f"{head}, whose corners allow {1 + len(self.rivals)} orientations, so {b} may be turned by {turns} "
+                "deg: view it from the side, or drive past one more shared tag"
             )
         return ""
 
 
 def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, tags: Sequence[TagKey]) -> Verdict | None:
-    """What tags that hang in both tell; None where one of them is not known in space.
+    """Return the transform from tags in both components; None where one of them has no pose in space.
 
     Args:
         maps: local maps.
@@ -97,7 +97,7 @@ def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, ta
 
 
 def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[TagKey]) -> list[PlacedTags]:
-    """How the tags may hang in a component; of several only as they hang in its map: a wrong one would not fit."""
+    """Return possible poses of the tags in a component; of several tags only the map's, as wrong ones would not fit."""
     refined = component.refined
     if refined is None:
         return []
@@ -113,12 +113,12 @@ def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[T
 
 
 def _other_solves(own: CornerSolution, tag: int) -> list[CornerSolution]:
-    """Other optima of the whole component, found from the other ways in which its looks allow a tag to hang."""
+    """Return other optima of the whole component, started from the other poses that the tag's corners allow."""
     found: list[CornerSolution] = []
     for start in alternative_states(own.problem, own.state, tag):
         try:
             other = solve_corners(own.problem, start)
-        except NotPositiveError:  # run off to where no look says anything
+        except NotPositiveError:  # diverged to where corners contain no information
             continue
         turn = other.state.turns[tag]
         known = [each.state.turns[tag] for each in (own, *found)]
@@ -128,7 +128,7 @@ def _other_solves(own: CornerSolution, tag: int) -> list[CornerSolution]:
 
 
 def _variance_factor(maps: Sequence[LocalMap], component: SolvedComponent, refined: Refined) -> float:
-    """By which noise is larger than was told, by what the runs and the corners leave over; 1 at least."""
+    """Return the factor of the noise variance, from the residuals of the runs and the corners, at least 1."""
     problem = refined.solution.problem
     n_priors = int((problem.prior.sigma > 0.0).sum())
     freedom = problem.n_residuals + n_priors - problem.columns.n
@@ -137,10 +137,10 @@ def _variance_factor(maps: Sequence[LocalMap], component: SolvedComponent, refin
 
 
 def _most_heading_sigma(component: SolvedComponent, tag: TagKey) -> float:
-    """How well the turn about a tag must be known for a component to be turned by it.
+    """Return the largest heading sigma about a tag with which a component may be rotated.
 
-    A turn by phi brings what is L away nearer by L phi^2 / 2, of which covariances, being of first order, know nothing.
-    In the root mean square, L sigma^2 sqrt(3/4), that must be less than what is not known of the distance L anyway.
+    A rotation by phi brings points at distance L nearer by L phi^2 / 2, which first-order covariances do not contain.
+    Its root mean square, L sigma^2 sqrt(3/4), must be less than the sigma of the distance L itself.
     """
     refined = component.refined
     if refined is None:

@@ -124,7 +124,7 @@ def test_a_run_with_a_single_tag(map_to: Run, logs: dict[str, Path], tmp_path: P
     log = write_drive(tmp_path / "single", DRIVES["b"], TAGS[:1], make_robot("s"))
     outcome = map_to(logs["a"], log)
     assert outcome.code == 3
-    assert "s_one saw a single tag, 0; two would fix its place" in outcome.out
+    assert "s_one saw a single tag, 0; two are needed to align" in outcome.out
     assert "shares only tag 0 with a_one" in outcome.out
 
 

@@ -111,14 +111,14 @@ def test_the_transform_knows_its_errors() -> None:
             "b",
             1,
             1,
-            "b_one shares only tag 1 with a_one, seen too poorly to join them: it tells how",
+            "b_one shares only tag 1 with a_one, seen too poorly to join them: it gives their",
         ),
-        ("b", 0, 5, "b_one shares only tag 0 with a_one, which by its corners may hang in"),
+        ("b", 0, 5, "b_one shares only tag 0 with a_one, whose corners allow"),
         (
             "raised",
             4,
             99,
-            "c_one shares only tag 4 with a_one, which hangs at another height there or leans",
+            "c_one shares only tag 4 with a_one, which has another height or another tilt there",
         ),
     ],
 )
@@ -146,7 +146,7 @@ def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> N
 def test_on_the_floor_one_tag_joins_nothing_but_the_way_out_is_told(runs: dict[str, Run]) -> None:
     result = build_map([seeing(runs["a"], 0, 1, 4), seeing(runs["b"], 4, 5, 6, 7)], NOISE)
     assert len(result.components) == 2
-    said = "shares only tag 4 with b_one; one more shared tag would do, and --model corners may do with the one"
+    said = "shares only tag 4 with b_one; one more shared tag would suffice, and with --model corners the one may"
     assert any(said in warning for warning in result.warnings), result.warnings
 
 

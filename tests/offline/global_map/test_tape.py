@@ -88,7 +88,7 @@ def test_a_distance_that_contradicts_is_said_with_its_sigmas() -> None:
     assert [told.contradicts for told in result.measurements] == [True, True]
     assert result.measurements[1].off_sigmas == pytest.approx(5.0, rel=1e-6)
     (said,) = [warning for warning in result.warnings if warning.startswith("--distance a_one,b_one")]
-    assert "measured 5.250 m, and everything else says otherwise by 5.0 sigma" in said
+    assert "measured 5.250 m, which contradicts everything else by 5.0 sigma" in said
 
 
 def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_badly() -> None:

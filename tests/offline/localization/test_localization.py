@@ -130,7 +130,7 @@ def with_second_places(known: MapResult, places: dict[int, tuple[float, float]])
     ("tags", "told"),
     [
         ((7, 8), "none of the 2 tags that c_one saw (7 (tag36h11), 8 (tag36h11)) is in"),
-        ((1, 7, 8), "c_one shares only tag 1 with the map; one more shared tag would do"),
+        ((1, 7, 8), "c_one shares only tag 1 with the map; one more shared tag would suffice"),
         ((), "c_one saw no tag"),
     ],
 )
@@ -143,7 +143,7 @@ def test_a_run_that_cannot_be_placed_is_refused(known: MapResult, tags: tuple[in
 
 def test_tags_that_all_lie_otherwise_are_the_wrong_map(known: MapResult) -> None:
     otherwise = {1: (0.0, 0.0), 2: (3.0, 3.0), 4: (6.0, -1.0)}
-    with pytest.raises(groundsbot.GroundsbotError, match="no two of them lie the same way in both maps"):
+    with pytest.raises(groundsbot.GroundsbotError, match="no two of them fit together in both maps"):
         localize(run_of("c", (1, 2, 4), otherwise), known)
 
 

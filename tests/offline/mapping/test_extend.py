@@ -89,12 +89,12 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
         return str(caught.value)
 
     assert "is in the map already" in told(runs=runs_of(folder, "a"))
-    assert "does not hold what its runs measured" in told(extending=replace(known, kept=()))
+    assert "does not contain its runs' measurements" in told(extending=replace(known, kept=()))
     kept = arrays_of(known.kept[0], "")
     older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
     assert (segment_from(kept, "") is None, segment_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
-    assert "does not hold corners" in told(corners=True)
+    assert "has no corners" in told(corners=True)
 
 
 def test_the_command_writes_elsewhere(run: Program, folder: Path, tmp_path: Path) -> None:

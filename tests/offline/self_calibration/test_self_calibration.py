@@ -119,7 +119,9 @@ def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
     assert freed_names(result) == set()
     assert all(each.reason for each in result.choices)
     assert AGREES in {each.verdict for each in result.robot_numbers}
-    assert verdict_lines(result.robot_numbers) == ["what these drives say of the robots: all as robot.yaml has it"]
+    assert verdict_lines(result.robot_numbers) == [
+        "robot parameters: these drives agree with robot.yaml in all of them"
+    ]
     off = map_runs(log, make_robot("a"), Calibrate())
     assert off.choices == ()
     for a, b in zip(off.components[0].tags, result.components[0].tags, strict=True):
@@ -174,9 +176,9 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     assert reasons["wheel_scale"] == TELLS_LESS
     assert {each.name for each in result.robot_numbers if each.verdict == ASKED} == {"wheel_ratio"}
     (refused_line,) = refusal_lines(result)
-    assert refused_line.startswith("not freed: wheel_scale of a: held by robot.yaml's sigma")
+    assert refused_line.startswith("not freed: wheel_scale of a: kept at robot.yaml's sigma")
     assert "--distance" in refused_line
-    assert reasons["track_scale"] == "it was not asked for"
+    assert reasons["track_scale"] == "it was not requested"
 
 
 def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> None:
@@ -214,11 +216,11 @@ def choice(
     [
         ([0.05, 0.051, 0.049], [0.001] * 3, "track_scale", ""),
         ([0.02, 0.021, 0.019], [0.001] * 3, "track_scale", "agrees"),
-        ([0.03, 0.01, -0.02], [0.05] * 3, "track_scale", "tell less"),
-        ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "foretell the others"),
-        ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "foretell the others"),
-        ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "no error of calibration"),
-        ([0.05, 0.0], [0.001, 9.0], "track_scale", "single segment"),
+        ([0.03, 0.01, -0.02], [0.05] * 3, "track_scale", "less well"),
+        ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "predict the others"),
+        ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "predict the others"),
+        ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "too much for a calibration error"),
+        ([0.05, 0.0], [0.001, 9.0], "track_scale", "only one section"),
         ([0.05, 0.051, 0.049], [0.001] * 3, "time_offset_s", ""),
     ],
 )
@@ -303,7 +305,7 @@ def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(log: Pat
     write_map(result, tmp_path)
     again = read_map(tmp_path)
     assert again.choices == result.choices
-    with pytest.raises(OfflineError, match="--calibrate: a kept map has its calibration"):
+    with pytest.raises(OfflineError, match="--calibrate: the map to extend is calibrated already"):
         build_map(read_runs([other]), extending=again, calibrate=Calibrate(is_on=True, names=("track_scale",)))
 
 
@@ -315,7 +317,7 @@ def test_the_command_writes_files_that_the_next_drive_is_mapped_with(log: Path, 
     assert found.code == 0, found.err
     assert "track_scale of a: -0.07" in found.out
     assert "; freed" in found.out
-    assert "to tell it, give a measured --distance" in found.out
+    assert "to determine it, give a measured --distance" in found.out
     assert "scale: known to" in found.out
     camera = read_robot_file(output).camera
     assert camera is not None
