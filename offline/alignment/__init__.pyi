@@ -1,9 +1,9 @@
 from .condensed_map import CondensedMap, condense, rotate_quarter
-from .joint_fit import FitState, LinearisedFit, hold
+from .joint_fit import FitState, LinearisedFit, fit_members
 from .merging import Group, Merge, PairAlignment, merge, size_rank, variance_factor
 from .model_selection import CHANCE_NATS, GROUP_MARGIN, MARGIN_NATS, HypothesisTest
 from .pairwise import Alignment, align
-from .ransac import Explanation, distances, is_same_distance, through
+from .ransac import Hypothesis, distances, is_same_distance, transform_from_two_tags
 from .tag_gate import FALSE_ALARM, TAG_GATE, gate_ratio, squared_sigmas
 from .words import reason_not_joined
 
@@ -15,9 +15,9 @@ __all__ = [
     "TAG_GATE",
     "Alignment",
     "CondensedMap",
-    "Explanation",
     "FitState",
     "Group",
+    "Hypothesis",
     "HypothesisTest",
     "LinearisedFit",
     "Merge",
@@ -25,14 +25,14 @@ __all__ = [
     "align",
     "condense",
     "distances",
+    "fit_members",
     "gate_ratio",
-    "hold",
     "is_same_distance",
     "merge",
     "reason_not_joined",
     "rotate_quarter",
     "size_rank",
     "squared_sigmas",
-    "through",
+    "transform_from_two_tags",
     "variance_factor",
 ]

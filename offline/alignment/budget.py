@@ -16,15 +16,15 @@ _WORK_AT_A_MIB: Final = 10e9
 # A pair takes at least 10 ms, whatever its tags.
 _A_PAIR: Final = 100e6
 # Overhead of Python for each fit and for each linearisation.
-_A_HOLD: Final = 5e6
+_A_FIT: Final = 5e6
 _A_LINEARISATION: Final = 5e6
 # Times the cube of the number of tags: (2 n)^3 / 2 to factorise and substitute; 2 (2 n) (5 n) (7 n) to propagate both
 # maps' covariances, in products of large matrices, which are three times as fast.
-_BY_HELD: Final = 4.0
+_BY_FITTED: Final = 4.0
 _BY_TAGS: Final = 50.0
 
 
-class AlignmentTooLongError(Exception):
+class AlignmentBudgetError(Exception):
     """The budget is exhausted; not a user's mistake, and reported as a warning."""
 
 
@@ -36,43 +36,43 @@ class AlignmentBudget:
         left: work.
     """
 
-    left: float = np.inf
+    remaining: float = np.inf
 
     @staticmethod
-    def of_logs(n_bytes: int) -> "AlignmentBudget":
+    def for_logs(n_bytes: int) -> "AlignmentBudget":
         """Return the budget for drives whose logs have this many bytes; unlimited if they are from no logs."""
         if not n_bytes:
             return AlignmentBudget()
         return AlignmentBudget(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2)
 
-    def begin(self) -> None:
+    def charge_pair(self) -> None:
         """Charge the fixed cost of a pair.
 
         Raises:
             AlignmentTooLongError: the budget is exhausted.
         """
-        self._take(_A_PAIR)
+        self._charge(_A_PAIR)
 
-    def linearise(self, n_tags: int) -> None:
+    def charge_linearisation(self, n_tags: int) -> None:
         """Charge the linearisation of two maps.
 
         Raises:
             AlignmentTooLongError: the budget is exhausted.
         """
-        self._take(_A_LINEARISATION + _BY_TAGS * n_tags**3)
+        self._charge(_A_LINEARISATION + _BY_TAGS * n_tags**3)
 
-    def hold(self, n_tags: int) -> None:
+    def charge_fit(self, n_tags: int) -> None:
         """Charge a least-squares fit of this many tags, and its predictions.
 
         Raises:
             AlignmentTooLongError: the budget is exhausted.
         """
-        self._take(_A_HOLD + _BY_HELD * n_tags**3)
+        self._charge(_A_FIT + _BY_FITTED * n_tags**3)
 
-    def _take(self, work: float) -> None:
-        self.left -= work
-        if self.left < 0.0:
-            raise AlignmentTooLongError
+    def _charge(self, work: float) -> None:
+        self.remaining -= work
+        if self.remaining < 0.0:
+            raise AlignmentBudgetError
 
 
 UNLIMITED: Final = AlignmentBudget()

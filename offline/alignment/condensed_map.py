@@ -87,7 +87,7 @@ class AnchorTree:
     parent: IntArray
     step: FloatArray
     tag_m: FloatArray
-    above: FloatArray
+    is_ancestor: FloatArray
     covariance: FloatArray
 
     def places(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -112,7 +112,7 @@ class AnchorTree:
         by_step = se2.adjoint(anchors) @ se2.right_jacobian(xi[: 3 * n].reshape(n, 3))
         moved = by_step[None, :, :2] + rotate_quarter(places)[:, None, :, None] * by_step[None, :, None, 2]
         out = np.zeros((n, 2, 5 * n))
-        out[..., : 3 * n] = (moved * self.above[:, :, None, None]).transpose(0, 2, 1, 3).reshape(n, 2, 3 * n)
+        out[..., : 3 * n] = (moved * self.is_ancestor[:, :, None, None]).transpose(0, 2, 1, 3).reshape(n, 2, 3 * n)
         cos, sin = np.cos(anchors[:, 2]), np.sin(anchors[:, 2])
         each = np.arange(n)
         out[each, 0, 3 * n + 2 * each], out[each, 0, 3 * n + 2 * each + 1] = cos, -sin
@@ -142,7 +142,7 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
         T_start_anchor=T_start_anchor,
         tag_m=tag_m,
         covariance=_in_anchors(joint, T_start_anchor, tag_m),
-        root=_stillest(joint, len(which)),
+        root=_most_certain_anchor(joint, len(which)),
     )
 
 
@@ -168,7 +168,7 @@ def _in_anchors(joint: FloatArray, T_start_anchor: FloatArray, tag_m: FloatArray
     return rows(np.ascontiguousarray(rows(joint).T))
 
 
-def _stillest(joint: FloatArray, n: int) -> int:
+def _most_certain_anchor(joint: FloatArray, n: int) -> int:
     """Return the anchor with the least summed variance of heading relative to the others."""
     return int(np.argmin(_heading_variance(joint, n).sum(axis=1)))
 
@@ -183,7 +183,7 @@ def _heading_variance(joint: FloatArray, n: int) -> FloatArray:
 def _anchor_tree(condensed: CondensedMap, which: IntArray) -> AnchorTree:
     n_all, n = len(condensed.tags), len(which)
     nodes = np.append(which, condensed.root)
-    parent, order = _stiffest_tree(condensed, nodes)
+    parent, order = _minimum_variance_tree(condensed, nodes)
     T_start_node = condensed.T_start_anchor[nodes]
     step = se2.between(T_start_node[parent], T_start_node[:n])
     columns = np.concatenate(
@@ -208,12 +208,12 @@ def _anchor_tree(condensed: CondensedMap, which: IntArray) -> AnchorTree:
         parent=np.where(parent == n, -1, parent),
         step=step,
         tag_m=condensed.tag_m[which],
-        above=above[:n],
+        is_ancestor=above[:n],
         covariance=rows(np.ascontiguousarray(rows(joint).T)),
     )
 
 
-def _stiffest_tree(condensed: CondensedMap, nodes: IntArray) -> tuple[IntArray, IntArray]:
+def _minimum_variance_tree(condensed: CondensedMap, nodes: IntArray) -> tuple[IntArray, IntArray]:
     """Return (n,) the parent of each node but the last, which is the root, and (n,) these nodes with parents first.
 
     The tree minimises the variances of relative heading along its edges: there rotation errors are smallest, and with

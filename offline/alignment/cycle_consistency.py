@@ -31,13 +31,13 @@ class Link:
     b: int
     T_a_b: FloatArray
     covariance: FloatArray
-    evidence_nats: float
+    log_bayes_factor: float
     names: tuple[str, str]
 
     @property
-    def rank(self) -> tuple[float, tuple[str, str]]:
+    def sort_key(self) -> tuple[float, tuple[str, str]]:
         """Sort key, most certain link first."""
-        return -self.evidence_nats, self.names
+        return -self.log_bayes_factor, self.names
 
     def transform_from(self, index: int) -> tuple[int, FloatArray, FloatArray]:
         """Return the other map, T_index_other, and its right tangent's covariance."""
@@ -52,8 +52,8 @@ class Contradiction:
     """A rejected link, the error of the cycle that it closes, and the maps of that cycle in order."""
 
     link: Link
-    ring: tuple[int, ...]
-    gap: FloatArray  # (3,)
+    cycle: tuple[int, ...]
+    closure_error: FloatArray  # (3,)
     sigmas: float
 
 
@@ -64,15 +64,15 @@ def consistent_links(links: Sequence[Link]) -> tuple[list[Link], list[Contradict
     cycles less consistent ones; among equals the least certain. This repeats until all such cycles close. Then each
     link that remains must close with the spanning tree of the most certain links.
     """
-    left = sorted(links, key=lambda link: link.rank)
+    left = sorted(links, key=lambda link: link.sort_key)
     contradictions = []
-    rings = _triangles(left)
+    rings = _three_cycles(left)
     while any(gap[1] > _GATE for _, gap in rings):
         worst = _worst(rings)
         contradictions.append(_contradiction(worst, rings))
         left.remove(worst)
         rings = [ring for ring in rings if worst not in ring[0]]
-    return _closing(left, contradictions), contradictions
+    return _links_that_close(left, contradictions), contradictions
 
 
 def spanning_tree(links: Sequence[Link]) -> list[Link]:
@@ -85,7 +85,7 @@ def spanning_tree(links: Sequence[Link]) -> list[Link]:
         return i
 
     tree = []
-    for link in sorted(links, key=lambda link: link.rank):
+    for link in sorted(links, key=lambda link: link.sort_key):
         if find(link.a) != find(link.b):
             root[find(link.a)] = find(link.b)
             tree.append(link)
@@ -113,7 +113,7 @@ def path(links: Sequence[Link], begin: int, end: int) -> list[Link]:
     return found[::-1]
 
 
-def gap_of(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
+def closure_error(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
     """Return the closure error of a cycle of links: (3,) twist, and its squared Mahalanobis distance.
 
     Links that share a map have correlated errors of unknown correlation. The variance of a sum of n errors is at most n
@@ -129,26 +129,26 @@ def gap_of(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
     return gap, float(gap @ np.linalg.solve(len(links) * covariance, gap))
 
 
-_Ring = tuple[tuple[Link, Link, Link], tuple[FloatArray, float]]
+_Cycle = tuple[tuple[Link, Link, Link], tuple[FloatArray, float]]
 
 
-def _triangles(links: Sequence[Link]) -> list[_Ring]:
+def _three_cycles(links: Sequence[Link]) -> list[_Cycle]:
     """Return all cycles of three links, with their closure errors."""
     of = {frozenset((link.a, link.b)): link for link in links}
     partners: dict[int, set[int]] = {}
     for link in links:
         partners.setdefault(link.a, set()).add(link.b)
         partners.setdefault(link.b, set()).add(link.a)
-    rings: list[_Ring] = []
+    rings: list[_Cycle] = []
     for i in sorted(partners):
         for j, k in combinations(sorted(p for p in partners[i] if p > i), 2):
             if k in partners[j]:
                 ring = of[frozenset((i, j))], of[frozenset((j, k))], of[frozenset((k, i))]
-                rings.append((ring, gap_of(ring, i)))
+                rings.append((ring, closure_error(ring, i)))
     return rings
 
 
-def _worst(rings: Sequence[_Ring]) -> Link:
+def _worst(rings: Sequence[_Cycle]) -> Link:
     """Return the link in most inconsistent cycles, less consistent ones."""
     against: dict[Link, int] = {}
     suspects: set[Link] = set()
@@ -157,16 +157,16 @@ def _worst(rings: Sequence[_Ring]) -> Link:
             against[link] = against.get(link, 0) + (1 if square > _GATE else -1)
         if square > _GATE:
             suspects.update(members)
-    return max(suspects, key=lambda link: (against[link], link.rank))
+    return max(suspects, key=lambda link: (against[link], link.sort_key))
 
 
-def _contradiction(link: Link, rings: Sequence[_Ring]) -> Contradiction:
+def _contradiction(link: Link, rings: Sequence[_Cycle]) -> Contradiction:
     """Return the contradiction of the link's worst cycle."""
     members, (gap, square) = max((ring for ring in rings if link in ring[0]), key=lambda ring: ring[1][1])
     return Contradiction(link, tuple(sorted({m.a for m in members} | {m.b for m in members})), gap, square**0.5)
 
 
-def _closing(links: Sequence[Link], contradictions: list[Contradiction]) -> list[Link]:
+def _links_that_close(links: Sequence[Link], contradictions: list[Contradiction]) -> list[Link]:
     """Return the links that close with the tree; the others are appended to the contradictions."""
     tree = spanning_tree(links)
     kept = list(tree)
@@ -174,7 +174,7 @@ def _closing(links: Sequence[Link], contradictions: list[Contradiction]) -> list
         if link in tree:
             continue
         ring = [*path(tree, link.b, link.a), link]
-        gap, square = gap_of(ring, link.b)
+        gap, square = closure_error(ring, link.b)
         if square <= _GATE:
             kept.append(link)
         else:

@@ -58,12 +58,12 @@ class LinearisedFit:
 
     at: FitState
     centre: FloatArray
-    apart: FloatArray
+    difference: FloatArray
     covariance: FloatArray
     by_transform: FloatArray
     by_a: FloatArray
     by_b: FloatArray
-    effort: AlignmentBudget = field(default_factory=AlignmentBudget)
+    budget: AlignmentBudget = field(default_factory=AlignmentBudget)
 
 
 class JointFit:
@@ -90,32 +90,34 @@ class JointFit:
         self._effort = effort
 
     @cached_property
-    def _unbent(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-        self._effort.linearise(self.n)
+    def _at_zero_errors(
+        self,
+    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+        self._effort.charge_linearisation(self.n)
         none = np.zeros(5 * self.n)
-        return _inflate(self.a, none), _inflate(self.b, none)
+        return _places_with_covariance(self.a, none), _places_with_covariance(self.b, none)
 
     @property
     def places_a(self) -> FloatArray:
         """Tag positions (n, 2) in map a; `places_b` in frame b."""
-        return self._unbent[0][0]
+        return self._at_zero_errors[0][0]
 
     @property
     def places_b(self) -> FloatArray:
         """Tag positions (n, 2) in map b."""
-        return self._unbent[1][0]
+        return self._at_zero_errors[1][0]
 
     @property
     def covariance_a(self) -> FloatArray:
         """Covariance (2 n, 2 n) of map a's tags relative to its root, to first order; `covariance_b` likewise."""
-        return self._unbent[0][2]
+        return self._at_zero_errors[0][2]
 
     @property
     def covariance_b(self) -> FloatArray:
         """Covariance (2 n, 2 n) of map b's tags."""
-        return self._unbent[1][2]
+        return self._at_zero_errors[1][2]
 
-    def unbent(self, T_a_b: FloatArray) -> FitState:
+    def point_without_errors(self, T_a_b: FloatArray) -> FitState:
         """Return the linearisation point of both maps without errors."""
         return FitState(T_a_b, np.zeros(5 * self.n), np.zeros(5 * self.n))
 
@@ -123,9 +125,11 @@ class JointFit:
         """Return the differences around a linearisation point."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
         if bent:
-            self._effort.linearise(self.n)
+            self._effort.charge_linearisation(self.n)
         (f_a, J_a, S_a), (f_b, J_b, S_b) = (
-            (_inflate(self.a, bend.xi_a), _inflate(self.b, bend.xi_b)) if bent else self._unbent
+            (_places_with_covariance(self.a, bend.xi_a), _places_with_covariance(self.b, bend.xi_b))
+            if bent
+            else self._at_zero_errors
         )
         cos, sin = np.cos(bend.T_a_b[2]), np.sin(bend.T_a_b[2])
         R = np.array([[cos, -sin], [sin, cos]])
@@ -145,7 +149,7 @@ class JointFit:
     def retract(self, linear: LinearisedFit, held: "SubsetFit") -> FitState:
         """Return the linearisation point after a step: the errors with which the fitted tags agree."""
         pull = np.zeros(2 * self.n)
-        pull[held.rows] = held.pull
+        pull[held.rows] = held.weighted_residual
         return FitState(
             held.T_a_b,
             -self.a.covariance @ (linear.by_a.T @ pull),
@@ -155,10 +159,10 @@ class JointFit:
     def solve(self, bend: FitState, members: BoolArray) -> tuple[LinearisedFit, "SubsetFit"]:
         """Iterate the fit of these tags (n,) to convergence, from a linearisation point nearby."""
         linear = self.linearise(bend)
-        held = hold(linear, members)
+        held = fit_members(linear, members)
         for _ in range(_STEPS):
             linear = self.linearise(self.retract(linear, held))
-            before, held = held, hold(linear, members)
+            before, held = held, fit_members(linear, members)
             left = float(held.motion @ held.information @ held.motion)
             if left < _CONVERGED_SIGMAS**2 and abs(before.cost_increase - held.cost_increase) < _CONVERGED_SIGMAS * (
                 1.0 + held.cost_increase
@@ -186,8 +190,8 @@ class SubsetFit:
     whitened: FloatArray  # (2 m, 3) by_transform
     motion: FloatArray
     information: FloatArray
-    pull: FloatArray
-    left: FloatArray  # (2 m,) whitened residual
+    weighted_residual: FloatArray
+    whitened_residual: FloatArray  # (2 m,) whitened residual
 
     @property
     def T_a_b(self) -> FloatArray:
@@ -200,10 +204,10 @@ class SubsetFit:
     @property
     def cost_increase(self) -> float:
         """Cost in squared sigmas."""
-        return float(self.left @ self.left)
+        return float(self.whitened_residual @ self.whitened_residual)
 
     @property
-    def closes(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether the cost is below the chi-square gate."""
         return self.cost_increase <= _cost_increase_bound(len(self.rows) - 3)
 
@@ -212,7 +216,7 @@ class SubsetFit:
         """Computed again if asked for after `without_root`."""
         return _root(self.linear, self.rows)
 
-    def without_root(self) -> None:
+    def free_root(self) -> None:
         """Free the Cholesky factor, which may be most of the memory; its log determinant stays cached."""
         _ = self.log_determinant
         vars(self).pop("root", None)
@@ -222,12 +226,12 @@ class SubsetFit:
         """Log determinant of the covariance of the differences."""
         return 2.0 * float(np.log(np.diag(self.root)).sum())
 
-    def others(self) -> tuple[FloatArray, FloatArray]:
+    def predict_others(self) -> tuple[FloatArray, FloatArray]:
         """Return residuals (n, 2) of predicted tags and covariances (n, 2, 2); undefined for the fitted tags."""
         linear = self.linear
-        n = len(linear.apart) // 2
+        n = len(linear.difference) // 2
         coupled = linalg.solve_triangular(self.root, linear.covariance[self.rows], lower=True, check_finite=False)
-        off = linear.apart + linear.by_transform @ self.motion - coupled.T @ self.left
+        off = linear.difference + linear.by_transform @ self.motion - coupled.T @ self.whitened_residual
         lever = (linear.by_transform - coupled.T @ self.whitened).reshape(n, 2, 3)
         each = coupled.reshape(-1, n, 2)
         own = linear.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n), :]
@@ -235,7 +239,7 @@ class SubsetFit:
         spread += lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
         return off.reshape(n, 2), spread
 
-    def without_each(self) -> tuple[FloatArray, FloatArray]:
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
         """Return leave-one-out residuals of the fitted tags: at least three.
 
         With P the inverse covariance projected orthogonally to the motion, P_ii^-1 (P w)_i is the residual of tag i
@@ -251,15 +255,15 @@ class SubsetFit:
         P = np.einsum("rma,rmb->mab", each, each)
         P -= lever @ np.linalg.inv(self.information) @ lever.transpose(0, 2, 1)
         covariance = np.linalg.inv(P)
-        return (covariance @ self.pull.reshape(m, 2, 1))[..., 0], covariance
+        return (covariance @ self.weighted_residual.reshape(m, 2, 1))[..., 0], covariance
 
-    def misfits(self) -> FloatArray:
+    def gate_ratios(self) -> FloatArray:
         """Return (m,) leave-one-out gate ratios of the fitted tags, see `gate_ratio`; at least three tags."""
-        return gate_ratio(*self.without_each())
+        return gate_ratio(*self.leave_one_out())
 
     def log_likelihood_ratio(self) -> FloatArray:
         """Return (m,) leave-one-out log likelihood ratios of fitting over wrong; at least three tags."""
-        return log_likelihood_ratio(*self.without_each())
+        return log_likelihood_ratio(*self.leave_one_out())
 
     def motion_covariance(self) -> FloatArray:
         """Return the covariance (3, 3) of the motion."""
@@ -271,12 +275,12 @@ def _cost_increase_bound(freedom: int) -> float:
     return float(chi2.isf(FALSE_ALARM, freedom))
 
 
-def hold(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
+def fit_members(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
     """Fit some tags (n,), at least two, by least squares."""
     rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
-    linear.effort.hold(len(rows) // 2)
+    linear.budget.charge_fit(len(rows) // 2)
     root = _root(linear, rows)
-    right = np.column_stack([linear.by_transform[rows], linear.apart[rows]])
+    right = np.column_stack([linear.by_transform[rows], linear.difference[rows]])
     right = linalg.solve_triangular(root, right, lower=True, check_finite=False)
     whitened, apart = right[:, :3], right[:, 3]
     information = whitened.T @ whitened
@@ -295,6 +299,6 @@ def _root(linear: LinearisedFit, rows: IntArray) -> FloatArray:
     return np.asarray(linalg.cholesky(S, lower=True, check_finite=False), dtype=np.float64)
 
 
-def _inflate(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _places_with_covariance(tree: AnchorTree, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     places, jacobian = tree.jacobian(xi)
     return places, jacobian, jacobian @ tree.covariance @ jacobian.T

@@ -12,7 +12,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import AlignmentBudget, AlignmentTooLongError
+from groundsbot.offline.alignment.budget import AlignmentBudget, AlignmentBudgetError
 from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
 from groundsbot.offline.alignment.cycle_consistency import Contradiction, Link, consistent_links, spanning_tree
 from groundsbot.offline.alignment.pairwise import Alignment, align
@@ -119,7 +119,7 @@ def _align_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
-    effort = AlignmentBudget.of_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
+    effort = AlignmentBudget.for_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
     by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
@@ -130,7 +130,7 @@ def _align_pairs(
             shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
             try:
                 alignment = align(map_a, map_b, placement, effort)
-            except AlignmentTooLongError:
+            except AlignmentBudgetError:
                 is_searched = False
         if shared or placement is not None:
             pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))
@@ -141,8 +141,8 @@ def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[Co
     """Return at most one link for a pair: by its tags, or else by the measured placement."""
     names = maps[pair.a].segment.name, maps[pair.b].segment.name
     alignment, placement = pair.alignment, pair.placement
-    if alignment is not None and alignment.is_sure:
-        return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.evidence_nats, names)]
+    if alignment is not None and alignment.is_accepted:
+        return [Link(pair.a, pair.b, alignment.T_a_b, alignment.covariance, alignment.log_bayes_factor, names)]
     if placement is None:
         return []
     # A link relates the frames that the maps' roots carry, a measurement the starts themselves.

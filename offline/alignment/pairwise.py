@@ -19,15 +19,21 @@ from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentBudget
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.joint_fit import JointFit
 from groundsbot.offline.alignment.model_selection import CHANCE_NATS, HypothesisTest
-from groundsbot.offline.alignment.ransac import Explanation, explanations, halves, refine_inliers, without
+from groundsbot.offline.alignment.ransac import (
+    Hypothesis,
+    find_hypotheses,
+    refine_inliers,
+    remove_tags,
+    split_at_weak_links,
+)
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM
 from groundsbot.offline.measurements import REACH_M, Placement, TagKey
 
 # The covariance of an alignment covers other choices of tags too, down to this much less likely: too wide a covariance
 # is harmless, one that does not cover the truth is wrong.
-_DOUBT_NATS: Final = log(1e4)
+_COVERED_NATS: Final = log(1e4)
 # Such choices drop at most this many tags, and of each number this many are kept (beam search).
-_MOST_DOUBTED: Final = 6
+_MAX_DROPPED: Final = 6
 _BEAM: Final = 12
 _ROUNDING_NATS: Final = 1e-3
 _AREA_M2: Final = REACH_M**2
@@ -58,10 +64,10 @@ class Alignment:
     off_m: FloatArray
     off_sigmas: FloatArray
     rmse_m: float
-    rise: float
-    evidence_nats: float
-    is_sure: bool = False
-    rivals: tuple["Alignment", ...] = ()
+    cost_increase: float
+    log_bayes_factor: float
+    is_accepted: bool = False
+    alternatives: tuple["Alignment", ...] = ()
 
     @property
     def n_inliers(self) -> int:
@@ -99,8 +105,8 @@ def align(
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:
         return None
-    effort.begin()
-    return _AlignmentChoice(a, b, shared, placement, effort).verdict()
+    effort.charge_pair()
+    return _AlignmentChoice(a, b, shared, placement, effort).align()
 
 
 class _AlignmentChoice(HypothesisTest):
@@ -120,8 +126,8 @@ class _AlignmentChoice(HypothesisTest):
         self.placement = placement
         self.frames = a.frame_covariance, b.frame_covariance
 
-    def verdict(self) -> Alignment | None:
-        explained = explanations(self.fit)
+    def align(self) -> Alignment | None:
+        explained = find_hypotheses(self.fit)
         if not explained:
             return None
         if not any(self._agrees(each) for each in explained):
@@ -130,61 +136,61 @@ class _AlignmentChoice(HypothesisTest):
         evidence, best = found[0]
         groups = [each for _, each in found]
         found += self._drop_unneeded(evidence, best)
-        for each in halves(self.fit, best):
-            found.append((self.evidence(each), each))
-            each.held.without_root()
+        for each in split_at_weak_links(self.fit, best):
+            found.append((self.log_bayes_factor(each), each))
+            each.solution.free_root()
         each_once = {each.members.tobytes(): (its, each) for its, each in found}
         found = sorted(each_once.values(), key=lambda f: -f[0])
-        rivals: list[Explanation] = []
+        rivals: list[Hypothesis] = []
         for each in self.alternatives(best, found, groups):
             if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
         told = tuple(self._alignment(rival, found, groups, (), is_sure=False) for rival in rivals)
-        beats_chance = best.n == len(self.shared) or evidence > CHANCE_NATS
+        beats_chance = best.n_members == len(self.shared) or evidence > CHANCE_NATS
         return self._alignment(best, found, groups, told, is_sure=beats_chance and not rivals)
 
-    def _drop_unneeded(self, evidence: float, best: Explanation) -> list[tuple[float, Explanation]]:
+    def _drop_unneeded(self, evidence: float, best: Hypothesis) -> list[tuple[float, Hypothesis]]:
         """Return the best hypothesis with weakly supported tags dropped, and others that then fit.
 
         Several tags are dropped together too, since two wrong ones support each other.
         """
         found = last = [(evidence, best)]
-        for _ in range(_MOST_DOUBTED):
-            fewer: list[tuple[float, Explanation]] = []
+        for _ in range(_MAX_DROPPED):
+            fewer: list[tuple[float, Hypothesis]] = []
             seen: set[bytes] = set()
             for its, each in last:
-                if each.n < 3:
+                if each.n_members < 3:
                     continue
                 held = np.flatnonzero(each.members)
-                most_nats = its - evidence + _DOUBT_NATS
-                if each.n == len(self.shared) and self.placement is None:
+                most_nats = its - evidence + _COVERED_NATS
+                if each.n_members == len(self.shared) and self.placement is None:
                     # No other tag can join, and the prior over choices of the remaining tags is lower.
-                    most_nats -= log(each.n) - _ROUNDING_NATS
-                for tag in held[each.held.log_likelihood_ratio() < most_nats]:
-                    less = without(each, tag)
-                    instead = less.joining & ~each.members
-                    for other in (less, less.with_more(instead)) if instead.any() else (less,):
+                    most_nats -= log(each.n_members) - _ROUNDING_NATS
+                for tag in held[each.solution.log_likelihood_ratio() < most_nats]:
+                    less = remove_tags(each, tag)
+                    instead = less.candidates & ~each.members
+                    for other in (less, less.add_tags(instead)) if instead.any() else (less,):
                         if (key := other.members.tobytes()) not in seen:
                             seen.add(key)
-                            fewer.append((self.evidence(other), other))
-                    fewer = self._likeliest(fewer, evidence - _DOUBT_NATS)
-                each.held.without_root()
+                            fewer.append((self.log_bayes_factor(other), other))
+                    fewer = self._most_likely(fewer, evidence - _COVERED_NATS)
+                each.solution.free_root()
             last = fewer
             found = found + last
         for _, each in found:
-            each.held.without_root()
+            each.solution.free_root()
         return found
 
     @staticmethod
-    def _likeliest(found: list[tuple[float, Explanation]], least_nats: float) -> list[tuple[float, Explanation]]:
+    def _most_likely(found: list[tuple[float, Hypothesis]], least_nats: float) -> list[tuple[float, Hypothesis]]:
         return sorted((f for f in found if f[0] > least_nats), key=lambda f: -f[0])[:_BEAM]
 
-    def _unite_groups(self, explained: Sequence[Explanation]) -> list[tuple[float, Explanation]]:
+    def _unite_groups(self, explained: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis]]:
         """Return hypotheses, best first, with unions of those that agree on the pose.
 
         From two tags in one corner a far tag is predicted too uncertainly to join; two tags there determine it.
         """
-        found = {each.members.tobytes(): (self.evidence(each), each) for each in explained}
+        found = {each.members.tobytes(): (self.log_bayes_factor(each), each) for each in explained}
         tried: set[bytes] = set()
         while True:
             ranked = sorted(found.values(), key=lambda f: -f[0])
@@ -196,17 +202,17 @@ class _AlignmentChoice(HypothesisTest):
                 together = refine_inliers(self.fit, one.linear.at, members)
                 if together is None or together.members.tobytes() in found:
                     continue
-                if (evidence := self.evidence(together)) > max(its, others):
+                if (evidence := self.log_bayes_factor(together)) > max(its, others):
                     found[together.members.tobytes()] = evidence, together
                     break
             else:
                 return ranked
 
-    def evidence(self, explanation: Explanation) -> float:
+    def log_bayes_factor(self, explanation: Hypothesis) -> float:
         """Return the log Bayes factor over chance, with the measured placement."""
-        return super().evidence(explanation) + self._evidence_of_placement(explanation)
+        return super().log_bayes_factor(explanation) + self._placement_log_bayes_factor(explanation)
 
-    def _evidence_of_placement(self, explanation: Explanation) -> float:
+    def _placement_log_bayes_factor(self, explanation: Hypothesis) -> float:
         """Return the log likelihood of the measured placement over that of a uniform one."""
         if self.placement is None:
             return 0.0
@@ -215,14 +221,14 @@ class _AlignmentChoice(HypothesisTest):
         log_determinant = float(np.linalg.slogdet(2.0 * pi * covariance)[1])
         return -0.5 * (square + log_determinant) + log(2.0 * pi * _AREA_M2)
 
-    def _agrees(self, explanation: Explanation) -> bool:
+    def _agrees(self, explanation: Hypothesis) -> bool:
         """Return whether the hypothesis is consistent with the measured placement."""
         if self.placement is None:
             return True
         off, covariance = self._from_placement(self.placement, explanation)
         return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
 
-    def _from_placement(self, placement: Placement, explanation: Explanation) -> tuple[FloatArray, FloatArray]:
+    def _from_placement(self, placement: Placement, explanation: Hypothesis) -> tuple[FloatArray, FloatArray]:
         """Return the deviation (3,) of a hypothesis from the measured placement, and its covariance."""
         back = se2.adjoint(se2.inverse(placement.T_a_b))
         covariance = placement.covariance + self.covariance(explanation)
@@ -230,7 +236,7 @@ class _AlignmentChoice(HypothesisTest):
         return se2.log(se2.between(placement.T_a_b, explanation.T_a_b)), covariance
 
     def _covering_covariance(
-        self, explanation: Explanation, found: Sequence[tuple[float, Explanation]], groups: Sequence[Explanation]
+        self, explanation: Hypothesis, found: Sequence[tuple[float, Hypothesis]], groups: Sequence[Hypothesis]
     ) -> FloatArray:
         """Return the covariance (3, 3) of the right tangent of T_a_b, with the uncertainty of which tags fit.
 
@@ -239,19 +245,19 @@ class _AlignmentChoice(HypothesisTest):
         so they are taken in the order of the tags.
         """
         near = [(its, each) for its, each in found if self.is_same_place(each, explanation)]
-        worth = [its + self.of_groups(each, [explanation, *groups], 0.0) for its, each in near]
+        worth = [its + self.log_bayes_factor_of_groups(each, [explanation, *groups], 0.0) for its, each in near]
         covering = self.covariance(explanation)
         for its, (_, each) in sorted(zip(worth, near, strict=True), key=lambda w: w[1][1].members.tobytes()):
-            if its > max(worth) - _DOUBT_NATS:
+            if its > max(worth) - _COVERED_NATS:
                 off = se2.log(se2.between(explanation.T_a_b, each.T_a_b))
                 covering = covariance_union(covering, self.covariance(each) + np.outer(off, off))
         return covering
 
     def _alignment(
         self,
-        explanation: Explanation,
-        found: Sequence[tuple[float, Explanation]],
-        groups: Sequence[Explanation],
+        explanation: Hypothesis,
+        found: Sequence[tuple[float, Hypothesis]],
+        groups: Sequence[Hypothesis],
         rivals: tuple[Alignment, ...],
         *,
         is_sure: bool,
@@ -267,10 +273,10 @@ class _AlignmentChoice(HypothesisTest):
             off_m=np.where(inlier, 0.0, np.linalg.norm(off_m, axis=1)),
             off_sigmas=np.where(inlier, 0.0, np.sqrt(squares)),
             rmse_m=float(np.sqrt((apart**2).sum(axis=1).mean())),
-            rise=explanation.held.cost_increase,
-            evidence_nats=self.evidence(explanation),
-            is_sure=is_sure,
-            rivals=rivals,
+            cost_increase=explanation.solution.cost_increase,
+            log_bayes_factor=self.log_bayes_factor(explanation),
+            is_accepted=is_sure,
+            alternatives=rivals,
         )
 
 

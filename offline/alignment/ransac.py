@@ -18,18 +18,18 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.joint_fit import FitState, JointFit, LinearisedFit, SubsetFit, hold
+from groundsbot.offline.alignment.joint_fit import FitState, JointFit, LinearisedFit, SubsetFit, fit_members
 from groundsbot.offline.alignment.tag_gate import (
     FALSE_ALARM,
+    OUTLIER_SCALE_M,
     TAG_GATE,
-    WRONG_FROM_M,
     gate_ratio,
-    log_wrong_there,
+    log_outlier_density_at,
     squared_sigmas,
 )
 
 # Probability of missing an alignment with half the tags of the best one.
-MISSED: Final = 1e-4
+MISS_PROBABILITY: Final = 1e-4
 
 _DISTANCE_GATE: Final = float(chi2.isf(FALSE_ALARM, 1))
 # Two tags whose distance has a larger relative sigma give no useful heading.
@@ -40,46 +40,46 @@ _SEED: Final = 20170501
 _NEXT_VARIANCE: Final = 4.0
 _MOST_CHANGES: Final = 100
 # A more certain link keeps two groups of tags together: five sigmas are the least error of a wrong tag.
-_LOOSE_SIGMA_M: Final = 0.2 * WRONG_FROM_M
+_LOOSE_SIGMA_M: Final = 0.2 * OUTLIER_SCALE_M
 
 
 @dataclass(frozen=True)
-class Explanation:
+class Hypothesis:
     """A hypothesis: shared tags that fit together (the consensus set), and the joint fit of them."""
 
     members: BoolArray  # (n,)
     linear: LinearisedFit
-    held: SubsetFit
+    solution: SubsetFit
 
     @property
     def T_a_b(self) -> FloatArray:
         """Pose (3,) of frame b in frame a."""
-        return self.held.T_a_b
+        return self.solution.T_a_b
 
     @cached_property
-    def _others(self) -> tuple[FloatArray, FloatArray]:
-        return self.held.others()
+    def _predictions(self) -> tuple[FloatArray, FloatArray]:
+        return self.solution.predict_others()
 
     @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray]:
         """Residuals (n, 2) under the prediction from the members, and (n,) their squared sigmas; 0 for members."""
-        off_m, spread = self._others
+        off_m, spread = self._predictions
         return off_m, np.where(self.members, 0.0, squared_sigmas(off_m, spread))
 
     @cached_property
-    def log_wrong(self) -> FloatArray:
+    def log_outlier_density(self) -> FloatArray:
         """Log density (n,) of each tag's position if it is wrong; meaningless for members."""
-        return log_wrong_there(*self._others)
+        return log_outlier_density_at(*self._predictions)
 
     @cached_property
-    def joining(self) -> BoolArray:
+    def candidates(self) -> BoolArray:
         """Which tags (n,) outside the members pass the gate."""
-        return ~self.members & (gate_ratio(*self._others) < 1.0)
+        return ~self.members & (gate_ratio(*self._predictions) < 1.0)
 
-    def with_more(self, tags: BoolArray) -> "Explanation":
+    def add_tags(self, tags: BoolArray) -> "Hypothesis":
         """Return the hypothesis with these tags (n,) added."""
         members = self.members | tags
-        return Explanation(members, self.linear, hold(self.linear, members))
+        return Hypothesis(members, self.linear, fit_members(self.linear, members))
 
     @property
     def fits(self) -> BoolArray:
@@ -87,14 +87,14 @@ class Explanation:
         return self.differences[1] < TAG_GATE
 
     @property
-    def n(self) -> int:
+    def n_members(self) -> int:
         """Number of members."""
         return int(self.members.sum())
 
 
-def explanations(fit: JointFit) -> list[Explanation]:
+def find_hypotheses(fit: JointFit) -> list[Hypothesis]:
     """Return all hypotheses found, each pair of shared tags in at most one of them; deterministic."""
-    found: list[Explanation] = []
+    found: list[Hypothesis] = []
     together = np.zeros((fit.n, fit.n), dtype=np.bool_)
     most = 0
     for draw, (i, j, fits) in enumerate(_random_pairs(fit)):
@@ -106,18 +106,18 @@ def explanations(fit: JointFit) -> list[Explanation]:
         if explanation is not None and not any((explanation.members == each.members).all() for each in found):
             found.append(explanation)
             together |= np.outer(explanation.members, explanation.members)
-            most = max(most, explanation.n)
+            most = max(most, explanation.n_members)
     return found
 
 
-def without(explanation: Explanation, tags: IntArray) -> Explanation:
+def remove_tags(explanation: Hypothesis, tags: IntArray) -> Hypothesis:
     """Return the hypothesis without some tags."""
     members = explanation.members.copy()
     members[tags] = False
-    return Explanation(members, explanation.linear, hold(explanation.linear, members))
+    return Hypothesis(members, explanation.linear, fit_members(explanation.linear, members))
 
 
-def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
+def split_at_weak_links(fit: JointFit, explanation: Hypothesis) -> Iterator[Hypothesis]:
     """Yield both parts of its tags at each weak link: where maps are deformed, a part may have moved as one.
 
     Each weak edge of the minimum spanning tree of distance variances is cut in turn. A part has at least two tags.
@@ -135,12 +135,12 @@ def halves(fit: JointFit, explanation: Explanation) -> Iterator[Explanation]:
         _, part = connected_components(cut, directed=False)
         for which in (0, 1):
             if 2 <= (part == which).sum() <= len(held) - 2:
-                yield without(explanation, held[part == which])
+                yield remove_tags(explanation, held[part == which])
 
 
 def _n_draws(share: float) -> float:
     """Return the number of draws after which a pair within this share is missed with probability MISSED."""
-    return log(MISSED) / log(1.0 - share**2) if share > 0.0 else float("inf")
+    return log(MISS_PROBABILITY) / log(1.0 - share**2) if share > 0.0 else float("inf")
 
 
 def _random_pairs(fit: JointFit) -> Iterator[tuple[int, int, bool]]:
@@ -173,16 +173,16 @@ def distances(
     return length, np.maximum(np.einsum("pi,pij,pj->p", along, spread, along), 0.0)
 
 
-def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
+def _grow(fit: JointFit, i: int, j: int) -> Hypothesis | None:
     """Grow a hypothesis from two tags outward, then test all tags again until nothing changes."""
     members = np.zeros(fit.n, dtype=np.bool_)
     members[[i, j]] = True
     tried = members.copy()
     pair = [i, j]
-    bend = fit.unbent(through(fit.places_a[pair], fit.places_b[pair]))
+    bend = fit.point_without_errors(transform_from_two_tags(fit.places_a[pair], fit.places_b[pair]))
     for _ in range(_MOST_CHANGES):
         linear = fit.linearise(bend)
-        held = hold(linear, members)
+        held = fit_members(linear, members)
         bend = fit.retract(linear, held)
         worst = _worst(held, members)
         if worst is not None:
@@ -192,7 +192,7 @@ def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
             continue
         if tried.all():
             break
-        off, spread = held.others()
+        off, spread = held.predict_others()
         size = np.where(tried, np.inf, np.trace(spread, axis1=1, axis2=2))
         following = size <= _NEXT_VARIANCE * size.min()
         tried |= following
@@ -200,25 +200,25 @@ def _grow(fit: JointFit, i: int, j: int) -> Explanation | None:
     return refine_inliers(fit, bend, members)
 
 
-def refine_inliers(fit: JointFit, bend: FitState, members: BoolArray) -> Explanation | None:
+def refine_inliers(fit: JointFit, bend: FitState, members: BoolArray) -> Hypothesis | None:
     """Add tags that fit and drop those that do not, until nothing changes; dropped tags do not return."""
     banned = np.zeros_like(members)
     for _ in range(_MOST_CHANGES):
         linear, held = fit.solve(bend, members)
         bend = linear.at
         worst = _worst(held, members)
-        if worst is None and not held.closes:
-            worst = int(np.flatnonzero(members)[np.argmax(held.misfits())])
+        if worst is None and not held.is_consistent:
+            worst = int(np.flatnonzero(members)[np.argmax(held.gate_ratios())])
         if worst is not None:
             members[worst] = False
             banned[worst] = True
             if members.sum() < 2:
                 return None
             continue
-        off, spread = held.others()
+        off, spread = held.predict_others()
         joining = ~members & ~banned & (gate_ratio(off, spread) < 1.0)
         if not joining.any():
-            return Explanation(members, linear, held)
+            return Hypothesis(members, linear, held)
         members |= joining
     return None
 
@@ -227,13 +227,13 @@ def _worst(held: SubsetFit, members: BoolArray) -> int | None:
     """Return the tag that the others contradict most, if any is beyond the gate."""
     which = np.flatnonzero(members)
     if len(which) == 2:
-        return None if held.closes else int(which[0])
-    misfits = held.misfits()
+        return None if held.is_consistent else int(which[0])
+    misfits = held.gate_ratios()
     worst = int(np.argmax(misfits))
     return int(which[worst]) if misfits[worst] > 1.0 else None
 
 
-def through(a: FloatArray, b: FloatArray) -> FloatArray:
+def transform_from_two_tags(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return T_a_b from two tags (2, 2) in both maps, by their midpoints and directions."""
     (ax, ay), (bx, by) = a[1] - a[0], b[1] - b[0]
     turn = np.arctan2(ay, ax) - np.arctan2(by, bx)

@@ -17,23 +17,23 @@ from groundsbot.calib.foundation import FloatArray
 FALSE_ALARM: Final = 1e-4
 TAG_GATE: Final = float(chi2.isf(FALSE_ALARM, 2))  # squared Mahalanobis distance
 # From a displaced door to the next house. A factor of ten changes the log density by 0.4.
-WRONG_FROM_M: Final = 0.5
+OUTLIER_SCALE_M: Final = 0.5
 _WRONG_TO_M: Final = 100.0
-_LOG_NORM: Final = log(pi * log1p((_WRONG_TO_M / WRONG_FROM_M) ** 2))
+_LOG_NORM: Final = log(pi * log1p((_WRONG_TO_M / OUTLIER_SCALE_M) ** 2))
 
 
-def log_wrong(square_m2: FloatArray) -> FloatArray:
+def log_outlier_density(square_m2: FloatArray) -> FloatArray:
     """Return the log density (...), per square metre, of a wrong tag at squared distances (...) from its prediction.
 
     1 / (r^2 + r_0^2), which is flat below the least distance r_0; normalised up to the largest.
     """
-    density: FloatArray = -_LOG_NORM - np.log(square_m2 + WRONG_FROM_M**2)
+    density: FloatArray = -_LOG_NORM - np.log(square_m2 + OUTLIER_SCALE_M**2)
     return density
 
 
-def log_wrong_there(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return (m,) `log_wrong` of differences (m, 2) with covariances (m, 2, 2), at their mean square."""
-    return log_wrong((off_m**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2))
+def log_outlier_density_at(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (m,) `log_outlier_density` of differences (m, 2) with covariances (m, 2, 2), at their mean square."""
+    return log_outlier_density((off_m**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2))
 
 
 def gate_ratio(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -50,7 +50,7 @@ def gate_ratio(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
 def log_likelihood_ratio(off_m: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return (m,) log likelihood ratios of fitting over wrong, of differences (m, 2) with covariances (m, 2, 2)."""
     log_fits = -0.5 * (squared_sigmas(off_m, covariance) + np.log(_determinants(covariance))) - log(2.0 * pi)
-    worth: FloatArray = log_fits - log_wrong_there(off_m, covariance)
+    worth: FloatArray = log_fits - log_outlier_density_at(off_m, covariance)
     return worth
 
 

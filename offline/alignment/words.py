@@ -12,11 +12,11 @@ _MOST_NAMED = 8
 
 def reason_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Alignment | None) -> str:
     """Return why run b is not joined to a, by name; they share at least one tag."""
-    if alignment is not None and alignment.rivals:
+    if alignment is not None and alignment.alternatives:
         return _ambiguous(a, b, alignment)
     if len(shared) == 1:
         return f"{b} shares only tag {shared[0].tag_id} with {a}; one more shared tag would suffice"
-    if alignment is not None and alignment.is_sure:
+    if alignment is not None and alignment.is_accepted:
         return f"the alignment of {b} with {a} contradicts those of other runs"
     if alignment is not None:
         return (
@@ -31,7 +31,7 @@ def reason_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Align
 
 
 def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
-    ways = [alignment, *alignment.rivals]
+    ways = [alignment, *alignment.alternatives]
     first = set(alignment.inliers)
     told = [f"tags {_names(ways[0].inliers)} put {b}'s start at {_place(ways[0].T_a_b)}"]
     told += [

@@ -20,7 +20,7 @@ from groundsbot.offline.self_calibration import (
     OwnedParameter,
     choice_words,
     correct_robot,
-    learnt_lines,
+    correction_lines,
     parse_calibrate,
     with_focal_lengths,
 )
@@ -89,7 +89,7 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
 def summary(calibrated: Calibrated) -> list[str]:
     """What was learnt, what holds the scale, and where it is written."""
     result = calibrated.result
-    lines = learnt_lines(result, calibrated.learnt)
+    lines = correction_lines(result, calibrated.learnt)
     lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]

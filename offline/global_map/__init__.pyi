@@ -1,22 +1,22 @@
 from .goodness_of_fit import joint_goodness_of_fit
 from .joint_solve import calibration_of, component_of
-from .overdispersion import misfit_of, noise_freedom
+from .overdispersion import misfit_of, noise_degrees_of_freedom
 from .pass_scatter import scatter_of_passes, scatter_warnings
-from .scale_checks import COMPARED, check_warnings, checks_of, scale_budget
+from .scale_checks import COMPARED_PARAMETERS, compare_wheels_and_tags, comparison_warnings, scale_budget
 from .solve_component import SolvedComponent, solve_group
 from .tag_joins.join import TagJoin, join_over_tags
 from .tag_joins.report import join_results, join_warnings
 from .tape import compare_measurements, measurement_warnings, unused_measurements
-from .weak_constraints import weak_parts
+from .weak_constraints import weak_constraint_warnings
 
 __all__ = [
-    "COMPARED",
+    "COMPARED_PARAMETERS",
     "SolvedComponent",
     "TagJoin",
     "calibration_of",
-    "check_warnings",
-    "checks_of",
     "compare_measurements",
+    "compare_wheels_and_tags",
+    "comparison_warnings",
     "component_of",
     "join_over_tags",
     "join_results",
@@ -24,11 +24,11 @@ __all__ = [
     "joint_goodness_of_fit",
     "measurement_warnings",
     "misfit_of",
-    "noise_freedom",
+    "noise_degrees_of_freedom",
     "scale_budget",
     "scatter_of_passes",
     "scatter_warnings",
     "solve_group",
     "unused_measurements",
-    "weak_parts",
+    "weak_constraint_warnings",
 ]

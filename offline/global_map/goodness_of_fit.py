@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from groundsbot.offline.local_map import FALSE_ALARM, GoodnessOfFit, LocalMap, fit_windows, freedom_of
+from groundsbot.offline.local_map import FALSE_ALARM, GoodnessOfFit, LocalMap, degrees_of_freedom, fit_windows
 from groundsbot.offline.sam import Solution
 
 
@@ -29,9 +29,9 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
         each.is_noisy or each.goodness.odometry_factor == each.goodness.reading_factor == 1.0 for each in maps
     )
     if not is_fitted or len(solution.problem.measured):
-        return fit_windows(solution.problem).judge(solution.state)
+        return fit_windows(solution.problem).goodness_of_fit(solution.state)
     alone = [each.solution for each in maps]
-    n = max(0, freedom_of(solution.problem) - sum(freedom_of(each.problem) for each in alone))
+    n = max(0, degrees_of_freedom(solution.problem) - sum(degrees_of_freedom(each.problem) for each in alone))
     rise = max(0.0, 2.0 * (solution.cost - sum(each.cost for each in alone)))
     # The noise has the degrees of freedom of the conditions within the runs.
     told = max(1, sum(each.expected for each in runs))

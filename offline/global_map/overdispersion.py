@@ -15,7 +15,7 @@ from scipy import stats
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.local_map import GoodnessOfFit, LocalMap, freedom_of
+from groundsbot.offline.local_map import GoodnessOfFit, LocalMap, degrees_of_freedom
 from groundsbot.offline.maps import Misfit
 from groundsbot.offline.sam import Graph, Solution, build_graph, losses_and_weights, solve
 
@@ -34,30 +34,36 @@ def misfit_of(
         solution: of it, on tag positions.
         together: goodness of fit of several drives as one map; None where a drive alone does not fit.
     """
-    alone = [_alone(each, graph, solution, segment) for segment, each in enumerate(maps)]
-    found = (_of_joins(maps, graph, solution, alone), _of_windows(maps, graph, solution, alone, together))
+    alone = [_solve_alone(each, graph, solution, segment) for segment, each in enumerate(maps)]
+    found = (_misfit_of_joins(maps, graph, solution, alone), _misfit_of_windows(maps, graph, solution, alone, together))
     misfits = [each for each in found if each is not None and each.variance_factor > 1.0]
     return max(misfits, key=lambda each: each.variance_factor, default=None)
 
 
-def noise_freedom(maps: Sequence[LocalMap]) -> int:
+def noise_degrees_of_freedom(maps: Sequence[LocalMap]) -> int:
     """Return the degrees of freedom of the noise estimate, from the conditions that join the windows of drives."""
     return max(1, sum(each.goodness.expected for each in maps))
 
 
-def _of_joins(maps: Sequence[LocalMap], graph: Graph, solution: Solution, alone: Sequence[Solution]) -> Misfit | None:
+def _misfit_of_joins(
+    maps: Sequence[LocalMap], graph: Graph, solution: Solution, alone: Sequence[Solution]
+) -> Misfit | None:
     """Return the cost of sharing tags and calibration, without measurements by a person, which are tested apart."""
     measured = graph.problem.measured
-    n = freedom_of(graph.problem) - measured.n_residuals - sum(freedom_of(each.problem) for each in alone)
+    n = (
+        degrees_of_freedom(graph.problem)
+        - measured.n_residuals
+        - sum(degrees_of_freedom(each.problem) for each in alone)
+    )
     if len(maps) == 1 or n <= 0:
         return None
     rise = 2.0 * (solution.cost - sum(each.cost for each in alone)) - measured.sum_of_squares(solution.state)
-    if rise <= n * float(stats.f.isf(_FALSE_ALARM, n, noise_freedom(maps))):
+    if rise <= n * float(stats.f.isf(_FALSE_ALARM, n, noise_degrees_of_freedom(maps))):
         return None
     return Misfit("joins", graph.segments[_worst(graph, solution, alone)].name, rise, n)
 
 
-def _of_windows(
+def _misfit_of_windows(
     maps: Sequence[LocalMap],
     graph: Graph,
     solution: Solution,
@@ -69,7 +75,7 @@ def _of_windows(
     if not all(each.fits for each in runs):
         cost = [_cost(each) for each in runs]
         worst = int(np.argmax([square / max(1, each.expected) for square, each in zip(cost, runs, strict=True)]))
-        return Misfit("windows", graph.segments[worst].name, sum(cost), noise_freedom(maps))
+        return Misfit("windows", graph.segments[worst].name, sum(cost), noise_degrees_of_freedom(maps))
     if together is None or together.fits:
         return None
     name = graph.segments[_worst(graph, solution, alone)].name
@@ -81,7 +87,7 @@ def _cost(goodness: GoodnessOfFit) -> float:
     return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
 
 
-def _alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) -> Solution:
+def _solve_alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) -> Solution:
     """Return the solution of one segment alone: its local map's, unless its tags were split differently since."""
     now = graph.segments[segment]
     if _same_places(local_map.segment.readings.tag, now.readings.tag):

@@ -15,15 +15,15 @@ from groundsbot.offline.maps import ConsistencyCheck, ScaleBudget
 from groundsbot.offline.sam import Graph, Solution
 
 # The corrections that each check compares.
-COMPARED: Final = {"scale": ("wheel_scale", TAG_SCALE), "turn": ("wheel_scale", "track_scale")}
+COMPARED_PARAMETERS: Final = {"scale": ("wheel_scale", TAG_SCALE), "turn": ("wheel_scale", "track_scale")}
 # Relative information of weakened priors, in effect none.
 _WEAKENED: Final = 1e-8
 # Observations whose sigma exceeds this multiple of robot.yaml's contain no information about the comparison.
-_TELLS_NOTHING: Final = 10.0
-_HELD: Final = 1e-12  # sigma of fixed parameters: far below any that is given
+_MAX_RELATIVE_SIGMA: Final = 10.0
+_FIXED_SIGMA: Final = 1e-12  # sigma of fixed parameters: far below any that is given
 
 
-def checks_of(graph: Graph, solution: Solution, component: int) -> list[ConsistencyCheck]:
+def compare_wheels_and_tags(graph: Graph, solution: Solution, component: int) -> list[ConsistencyCheck]:
     """Return each robot's wheels compared with each batch of tags, where observations determine this."""
     found: dict[tuple[str, str, str | None], ConsistencyCheck] = {}
     for i, segment in enumerate(graph.segments):
@@ -39,7 +39,7 @@ def checks_of(graph: Graph, solution: Solution, component: int) -> list[Consiste
     return list(found.values())
 
 
-def check_warnings(checks: Sequence[ConsistencyCheck]) -> list[str]:
+def comparison_warnings(checks: Sequence[ConsistencyCheck]) -> list[str]:
     """Return a warning for each contradiction between wheels and tags, with its size and usual cause."""
     return [_sentence(check) for check in checks if check.contradicts]
 
@@ -53,11 +53,11 @@ def scale_budget(graph: Graph, component: int) -> ScaleBudget:
     for parameter in graph.parameters:
         kind = {"wheel_scale": "wheels", "track_scale": "track", TAG_SCALE: "tags"}.get(parameter.name)
         if kind is not None:
-            resists[kind] += 1.0 / max(parameter.sigma, _HELD) ** 2
+            resists[kind] += 1.0 / max(parameter.sigma, _FIXED_SIGMA) ** 2
         elif parameter.name in ("mount_x_m", "mount_y_m"):
             x_m, y_m, _ = parameter.nominal
             stretched_m = x_m if parameter.name == "mount_x_m" else y_m
-            resists["mount"] += (stretched_m / max(parameter.sigma, _HELD)) ** 2
+            resists["mount"] += (stretched_m / max(parameter.sigma, _FIXED_SIGMA)) ** 2
     measured = graph.problem.measured
     resists["distances"] = float(((measured.distances.distance_m / measured.distances.sigma_m) ** 2).sum())
     x, y, theta = measured.starts.T_map_start.T
@@ -91,7 +91,7 @@ def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float
     own = np.linalg.inv(_positive(information - np.eye(len(way))) + weak)
     scaled_way = way @ np.sqrt(P)
     sigma = float(np.sqrt(scaled_way @ own @ scaled_way))
-    if sigma > _TELLS_NOTHING * allowed:
+    if sigma > _MAX_RELATIVE_SIGMA * allowed:
         return None
     estimate = own @ information @ unit @ solution.state.calibration[indices][free]
     return float(scaled_way @ estimate), sigma, allowed

@@ -43,10 +43,10 @@ class SolvedComponent(NamedTuple):
     members: Group
     graph: Graph
     solution: Solution
-    suspects: list[SuspectTag]
+    outliers: list[SuspectTag]
     refined: Refined | None = None
-    told: tuple[str, ...] = ()
-    left_out: frozenset[tuple[str, int]] = frozenset()
+    messages: tuple[str, ...] = ()
+    excluded_tags: frozenset[tuple[str, int]] = frozenset()
 
 
 def solve_group(
@@ -79,12 +79,12 @@ def solve_group(
         ids = _list_ids({(tag.family, tag.tag_id) for tag in misread})
         told = [*told, f"tags {ids} were each read once at another tag's place; taken for misread codes and left out"]
     left_out = frozenset((tag.family, tag.tag_id) for tag in gone)
-    solved = SolvedComponent(members, graph, solution, suspects, told=tuple(told), left_out=left_out)
+    solved = SolvedComponent(members, graph, solution, suspects, messages=tuple(told), excluded_tags=left_out)
     if not corners or not graph.has_corners:
         return solved
     with stages.stage("refining on tag corners"):
         refined, more = refine(graph, solution, upright_sigma_rad)
-    return solved._replace(refined=refined, told=(*told, *more))
+    return solved._replace(refined=refined, messages=(*told, *more))
 
 
 def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:

@@ -71,7 +71,7 @@ def compare_measurements(
     rows = [(by_start, m) for m in range(len(starts))] + [(by_distance, m) for m in range(len(distances))]
     results = []
     for result, (kind, m), value in zip(told, rows, [*in_map[0], *in_map[1]], strict=True):
-        off_sigmas, bound = _off(kind, m, solution)
+        off_sigmas, bound = _deviation(kind, m, solution)
         results.append(
             replace(
                 result,
@@ -125,7 +125,7 @@ def _names(graph: Graph) -> list[str]:
     return [segment.name for segment in graph.segments]
 
 
-def _off(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:
+def _deviation(kind: Linearised, m: int, solution: Solution | CornerSolution) -> tuple[float | None, float]:
     """Return the deviation of a measurement from the prediction by all others, in sigmas, and its bound.
 
     With S = J H^-1 J^T, r^T (I - S)^-1 r is the squared Mahalanobis distance from a prediction without the measurement

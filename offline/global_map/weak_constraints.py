@@ -12,7 +12,7 @@ from groundsbot.offline.sam import MAX_RELATIVE_ERROR, Graph, Solution
 _MOST_NAMED: Final = 12
 
 
-def weak_parts(graph: Graph, solution: Solution) -> list[str]:
+def weak_constraint_warnings(graph: Graph, solution: Solution) -> list[str]:
     """Return sentences about one component."""
     return [
         *_unobservable_warnings(graph, solution),

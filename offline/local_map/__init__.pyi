@@ -1,14 +1,14 @@
 from .archive import (
     archive_map,
+    archived_tag_ids,
     check_extendable,
     check_sizes_in_map,
-    local_map_of,
+    restore_local_map,
     run_without_log,
     segment_from_arrays,
-    tags_of,
     tape_options_of,
 )
-from .goodness_of_fit import FALSE_ALARM, WINDOW_M, GoodnessOfFit, fit_windows, freedom_of
+from .goodness_of_fit import FALSE_ALARM, WINDOW_M, GoodnessOfFit, degrees_of_freedom, fit_windows
 from .local_map import LocalMap, WindowNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
 
 __all__ = [
@@ -18,17 +18,17 @@ __all__ = [
     "LocalMap",
     "WindowNoise",
     "archive_map",
+    "archived_tag_ids",
     "check_extendable",
     "check_sizes_in_map",
+    "degrees_of_freedom",
     "first_solution",
     "fit_windows",
-    "freedom_of",
-    "local_map_of",
     "noise_of_windows",
+    "restore_local_map",
     "run_without_log",
     "segment_from_arrays",
     "solve_local_map",
-    "tags_of",
     "tape_options_of",
     "with_goodness_of_fit",
 ]

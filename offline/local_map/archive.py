@@ -73,7 +73,7 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
     )
 
 
-def local_map_of(kept: ArchivedSegment) -> LocalMap:
+def restore_local_map(kept: ArchivedSegment) -> LocalMap:
     """Return the archived local map, under the noise it was archived with."""
     segment = _segment(kept)
     graph = build_graph([segment])
@@ -205,7 +205,7 @@ def check_extendable(known: MapResult) -> None:
         )
 
 
-def tags_of(kept: ArchivedSegment) -> list[TagKey]:
+def archived_tag_ids(kept: ArchivedSegment) -> list[TagKey]:
     """Return the ids of the tags that a segment observed, without instances."""
     return [TagKey(family, tag_id) for family, tag_id in zip(kept.tag_families, kept.tag_ids.tolist(), strict=True)]
 

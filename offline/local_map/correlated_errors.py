@@ -20,7 +20,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam import Solution, losses_and_weights, stack
 
 # Weight of the prior of independent errors, as a number of cells.
-_TOLD: Final = 4.0
+_PRIOR_CELLS: Final = 4.0
 _TINY: Final = 1e-9
 _N_SIGNS: Final = 8
 _FEW: Final = 2**20  # numbers: more vectors at once take more memory than a solve
@@ -28,7 +28,7 @@ _SEED: Final = 7
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class CorrelatedErrors:
     """Variances of whitened observations, by component of the observation.
 
     Attributes:
@@ -36,10 +36,10 @@ class SharedErrors:
         shared: (2,) of the part common to a cell, and shared_redundancy: (2,) its number of cells.
     """
 
-    own: FloatArray
-    own_redundancy: FloatArray
-    shared: FloatArray
-    shared_redundancy: FloatArray
+    independent_variance: FloatArray
+    independent_redundancy: FloatArray
+    common_variance: FloatArray
+    common_redundancy: FloatArray
 
     def factors(self, cell: IntArray, least_shared: FloatArray | float = 0.0) -> FloatArray:
         """Return (M, 2) factors on sigmas that make observations equivalent to independent ones.
@@ -48,26 +48,28 @@ class SharedErrors:
             cell: (M,) of each observation.
             least_shared: (M, 2) lower bound on the common variance, known independently of the fit.
         """
-        return np.sqrt(self.own + _n_in_cell(cell)[:, None] * np.maximum(self.shared, least_shared))
+        return np.sqrt(
+            self.independent_variance + _n_in_cell(cell)[:, None] * np.maximum(self.common_variance, least_shared)
+        )
 
-    def freedom(self, cell: IntArray) -> float:
+    def degrees_of_freedom(self, cell: IntArray) -> float:
         """Return the effective degrees of freedom of the inflated variance of the observations.
 
         By Satterthwaite's sum: "An approximate distribution of estimates of variance components" (1946).
         """
-        parts = np.concatenate([len(cell) * self.own, _n_in_cell(cell).sum() * self.shared])
-        redundancy = np.concatenate([self.own_redundancy, self.shared_redundancy])
+        parts = np.concatenate([len(cell) * self.independent_variance, _n_in_cell(cell).sum() * self.common_variance])
+        redundancy = np.concatenate([self.independent_redundancy, self.common_redundancy])
         return float(parts.sum() ** 2 / (parts**2 / redundancy).sum())
 
 
-def fit_shared_errors(solution: Solution, cell: IntArray) -> SharedErrors:
+def fit_correlated_errors(solution: Solution, cell: IntArray) -> CorrelatedErrors:
     """Fit both variances to the residuals of a solve's observations, with all other noise as given to the solve.
 
     Args:
         solution: with observations weighted as independent.
         cell: (M,) of each observation; numbers from 0 without gaps.
     """
-    read = _Readings(solution)
+    read = _ResidualProjection(solution)
     cells = sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
     found, whole = np.empty((4, 4, _N_SIGNS)), np.empty((4, _N_SIGNS))
     drawn = _random_signs(cell)
@@ -95,7 +97,7 @@ def _random_signs(cell: IntArray) -> Iterator[FloatArray]:
         yield drawn
 
 
-class _Readings:
+class _ResidualProjection:
     """Residual projection of the observations in a solve, with the weights of its loss.
 
     Attributes:
@@ -128,7 +130,7 @@ def _squares(readings: FloatArray, cells: sparse.csr_array) -> FloatArray:
     return np.stack([*(readings**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
 
 
-def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> SharedErrors:
+def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> CorrelatedErrors:
     """Return variances (independent twice, common twice), none negative, of traces @ variances = squares.
 
     Args:
@@ -138,13 +140,13 @@ def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray
         size: mean size of an observation's cell: the trace of a cell without reduction by the estimate. Where the
             reduction is large, sums over cells contain little information, and the prior dominates.
     """
-    told = _TOLD * np.array([1.0, 1.0, size, size]) ** 2
+    told = _PRIOR_CELLS * np.array([1.0, 1.0, size, size]) ** 2
     weighed = traces + np.diag(told)
     aimed = squares + told * np.array([1.0, 1.0, 0.0, 0.0])
     shared = np.maximum(np.linalg.solve(weighed, aimed)[2:], 0.0)
     own = np.linalg.solve(weighed[:2, :2], aimed[:2] - weighed[:2, 2:] @ shared)
-    redundancy = length**2 / np.maximum(traces.diagonal(), _TINY) + _TOLD
-    return SharedErrors(np.maximum(own, _TINY), redundancy[:2], shared, redundancy[2:])
+    redundancy = length**2 / np.maximum(traces.diagonal(), _TINY) + _PRIOR_CELLS
+    return CorrelatedErrors(np.maximum(own, _TINY), redundancy[:2], shared, redundancy[2:])
 
 
 def _n_in_cell(cell: IntArray) -> FloatArray:

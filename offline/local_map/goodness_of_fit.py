@@ -18,7 +18,7 @@ from scipy import stats
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions
-from groundsbot.offline.local_map.correlated_errors import fit_shared_errors
+from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     MAX_TRIES,
@@ -44,7 +44,7 @@ FALSE_ALARM: Final = 1e-3
 # The prior sigmas count as this many measurements of each kind, unless the data contradict them by a factor of ten: the
 # prior mean is first drawn to the data in the same proportion (a prior with uncertain scale: Gelman et al., "Bayesian
 # Data Analysis", 2013, chapter 5).
-_TOLD: Final = 4.0
+_PRIOR_COUNT: Final = 4.0
 # The fit ends when a factor changes by less than this share; far below the effect of its own uncertainty.
 _FACTOR_TOLERANCE: Final = 0.02
 _MAX_FITS: Final = 20
@@ -115,23 +115,23 @@ class Windows:
     problem: Problem
     losses: Losses
     factors: FloatArray
-    usual_factors: FloatArray
-    sharing: FloatArray
-    freedom: float
+    trimmed_factors: FloatArray
+    correlated_error_factors: FloatArray
+    degrees_of_freedom: float
     cost: float
     n_conditions: int
     effort: SolveBudget | None = None
     share: float = 1.0
 
-    def judge(self, state: State) -> GoodnessOfFit:
+    def goodness_of_fit(self, state: State) -> GoodnessOfFit:
         """Return the cost of joining the windows at the minimum near a state."""
-        problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.sharing)
+        problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.correlated_error_factors)
         most_tries = self.effort.max_linearisations(problem, self.share) if self.effort else MAX_TRIES
         together = solve(problem, state, losses=self.losses, most_tries=most_tries)
         if self.effort:
             self.effort.spend(together)
         n = self.n_conditions
-        quantile = stats.f.isf(FALSE_ALARM, n, self.freedom) if n else 1.0
+        quantile = stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom) if n else 1.0
         return GoodnessOfFit(
             chi_square=max(0.0, 2.0 * (together.cost - self.cost)),
             expected=n,
@@ -176,10 +176,10 @@ def fit_windows(
         left -= solution.n_linearised
         if effort:
             effort.spend(solution)
-        squares, redundancy = _mean_squares(solution)
+        squares, redundancy = _losses_and_redundancies(solution)
         squares = squares * factors**2
-        believed = (squares + _TOLD) / (redundancy + _TOLD)
-        found = np.maximum(np.sqrt((squares + _TOLD * believed) / (redundancy + _TOLD)), least_factor)
+        believed = (squares + _PRIOR_COUNT) / (redundancy + _PRIOR_COUNT)
+        found = np.maximum(np.sqrt((squares + _PRIOR_COUNT * believed) / (redundancy + _PRIOR_COUNT)), least_factor)
         # Wheels and observations compete for the residuals: a factor that reverses had overshot, so half a step is
         # taken.
         turns_back = (found / factors - 1.0) * (factors / last - 1.0) < 0.0
@@ -189,8 +189,8 @@ def fit_windows(
         if left <= 0 or np.abs(factors / last - 1.0).max() < _FACTOR_TOLERANCE:
             break
     # Drives that only a tape measurement joins have more unknowns together than apart.
-    n_conditions = max(0, freedom_of(problem) - freedom_of(apart))
-    sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _TOLD).min())
+    n_conditions = max(0, degrees_of_freedom(problem) - degrees_of_freedom(apart))
+    sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _PRIOR_COUNT).min())
     most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
         solution = solve(_scale_noise(apart, *factors), state, losses=losses, most_tries=most_tries)
@@ -198,7 +198,7 @@ def fit_windows(
         solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, most_tries)
         if effort:
             effort.spend(solution)
-        sharing, known_like = _sharing(problem, solution, least_shared / factors[1] ** 2)
+        sharing, known_like = _correlated_error_factors(problem, solution, least_shared / factors[1] ** 2)
         sharing = np.maximum(sharing, least_factor / factors[1])
         freedom, state = min(freedom, known_like), solution.state
         del solution
@@ -206,11 +206,11 @@ def fit_windows(
         solution = solve(shared, state, losses=losses, most_tries=most_tries)
     if effort:
         effort.spend(solution)
-    usual = factors * _without_the_worst(solution)
+    usual = factors * _trimmed_factors(solution)
     return Windows(problem, losses, factors, usual, sharing, freedom, solution.cost, n_conditions, effort, share)
 
 
-def _without_the_worst(solution: Solution) -> FloatArray:
+def _trimmed_factors(solution: Solution) -> FloatArray:
     """Return (2,) factors on the noise of wheels and of observations when the fifth of worst windows is left out."""
     problem, state = solution.problem, solution.state
     begins = np.ones(len(state.poses), dtype=np.bool_)
@@ -232,11 +232,13 @@ def _without_the_worst(solution: Solution) -> FloatArray:
     return found
 
 
-def _sharing(problem: Problem, solution: Solution, least_shared: FloatArray | float) -> tuple[FloatArray, float]:
+def _correlated_error_factors(
+    problem: Problem, solution: Solution, least_shared: FloatArray | float
+) -> tuple[FloatArray, float]:
     """Return factors on the sigmas of observations for correlated errors, and their effective degrees of freedom."""
     cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
-    errors = fit_shared_errors(solution, cell)
-    return errors.factors(cell, least_shared), errors.freedom(cell)
+    errors = fit_correlated_errors(solution, cell)
+    return errors.factors(cell, least_shared), errors.degrees_of_freedom(cell)
 
 
 def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
@@ -338,12 +340,12 @@ def _scale_noise(problem: Problem, odometry_factor: float, reading_factor: float
     return problem.reweigh(odometry, readings)
 
 
-def freedom_of(problem: Problem) -> int:
+def degrees_of_freedom(problem: Problem) -> int:
     """Return the number of measurements, priors included, less the number of unknowns."""
     return problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
 
 
-def _mean_squares(solution: Solution) -> tuple[FloatArray, FloatArray]:
+def _losses_and_redundancies(solution: Solution) -> tuple[FloatArray, FloatArray]:
     """Return losses (2,) of wheels and observations at the solution, and their redundancies (2,).
 
     The redundancy is the number of residuals less the trace of J H^-1 J^T, an average over random signs z of z^T J H^-1
@@ -361,5 +363,5 @@ def _mean_squares(solution: Solution) -> tuple[FloatArray, FloatArray]:
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)
-    whole = max(0, freedom_of(problem))
+    whole = max(0, degrees_of_freedom(problem))
     return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])

@@ -55,7 +55,7 @@ _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.1  # it is solved several times
 # Where windows show far more noise than given, other starts end with the first that does not lower the cost by this
 # share: what remains is noise.
-_MOST_IN_VAIN: Final = 1
+_MAX_FAILED_STARTS: Final = 1
 _LEAST_GAIN: Final = 0.01
 # The incremental solve uses the noise of the windows where it is larger than given by this factor. Below it, the larger
 # noise would admit wrong minima.
@@ -77,7 +77,7 @@ class LocalMap:
     solution: Solution
     goodness: GoodnessOfFit
     is_noisy: bool = False  # its windows show far more noise than given, so the noise is fitted before outliers
-    whole: Segment | None = None  # with unconfirmed observations, where these were left out of a noisy segment
+    unfiltered: Segment | None = None  # with unconfirmed observations, where these were left out of a noisy segment
     n_misread: int = 0  # observations left out as those of another tag, or of none
     is_doubtful: bool = False  # it does not fit even under its fitted noise, so none of its tags is named an outlier
 
@@ -96,7 +96,7 @@ class LocalMap:
         """Calibration estimated from the segment."""
         return self.graph.calibration_of(self.solution.state)
 
-    def without_factors(self) -> "LocalMap":
+    def without_factorisation(self) -> "LocalMap":
         """Return the map without the cached factorisation of its solution, which may be most of its memory."""
         return replace(self, solution=replace(self.solution))
 
@@ -144,14 +144,16 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
         effort.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
-            best = LocalMap(segment, graph, solution, check.judge(solution), is_noisy=far_larger, whole=whole)
+            best = LocalMap(
+                segment, graph, solution, check.goodness_of_fit(solution), is_noisy=far_larger, unfiltered=whole
+            )
             n_in_vain = 0
             if best.goodness.fits:
                 break
         is_spent = effort.left < _BUILDING_SHARE * effort.allowed
-        if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MOST_IN_VAIN):
+        if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
             break
-        known = _build_up(_redrawn(_inflate_noise(coarse, check.noise_factors), rng), effort)
+        known = _build_up(_perturb_odometry(_inflate_noise(coarse, check.noise_factors), rng), effort)
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
@@ -173,9 +175,9 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> Lo
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
     graph.problem.arrowhead.without_scratch()
-    whole = local_map.whole
+    whole = local_map.unfiltered
     return replace(
-        local_map, segment=segment, graph=graph, solution=solution, whole=whole and with_solved_ranges(whole)
+        local_map, segment=segment, graph=graph, solution=solution, unfiltered=whole and with_solved_ranges(whole)
     )
 
 
@@ -190,13 +192,13 @@ class WindowNoise(NamedTuple):
 
     is_far_larger: bool
     factors: tuple[float, float]
-    added: tuple[str, ...]
+    extra_noise: tuple[str, ...]
 
     def apply_to(self, segment: Segment) -> tuple[Segment, Segment | None]:
         """Return the segment to solve and, where its noise is unknown, the one with unconfirmed observations."""
         if not self.is_far_larger:
             return segment, None
-        whole = segment.with_position_noise(self.added)
+        whole = segment.with_position_noise(self.extra_noise)
         return without_unconfirmed_tracks(whole), whole
 
 
@@ -225,7 +227,7 @@ def with_goodness_of_fit(local_map: LocalMap, effort: SolveBudget | None = None)
     segment = local_map.segment
     effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, effort, least_factor=1.0)
-    found = replace(local_map, goodness=check.judge(local_map.solution))
+    found = replace(local_map, goodness=check.goodness_of_fit(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
 
@@ -236,7 +238,7 @@ def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: b
     noise_is_open = noise_is_open or is_left_open
     likely = without_unconfirmed_tracks(segment) if is_left_open else segment
     check = _Check(build_graph([likely]), effort)
-    factors = check.noise_factors if is_left_open else check.usual_noise_factors
+    factors = check.noise_factors if is_left_open else check.trimmed_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
     is_beyond_pixels = factors[1] * segment.readings.corner_sigma_px > _MOST_CORNER_PX
     shown = WindowNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
@@ -279,14 +281,14 @@ class _Check:
         return wheels, readings
 
     @property
-    def usual_noise_factors(self) -> tuple[float, float]:
+    def trimmed_noise_factors(self) -> tuple[float, float]:
         """The same without the worst windows."""
-        wheels, readings = self._windows.usual_factors.tolist()
+        wheels, readings = self._windows.trimmed_factors.tolist()
         return wheels, readings
 
-    def judge(self, solution: Solution) -> GoodnessOfFit:
+    def goodness_of_fit(self, solution: Solution) -> GoodnessOfFit:
         state = solution.state
-        return self._windows.judge(
+        return self._windows.goodness_of_fit(
             State(state.poses[self._keyframes], state.tags[self._tags], state.calibration[self._calibration])
         )
 
@@ -301,7 +303,7 @@ def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
     )
 
 
-def _redrawn(segment: Segment, rng: np.random.Generator) -> Segment:
+def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
     """Return the segment with another draw of the wheels' noise: an equally likely drive with other local minima."""
     odometry = segment.odometry
     error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))

@@ -154,7 +154,7 @@ class _SegmentPlaces:
             reason = f"{name} is in component {best.component}, the rest of the run in component {home}"
             return NotLocated(name, reason, tuple(_candidates(best)[:1]))
         reason = reason_not_joined(_MAP, name, best.shared, best.alignment)
-        is_ambiguous = best.alignment is not None and len(best.alignment.rivals) > 0
+        is_ambiguous = best.alignment is not None and len(best.alignment.alternatives) > 0
         return NotLocated(name, reason, tuple(_candidates(best)) if is_ambiguous else ())
 
 
@@ -177,7 +177,7 @@ def _locate(local_map: LocalMap, parts: dict[int, MapPrior]) -> tuple[Located, .
 
 
 def _evidence(located: Located) -> float:
-    return float("-inf") if located.alignment is None else located.alignment.evidence_nats
+    return float("-inf") if located.alignment is None else located.alignment.log_bayes_factor
 
 
 def _check_shared_tags(found: Sequence[_SegmentPlaces], folder: Path, parts: dict[int, MapPrior]) -> None:
@@ -263,7 +263,7 @@ def _moved_tags(here: Sequence[Located], held: RunInMap) -> tuple[MovedTag, ...]
 def _candidates(located: Located) -> list[Candidate]:
     if located.alignment is None:
         return []
-    ways = (located.alignment, *located.alignment.rivals)
+    ways = (located.alignment, *located.alignment.alternatives)
     return [Candidate(located.component, way.T_a_b, way.inliers) for way in ways]
 
 

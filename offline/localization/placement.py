@@ -32,7 +32,7 @@ class Located:
     @property
     def is_sure(self) -> bool:
         """Whether nothing else explains the tags as well."""
-        return self.alignment is not None and self.alignment.is_sure
+        return self.alignment is not None and self.alignment.is_accepted
 
     @property
     def shared(self) -> tuple[TagKey, ...]:
@@ -95,5 +95,5 @@ def _repeat_tags(condensed: CondensedMap, which: list[int], names: list[TagKey])
 
 def _with_map_names(alignment: Alignment, tags: tuple[TagKey, ...]) -> Alignment:
     """With the tags under the map's own names."""
-    rivals = tuple(_with_map_names(rival, tags) for rival in alignment.rivals)
-    return replace(alignment, shared=tags, rivals=rivals)
+    rivals = tuple(_with_map_names(rival, tags) for rival in alignment.alternatives)
+    return replace(alignment, shared=tags, alternatives=rivals)

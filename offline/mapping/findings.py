@@ -8,16 +8,16 @@ from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map import (
     SolvedComponent,
     calibration_of,
-    checks_of,
     compare_measurements,
+    compare_wheels_and_tags,
     component_of,
     joint_goodness_of_fit,
     misfit_of,
-    noise_freedom,
+    noise_degrees_of_freedom,
     scale_budget,
     scatter_of_passes,
     scatter_warnings,
-    weak_parts,
+    weak_constraint_warnings,
 )
 from groundsbot.offline.local_map import GoodnessOfFit, LocalMap
 from groundsbot.offline.mapping.workings import SolvedGroup
@@ -40,38 +40,41 @@ class Findings:
     """Results of the components, in their order."""
 
     components: list[Component] = field(default_factory=list)
-    suspects: list[SuspectTag] = field(default_factory=list)
+    outliers: list[SuspectTag] = field(default_factory=list)
     calibration: list[CalibrationResult] = field(default_factory=list)
-    measured: list[MeasurementResult] = field(default_factory=list)
+    measurements: list[MeasurementResult] = field(default_factory=list)
     checks: list[ConsistencyCheck] = field(default_factory=list)
-    metres: list[ScaleBudget] = field(default_factory=list)
+    scale_budgets: list[ScaleBudget] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    left_out: set[tuple[str, int]] = field(default_factory=set)
+    excluded_tags: set[tuple[str, int]] = field(default_factory=set)
     advice: list[AdviceResult] = field(default_factory=list)
 
-    def take(
+    def add(
         self, maps: Sequence[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
     ) -> SolvedGroup:
         """Add the results of one more component."""
         index = len(self.components)
         members, graph, solution, suspects, refined, told, left_out = solved
-        self.suspects += suspects
-        self.left_out |= left_out
+        self.outliers += suspects
+        self.excluded_tags |= left_out
         self.warnings += [f"component {index}: {sentence}" for sentence in told]
         own_maps = [maps[m] for m in members.members]
         with stages.stage("checking that it fits"):
             together = _joint_goodness_of_fit(own_maps, solution)
             misfit = misfit_of(own_maps, graph, solution, together)
             factor = 1.0 if misfit is None else misfit.variance_factor
-            scatter = scatter_of_passes(graph, solution, factor, noise_freedom(own_maps))
+            scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
         with stages.stage("covariances"):
             self.components.append(inflate_covariances(component_of(graph, solution, refined), misfit, scatter))
             last = refined.solution if refined else solution
             numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)
             self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
-            self.measured += compare_measurements(graph, last, measurements, index)
-            self.checks += [replace(each, sigma=factor**0.5 * each.sigma) for each in checks_of(graph, solution, index)]
-            self.metres.append(scale_budget(graph, index))
+            self.measurements += compare_measurements(graph, last, measurements, index)
+            self.checks += [
+                replace(each, sigma=factor**0.5 * each.sigma)
+                for each in compare_wheels_and_tags(graph, solution, index)
+            ]
+            self.scale_budgets.append(scale_budget(graph, index))
         is_refined, poses = refined is not None, last.state.poses
         del solved, refined, last  # frees the factorisation on corners, unused below
         if not is_refined:  # else the map's sigmas are not those that advice predicts from
@@ -81,7 +84,7 @@ class Findings:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
             )
-        self.warnings += weak_parts(graph, solution) + _contradictions(own_maps, index, together)
+        self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
         return SolvedGroup(members, graph, solution, poses)
 

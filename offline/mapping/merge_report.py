@@ -39,17 +39,17 @@ def merge_warnings(
         alignment = pair.alignment
         if alignment is None:
             continue
-        if alignment.is_sure:
-            warnings += _elsewhere(maps, pair, alignment, named)
+        if alignment.is_accepted:
+            warnings += _moved_tags(maps, pair, alignment, named)
         elif component[pair.a] == component[pair.b]:
             warnings.append(f"{_reason_not_joined(maps, pair)}; they are joined by other runs")
     warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
     for i, group in enumerate(merged.groups[1:], start=1):
-        warnings.append(f"component {i}: {reason_apart(maps, merged, group, not_joined)}")
+        warnings.append(f"component {i}: {why_not_merged(maps, merged, group, not_joined)}")
     return warnings
 
 
-def reason_apart(
+def why_not_merged(
     maps: Sequence[LocalMap], merged: Merge, group: Group, not_joined: Sequence[TagJoin] | None = None
 ) -> str:
     """Return why a component is not joined, for the pair that is nearest to joining it, and what would help."""
@@ -80,21 +80,21 @@ def _not_searched(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
 
 
 def _nearness(pair: PairAlignment) -> tuple[float, int]:
-    evidence_nats = float("-inf") if pair.alignment is None else pair.alignment.evidence_nats
+    evidence_nats = float("-inf") if pair.alignment is None else pair.alignment.log_bayes_factor
     return evidence_nats, len(pair.shared)
 
 
 def _reason_not_joined(maps: Sequence[LocalMap], pair: PairAlignment, told_of: set[str] | None = None) -> str:
     """Return why a pair is not joined; the first name is one of `told_of`."""
     a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
-    if (pair.alignment is None or not pair.alignment.rivals) and told_of is not None and b not in told_of:
+    if (pair.alignment is None or not pair.alignment.alternatives) and told_of is not None and b not in told_of:
         a, b = b, a
     if not pair.is_searched:
         return f"{b} shares {len(pair.shared)} tags with {a}, but was not aligned with it: {_TOO_LONG}"
     return reason_not_joined(a, b, pair.shared, pair.alignment)
 
 
-def _elsewhere(
+def _moved_tags(
     maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment, named: Collection[tuple[str, int]]
 ) -> list[str]:
     a, b = maps[pair.a].segment.name, maps[pair.b].segment.name
@@ -111,8 +111,8 @@ def _elsewhere(
 def _contradictions(maps: Sequence[LocalMap], merged: Merge) -> list[str]:
     warnings = []
     for each in merged.contradictions:
-        ring = ", ".join(maps[m].segment.name for m in each.ring)
-        gap_m, turn_deg = float((each.gap[:2] ** 2).sum() ** 0.5), abs(degrees(each.gap[2]))
+        ring = ", ".join(maps[m].segment.name for m in each.cycle)
+        gap_m, turn_deg = float((each.closure_error[:2] ** 2).sum() ** 0.5), abs(degrees(each.closure_error[2]))
         a, b = (maps[m].segment.name for m in (each.link.a, each.link.b))
         warnings.append(
             f"the alignments of {ring} contradict each other (around the cycle by {gap_m:.2f} m and {turn_deg:.1f} "
@@ -130,8 +130,8 @@ def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment)
         n_inliers=alignment.n_inliers,
         inlier_rmse_m=alignment.rmse_m,
         outliers=_ids(alignment.outliers),
-        is_sure=alignment.is_sure,
-        rivals=tuple(AlternativeResult(each.T_a_b, _ids(each.inliers)) for each in alignment.rivals),
+        is_sure=alignment.is_accepted,
+        rivals=tuple(AlternativeResult(each.T_a_b, _ids(each.inliers)) for each in alignment.alternatives),
     )
 
 

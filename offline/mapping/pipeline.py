@@ -17,7 +17,7 @@ from groundsbot.offline.global_map import (
     solve_group,
     unused_measurements,
 )
-from groundsbot.offline.local_map import LocalMap, archive_map, local_map_of, tags_of, tape_options_of
+from groundsbot.offline.local_map import LocalMap, archive_map, archived_tag_ids, restore_local_map, tape_options_of
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
 from groundsbot.offline.mapping.merge_report import alignment_results
@@ -40,14 +40,14 @@ from groundsbot.offline.outliers import (
     with_outliers_apart,
 )
 from groundsbot.offline.self_calibration import (
-    TIMES_MAPPED,
+    N_MAPPINGS,
     Calibrate,
     FreedRobots,
-    about_the_files,
+    applied_corrections,
+    compare_with_files,
     free_parameters,
-    put_right,
-    start_left_open,
-    verdicts,
+    initialise_open_robots,
+    relative_to_files,
 )
 
 
@@ -101,7 +101,7 @@ def build_map(
     workings.searches |= searches
     measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
-    times = TIMES_MAPPED if calibrate.is_on else 1
+    times = N_MAPPINGS if calibrate.is_on else 1
     maps, noisy, broken = local_maps_of(segments, stages, times, noise_is_open=noise is None)
     if noise is None:
         with stages.stage("fitting the noise"):
@@ -118,25 +118,25 @@ def build_map(
     joined = join_results(components, joins)
     found = Findings()
     while components:  # each is freed once it is reported: its factor on corners may take 100 MiB
-        workings.solved.append(found.take(maps, components.pop(0), measurements, stages))
-    found.measured += unused_measurements(measurements, found.measured)
+        workings.components.append(found.add(maps, components.pop(0), measurements, stages))
+    found.measurements += unused_measurements(measurements, found.measurements)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.segment.run.name: each.segment.run for each in known}.values(), *runs]
-    calibration = about_the_files(found.calibration, put_in)
+    calibration = relative_to_files(found.calibration, put_in)
     return MapResult(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged) + joined,
         noise=noise,
         calibration=tuple(calibration),
-        robot_numbers=verdicts(given, calibration, choices),
-        measurements=tuple(found.measured),
+        robot_numbers=compare_with_files(given, calibration, choices),
+        measurements=tuple(found.measurements),
         checks=tuple(found.checks),
-        metres=tuple(found.metres),
+        metres=tuple(found.scale_budgets),
         warnings=map_warnings(
             runs, maps, broken, merged, found, [each for each in joins if each.reason] if corners else None
         ),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
-        suspects=tuple(found.suspects),
+        suspects=tuple(found.outliers),
         noise_fit=noise_fit,
         advice=tuple(found.advice),
         choices=choices,
@@ -149,13 +149,13 @@ def _calibrate_runs(
 ) -> tuple[FreedRobots, list[Segment]]:
     """Return the runs with start values and freed parameters, and their segments."""
     with stages.stage("start values of robots"):
-        runs, started, searches = start_left_open(runs, noise)
-    found = FreedRobots(runs, started, put_right(started), searches)
+        runs, started, searches = initialise_open_robots(runs, noise)
+    found = FreedRobots(runs, started, applied_corrections(started), searches)
     if calibrate.is_on:
         with stages.stage("self-calibration"):
             freed = free_parameters(runs, noise, calibrate.names, corners=corners)
         found = FreedRobots(
-            freed.runs, (*started, *freed.choices), found.put_in | freed.put_in, found.searches | freed.searches
+            freed.runs, (*started, *freed.choices), found.applied | freed.applied, found.searches | freed.searches
         )
     return found, _segments(found.runs, noise, stages)
 
@@ -176,7 +176,7 @@ def _measurements(
     names, tags = [run.name for run in runs], {tag for segment in segments for tag in segment.tags}
     if extending is not None:
         names = [*dict.fromkeys(each.run for each in extending.kept), *names]
-        tags |= {tag for each in extending.kept for tag in tags_of(each)}
+        tags |= {tag for each in extending.kept for tag in archived_tag_ids(each)}
     return parse_measurements(tape, names, sorted(tags))
 
 
@@ -185,7 +185,7 @@ def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMa
     if extending is None:
         return []
     with stages.stage("the map that is extended"):
-        return [local_map_of(each) for each in extending.kept]
+        return [restore_local_map(each) for each in extending.kept]
 
 
 class _SolvedTogether(NamedTuple):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from groundsbot.calib.robot import TAG_SCALE
 from groundsbot.offline.alignment import Merge
-from groundsbot.offline.global_map import COMPARED, TagJoin, check_warnings, measurement_warnings
+from groundsbot.offline.global_map import COMPARED_PARAMETERS, TagJoin, comparison_warnings, measurement_warnings
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.merge_report import merge_warnings
@@ -26,9 +26,9 @@ def map_warnings(
     warnings = (
         [w for run in runs for w in run.warnings] + [*broken] + [w for segment in segments for w in segment.warnings]
     )
-    warnings += found.warnings + measurement_warnings(found.measured) + check_warnings(found.checks)
+    warnings += found.warnings + measurement_warnings(found.measurements) + comparison_warnings(found.checks)
     warnings += calibration_warnings(found.calibration, found.checks)
-    named = {(each.family, each.tag_id) for each in found.suspects} | found.left_out | _in_one_place(found)
+    named = {(each.family, each.tag_id) for each in found.outliers} | found.excluded_tags | _in_one_place(found)
     return tuple(
         dict.fromkeys(warnings + _segment_warnings(segments) + merge_warnings(maps, merged, named, not_joined))
     )
@@ -47,7 +47,7 @@ def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Seque
         (check.component, check.batch if name == TAG_SCALE else check.robot_id, name)
         for check in checks
         if check.contradicts
-        for name in COMPARED[check.name]
+        for name in COMPARED_PARAMETERS[check.name]
     }
     return [
         f"{entry.name} of {entry.owner} is {entry.value:+.4f}, {abs(entry.value) / entry.prior_sigma:.0f} times its "

@@ -44,6 +44,6 @@ class Diagnostics:
     """
 
     maps: list[LocalMap] = field(default_factory=list)
-    solved: list[SolvedGroup] = field(default_factory=list)
+    components: list[SolvedGroup] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
     searches: dict[str, TimeOffsetSearch] = field(default_factory=dict)

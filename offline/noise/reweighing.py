@@ -109,10 +109,10 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
         goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
     solution = solve(graph.problem, local_map.solution.state)
     graph.problem.arrowhead.without_scratch()
-    whole = local_map.whole
+    whole = local_map.unfiltered
     if whole is not None:
         whole = with_shared_errors(whole.with_noise(noise), shared, noise.sigma_corner_px)
-    return replace(local_map, segment=segment, graph=graph, solution=solution, goodness=goodness, whole=whole)
+    return replace(local_map, segment=segment, graph=graph, solution=solution, goodness=goodness, unfiltered=whole)
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:

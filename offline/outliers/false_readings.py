@@ -92,10 +92,10 @@ def without_false_detections(local_map: LocalMap) -> LocalMap:
 
 def _with_all_readings(local_map: LocalMap) -> LocalMap:
     """The map, not solved again, with the readings that were left out of it because nothing confirmed them."""
-    segment = local_map.whole
+    segment = local_map.unfiltered
     if segment is None:
         return local_map
     graph = build_graph([segment])
     state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = replace(local_map.solution, state=state, problem=graph.problem)
-    return replace(local_map, segment=segment, graph=graph, solution=solution, whole=None)
+    return replace(local_map, segment=segment, graph=graph, solution=solution, unfiltered=None)

@@ -56,7 +56,7 @@ def local_maps_of(
     with stages.stage("tags that do not belong"):
         maps = [each if each.is_noisy else alone.split(each) for each in maps]
     noisy = frozenset(each.segment.name for each in maps if each.is_noisy)
-    return ExplainedMaps([each.without_factors() for each in maps], noisy, broken)
+    return ExplainedMaps([each.without_factorisation() for each in maps], noisy, broken)
 
 
 class JudgedMaps(NamedTuple):
@@ -95,5 +95,7 @@ def remove_outliers_under_own_noise(maps: Sequence[LocalMap], noisy: Collection[
             with stages.stage("breaks of odometry"):
                 parts, broken = split_at_breaks([replace(again, is_noisy=False)])
             warnings += broken
-        found += [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factors() for part in parts]
+        found += [
+            replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factorisation() for part in parts
+        ]
     return JudgedMaps(found, warnings)

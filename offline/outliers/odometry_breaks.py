@@ -250,7 +250,7 @@ def _ways_to_align(segment: Segment, behind: SolvedPart, place: _BreakPlace, eff
         return []
     at_begin = behind.poses[place.begin - behind.first]
     alignment = _align(*apart)
-    ways = [] if alignment is None else [alignment, *alignment.rivals]
+    ways = [] if alignment is None else [alignment, *alignment.alternatives]
     return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
 
 
@@ -305,7 +305,7 @@ def _test_break(
     segment, problem = local_map.segment, local_map.graph.problem
     parts = _solve_apart(segment, place, effort)
     alignment = None if parts is None else _align(*parts)
-    if parts is None or alignment is None or not alignment.is_sure:
+    if parts is None or alignment is None or not alignment.is_accepted:
         return None
     freed = _without_motions(problem, *place)
     apart = solve(freed, start, most_tries=effort.max_linearisations(freed, 1.0))

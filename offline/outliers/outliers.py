@@ -195,7 +195,7 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
     """The maps with tags told apart that sure alignments found elsewhere in one map than in another."""
     names: dict[tuple[int, TagKey], TagKey] = {}
     n_places: Counter[TagKey] = Counter()
-    sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_sure]
+    sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_accepted]
     outliers = {tag for pair in sure for tag in (pair.alignment.outliers if pair.alignment else ())}
     for tag in sorted(outliers):
         group = {m: m for m, each in enumerate(maps) if tag in each.graph.tags}

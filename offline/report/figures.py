@@ -30,16 +30,16 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
         workings: of the same map.
     """
     colours = run_colours(document)
-    components = [_component(document, i, solved, workings, colours) for i, solved in enumerate(workings.solved)]
-    events = events_of([segment for solved in workings.solved for segment in solved.graph.segments])
+    components = [_component(document, i, solved, workings, colours) for i, solved in enumerate(workings.components)]
+    events = events_of([segment for solved in workings.components for segment in solved.graph.segments])
     timelines: list[dict[str, Any]] = []
-    for solved in workings.solved:
+    for solved in workings.components:
         sigmas = residual_sigmas(solved)
         for i, segment in enumerate(solved.graph.segments):
             if len(timelines) < _MOST_TIMELINES:
                 data = timeline(segment, sigmas[segment_of_reading(solved) == i], events[segment.name])
                 timelines.append(data | {"colour": colours[segment.name]})
-    n_timelines = sum(len(solved.graph.segments) for solved in workings.solved)
+    n_timelines = sum(len(solved.graph.segments) for solved in workings.components)
     return {
         "components": components,
         "timelines": timelines,

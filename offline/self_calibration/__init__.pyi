@@ -1,29 +1,36 @@
-from .left_open import start_left_open
+from .left_open import initialise_open_robots
 from .option import AUTO, Calibrate, parse_calibrate
 from .robot import Correction, OwnedParameter, correct_robot
-from .robot_table import verdict_lines, verdicts
-from .self_calibration import TIMES_MAPPED, FreedRobots, about_the_files, free_parameters, put_right, with_focal_lengths
+from .robot_table import compare_with_files, verdict_lines
+from .self_calibration import (
+    N_MAPPINGS,
+    FreedRobots,
+    applied_corrections,
+    free_parameters,
+    relative_to_files,
+    with_focal_lengths,
+)
 from .time_offset_search import TimeOffsetSearch
-from .words import choice_words, learnt_lines, refusal_lines
+from .words import choice_words, correction_lines, refusal_lines
 
 __all__ = [
     "AUTO",
-    "TIMES_MAPPED",
+    "N_MAPPINGS",
     "Calibrate",
     "Correction",
     "FreedRobots",
     "OwnedParameter",
     "TimeOffsetSearch",
-    "about_the_files",
+    "applied_corrections",
     "choice_words",
+    "compare_with_files",
     "correct_robot",
+    "correction_lines",
     "free_parameters",
-    "learnt_lines",
+    "initialise_open_robots",
     "parse_calibrate",
-    "put_right",
     "refusal_lines",
-    "start_left_open",
+    "relative_to_files",
     "verdict_lines",
-    "verdicts",
     "with_focal_lengths",
 ]

@@ -23,7 +23,7 @@ from groundsbot.offline.sam import Parameter, Solution, SolveBudget, build_graph
 from groundsbot.offline.self_calibration.selection import CalibrationInformation
 
 # Sections of a segment, where it is as long as this many windows. Holding out one of five is the usual share.
-_STRETCHES: Final = 5
+_SECTIONS: Final = 5
 _FEWEST: Final = 2  # of a short segment
 # Shares of a segment's solve budget: for its windows, and for each section, whose solve is correspondingly smaller.
 _WINDOWS_SHARE: Final = 0.2
@@ -64,7 +64,7 @@ def information_of(
         robot = robots[each.segment.run.name]
         given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
         priors |= {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters}
-        segment = _under_own_noise(each, noise, effort)
+        segment = _with_window_noise(each, noise, effort)
         for first, end in _cuts(segment):
             part = _information_of_segment(segment, each, first, end, effort, corners=corners)
             if part is not None:
@@ -88,7 +88,7 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
-def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
+def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
     """Return the segment under the noise fitted to its windows, including correlated errors of observations."""
     least = least_shared_variance(local_map.segment.readings)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
@@ -99,14 +99,14 @@ def _under_own_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveB
     if not len(segment.readings):
         return segment
     of_corners = inflation_of_corners(segment, in_cell(segment), own.sigma_corner_px)
-    of_corners = np.maximum(windows.sharing.max(axis=-1), of_corners)
-    return replace(segment, readings=segment.readings.inflate(windows.sharing, of_corners))
+    of_corners = np.maximum(windows.correlated_error_factors.max(axis=-1), of_corners)
+    return replace(segment, readings=segment.readings.inflate(windows.correlated_error_factors, of_corners))
 
 
 def _cuts(segment: Segment) -> list[tuple[int, int]]:
     """Return the first keyframe and the end of each section; all are equally long."""
     along_m = segment.along_m
-    n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _STRETCHES))
+    n = int(np.clip(along_m[-1] / WINDOW_M, _FEWEST, _SECTIONS))
     ends = np.searchsorted(along_m, along_m[-1] * np.arange(1, n) / n, side="right").tolist()
     return list(zip([0, *ends], [*ends, len(along_m)], strict=True))
 

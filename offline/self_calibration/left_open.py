@@ -24,7 +24,7 @@ class StartedRobots(NamedTuple):
     searches: dict[str, TimeOffsetSearch]
 
 
-def by_robot(runs: Sequence[Run]) -> list[list[int]]:
+def group_by_robot(runs: Sequence[Run]) -> list[list[int]]:
     """Return indices of runs, grouped by robot file."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(runs):
@@ -32,7 +32,7 @@ def by_robot(runs: Sequence[Run]) -> list[list[int]]:
     return list(groups.values())
 
 
-def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> StartedRobots:
+def initialise_open_robots(runs: Sequence[Run], noise: NoiseParameters) -> StartedRobots:
     """Estimate start values robot by robot; robots whose file leaves nothing open are not changed.
 
     Args:
@@ -42,16 +42,16 @@ def start_left_open(runs: Sequence[Run], noise: NoiseParameters) -> StartedRobot
     found = list(runs)
     choices: list[CalibrationChoice] = []
     searches: dict[str, TimeOffsetSearch] = {}
-    for own in by_robot(runs):
+    for own in group_by_robot(runs):
         robot = runs[own[0]].robot
         if not robot.is_left_open:
             continue
         start = estimate_start_values([runs[i] for i in own], noise)
-        if start.searched is not None:
-            searches[robot.robot_id] = start.searched
+        if start.search is not None:
+            searches[robot.robot_id] = start.search
         for i in own:
-            found[i] = with_start_values(runs[i], start.learnt)
-        choices += [_choice(robot, name, each) for name, each in start.learnt.items() if each.value]
+            found[i] = with_start_values(runs[i], start.corrections)
+        choices += [_choice(robot, name, each) for name, each in start.corrections.items() if each.value]
     return StartedRobots(found, tuple(choices), searches)
 
 

@@ -80,7 +80,7 @@ def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArra
     return together[:, 0], together[:, 1:]
 
 
-def places_of_tags(passes: Passes, parameters: FloatArray) -> FloatArray:
+def tag_positions(passes: Passes, parameters: FloatArray) -> FloatArray:
     """Return (G, 2) tag positions, the mean over the observations of each pass, in the frame of its first station."""
     base, _ = poses(passes, parameters)
     range_m = (passes.value[:, 0] - parameters[6]) * (1.0 + parameters[7])
@@ -96,7 +96,7 @@ def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> Lin
     Args:
         passes: M observations in G passes.
         parameters: (8,) in order of PARAMETERS.
-        tags_m: (G, 2) as from `places_of_tags`.
+        tags_m: (G, 2) as from `tag_positions`.
     """
     (x, y, theta), by_motion = poses(passes, parameters)
     mount = passes.sensor + parameters[3:6]

@@ -29,7 +29,7 @@ _M_PER_RAD: Final = 0.5  # weight of a turn relative to distance
 _MOST_PASSES: Final = 200
 
 REACH_S: Final = 1.0  # largest time offset searched, so wheels must be known this long before and after an observation
-_BETWEEN_STRETCHES_S: Final = 10.0
+_BETWEEN_SEGMENTS_S: Final = 10.0
 _RATE_OVER_S: Final = 0.05  # longer than an encoder tick, shorter than a change of speed
 _STATION_S: Final = 0.25
 
@@ -124,7 +124,7 @@ class _Stamps:
         )
 
 
-def gather_passes(runs: Sequence[Run]) -> Passes | None:
+def find_passes(runs: Sequence[Run]) -> Passes | None:
     """Return the passes of tags in some runs of one robot; None if the robot moves or turns in none of them.
 
     Args:
@@ -138,7 +138,7 @@ def gather_passes(runs: Sequence[Run]) -> Passes | None:
     twist = wheels.twist_at(looks.time_s)
     for number, run in enumerate(runs):
         own = np.flatnonzero(looks.run == number)
-        for readings in _read(run, looks.index[own], twist[own]):
+        for readings in _read_observations(run, looks.index[own], twist[own]):
             at = own[readings.keyframe]
             value[at], sigma[at] = _polar(readings)
             mount = run.robot.mount
@@ -158,7 +158,7 @@ def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
         if len(wheel_segment.stamps_ns):
             times.append(end_s + _since_s(wheel_segment.stamps_ns, wheel_segment.stamps_ns[0]))
             wheels.append(np.stack([wheel_segment.left_m, wheel_segment.right_m]))
-            end_s = times[-1][-1] + _BETWEEN_STRETCHES_S
+            end_s = times[-1][-1] + _BETWEEN_SEGMENTS_S
     if sum(map(len, times)) < 2:
         return None
     time_s, wheels_m = np.concatenate(times), np.concatenate(wheels, axis=1)
@@ -216,7 +216,7 @@ def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
     return looks.where((first[group] + step)[keep]), group[keep]
 
 
-def _read(run: Run, index: IntArray, twist: FloatArray) -> list[Readings]:
+def _read_observations(run: Run, index: IntArray, twist: FloatArray) -> list[Readings]:
     """Return observations of a run; each has its index in `index` as its keyframe, so that none are averaged."""
     noise, n = NoiseParameters(), len(run.positions.stamps_ns)
     order = np.argsort(index)

@@ -24,7 +24,7 @@ _MOUNT: Final = "mount_"
 
 # Parameters that may be freed, and their prior sigma when freed: that of a robot believed to be calibrated, so wide
 # that the data dominate it. Camera height is not among them: on a floor only differences of heights are observable.
-OPEN_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
+FREED_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     {
         _WHEEL_SCALE: 0.05,
         _WHEEL_RATIO: 0.05,
@@ -40,9 +40,9 @@ OPEN_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     }
 )
 # Parameters whose error may be too large for a first-order judgement of robot.yaml.
-OFF_BY_FAR: Final = (TIME_OFFSET, TRACK_SCALE, *MOUNT_PARAMETERS)
+GROSS_ERROR_NAMES: Final = (TIME_OFFSET, TRACK_SCALE, *MOUNT_PARAMETERS)
 # A larger error means the file of another robot, not a calibration error.
-MOST_SIGMAS: Final = 3.0
+MAX_FREED_SIGMAS: Final = 3.0
 
 
 class Correction(NamedTuple):
@@ -90,11 +90,14 @@ def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robo
     )
 
 
-def as_if_unknown(robot: Robot) -> Robot:
+def with_unknown_calibration(robot: Robot) -> Robot:
     """Return the robot with wide sigmas for every parameter that may be grossly wrong, and for the focal length."""
-    own = {OwnedParameter(robot.robot_id, name): OPEN_SIGMAS[name] for name in (*OFF_BY_FAR, RANGE_OFFSET, FOCAL_SCALE)}
+    own = {
+        OwnedParameter(robot.robot_id, name): FREED_SIGMAS[name]
+        for name in (*GROSS_ERROR_NAMES, RANGE_OFFSET, FOCAL_SCALE)
+    }
     batches = [*(_of_batch(batch) for batch in robot.tags), OwnedParameter(IMPORTED_BATCH, TAG_SCALE)]
-    return open_parameters(robot, own | dict.fromkeys(batches, OPEN_SIGMAS[TAG_SCALE]))
+    return open_parameters(robot, own | dict.fromkeys(batches, FREED_SIGMAS[TAG_SCALE]))
 
 
 def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> Robot:
@@ -121,7 +124,7 @@ def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> 
 
 def _mount_fields() -> list[str]:
     """Return the fields of a mount that can be freed, without their `mount_`."""
-    return [name.removeprefix(_MOUNT) for name in OPEN_SIGMAS if name.startswith(_MOUNT)]
+    return [name.removeprefix(_MOUNT) for name in FREED_SIGMAS if name.startswith(_MOUNT)]
 
 
 def _of_batch(batch: TagBatch) -> OwnedParameter:

@@ -19,20 +19,20 @@ from groundsbot.calib.robot import (
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotNumber
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import OwnedParameter
-from groundsbot.offline.self_calibration.selection import DOUBTED, TELLS_LESS
-from groundsbot.offline.self_calibration.words import DRIVES
+from groundsbot.offline.self_calibration.selection import GROSS_ERROR_ELSEWHERE, LESS_CERTAIN
+from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES
 
-FOUND: Final = "estimated; it had not been measured"
+ESTIMATED: Final = "estimated; it had not been measured"
 WRONG: Final = "robot.yaml is wrong"
-ASKED: Final = "estimated as requested"
+REQUESTED: Final = "estimated as requested"
 AGREES: Final = "agrees"
-NOT_TOLD: Final = "not observable in these drives"
-NOT_BELIEVED: Final = "estimated, since another number is grossly wrong"
+NOT_OBSERVABLE: Final = "not observable in these drives"
+DISTRUSTED: Final = "estimated, since another number is grossly wrong"
 CONTRADICTED: Final = "contradicts robot.yaml, which was kept as prior"
 
 _WRITE: Final = "write the estimate into robot.yaml, as groundsbot-offline calibrate does"
 _MOST_SIGMAS: Final = 3.0
-_TOLD_SHARE: Final = 0.7  # an observed parameter has at most this share of its prior sigma
+_OBSERVED_SHARE: Final = 0.7  # an observed parameter has at most this share of its prior sigma
 _SCALES: Final = frozenset({*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE})
 # Value of each parameter in a robot's file.
 _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
@@ -50,7 +50,7 @@ _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
         },
     }
 )
-WHAT: Final[Mapping[str, str]] = MappingProxyType(
+LABELS: Final[Mapping[str, str]] = MappingProxyType(
     {
         WHEEL_PARAMETERS[0]: "mean wheel radius (m)",
         WHEEL_PARAMETERS[1]: "wheel radius, right / left",
@@ -64,7 +64,7 @@ WHAT: Final[Mapping[str, str]] = MappingProxyType(
 )
 
 
-def verdicts(
+def compare_with_files(
     runs: Sequence[Run], calibration: Sequence[CalibrationResult], choices: Sequence[CalibrationChoice]
 ) -> tuple[RobotNumber, ...]:
     """Return a row for each parameter that the map estimated.
@@ -100,14 +100,14 @@ def verdicts(
     return tuple(rows)
 
 
-def is_news(number: RobotNumber) -> bool:
+def is_different(number: RobotNumber) -> bool:
     """Return whether the estimate differs from the file."""
-    return number.verdict in (FOUND, WRONG, ASKED, NOT_BELIEVED, CONTRADICTED)
+    return number.verdict in (ESTIMATED, WRONG, REQUESTED, DISTRUSTED, CONTRADICTED)
 
 
 def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
     """Return a terminal table of parameters that differ from robot.yaml, or one line if none does."""
-    rows = [each for each in numbers if is_news(each)]
+    rows = [each for each in numbers if is_different(each)]
     if not rows:
         return ["robot parameters: these drives agree with robot.yaml in all of them"] if numbers else []
     owner = max(len(each.owner) for each in rows)
@@ -137,23 +137,23 @@ def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | N
 def _what(entry: CalibrationResult) -> str:
     if entry.owner.startswith(IMPORTED_BATCH):
         return "ranges, relative"
-    return WHAT.get(entry.name, f"mount.{entry.name.removeprefix('mount_')}")
+    return LABELS.get(entry.name, f"mount.{entry.name.removeprefix('mount_')}")
 
 
 def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_open: bool) -> str:
     if is_open:
-        return FOUND if entry.sigma < _TOLD_SHARE * entry.prior_sigma else NOT_TOLD
+        return ESTIMATED if entry.sigma < _OBSERVED_SHARE * entry.prior_sigma else NOT_OBSERVABLE
     if choice is not None and choice.is_freed:
         is_off = abs(entry.value) > _MOST_SIGMAS * float(np.hypot(entry.sigma, choice.prior_sigma))
         if choice.is_asked:
-            return ASKED
-        return NOT_BELIEVED if choice.reason == DOUBTED and not is_off else WRONG
+            return REQUESTED
+        return DISTRUSTED if choice.reason == GROSS_ERROR_ELSEWHERE and not is_off else WRONG
     if abs(entry.value) > _MOST_SIGMAS * entry.prior_sigma:
         return CONTRADICTED
-    return NOT_TOLD if choice is not None and choice.reason == TELLS_LESS else AGREES
+    return NOT_OBSERVABLE if choice is not None and choice.reason == LESS_CERTAIN else AGREES
 
 
 def _to_do(name: str, verdict: str) -> str:
-    if verdict == NOT_TOLD:
-        return DRIVES.get(name, "")
+    if verdict == NOT_OBSERVABLE:
+        return CALIBRATION_DRIVES.get(name, "")
     return "" if verdict == AGREES else _WRITE

@@ -17,20 +17,20 @@ from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import MOST_SIGMAS, OFF_BY_FAR, OPEN_SIGMAS, OwnedParameter
+from groundsbot.offline.self_calibration.robot import FREED_SIGMAS, GROSS_ERROR_NAMES, MAX_FREED_SIGMAS, OwnedParameter
 
 # Share of maps with a correct robot.yaml in which any parameter is freed.
 _FALSE_ALARM: Final = 0.01
 _NOTHING: Final = 1e-9  # information relative to the prior of freed parameters: rounding
 _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
 # An error beyond this many of the sigmas of freed parameters is a gross error.
-_BY_FAR: Final = 0.5
+_GROSS_SHARE: Final = 0.5
 # A parameter less certain from data than from robot.yaml is freed only beyond the threshold times this: then the
 # claimed sigma is wrong. Roll and pitch, which floor observations estimate with a bias, are excluded.
-OFF_BY_ALL: Final = frozenset({*OFF_BY_FAR, RANGE_OFFSET, TAG_SCALE})
-_CERTAINLY: Final = 1.5
-DOUBTED: Final = "robot.yaml has a gross error in another number, so this one is not trusted either"
-TELLS_LESS: Final = "the drives determine it less well than robot.yaml does"
+DISTRUSTED_NAMES: Final = frozenset({*GROSS_ERROR_NAMES, RANGE_OFFSET, TAG_SCALE})
+_CLAIM_MARGIN: Final = 1.5
+GROSS_ERROR_ELSEWHERE: Final = "robot.yaml has a gross error in another number, so this one is not trusted either"
+LESS_CERTAIN: Final = "the drives determine it less well than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
 _NOT_ASKED: Final = "it was not requested"
 
@@ -48,7 +48,7 @@ class CalibrationInformation:
     information: FloatArray
     vector: FloatArray
 
-    def about(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
+    def relative_to(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
         """Return the same relative to the files before these corrections, by owner and name, were applied."""
         shift = np.array([values.get(OwnedParameter(each.owner, each.name), 0.0) for each in self.parameters])
         return replace(self, vector=self.vector + self.information @ shift)
@@ -76,21 +76,24 @@ def choose(
         late_s: time offset by robot, estimated from passes of tags alone. At constant speed a late camera and a
             displaced camera cannot be distinguished.
     """
-    candidates = [i for i, each in enumerate(told.parameters) if each.name in OPEN_SIGMAS]
+    candidates = [i for i, each in enumerate(told.parameters) if each.name in FREED_SIGMAS]
     judge = _Selection(told, candidates, asked, late_s)
-    by_far = [] if asked else judge.off_by_far()
-    judge.open_what_contradicts()
-    if not asked and not by_far and judge.is_any_by_far():
-        by_far = judge.open_all()
-        judge.open_what_contradicts()
-    found = {i: judge.look(i) for i in candidates}
+    by_far = [] if asked else judge.free_gross_errors()
+    judge.free_contradicting()
+    if not asked and not by_far and judge.has_gross_error():
+        by_far = judge.free_doubtful()
+        judge.free_contradicting()
+    found = {i: judge.assess(i) for i in candidates}
     doubted = [i for i in judge.open if i in by_far and found[i].off_sigmas <= judge.at_least]
-    return [_free(each, DOUBTED if i in doubted else "") if i in judge.open else each for i, each in found.items()]
+    return [
+        _free(each, GROSS_ERROR_ELSEWHERE if i in doubted else "") if i in judge.open else each
+        for i, each in found.items()
+    ]
 
 
 def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
     """Return whether every parameter that may be grossly wrong was freed."""
-    return all(each.is_freed for each in choices if each.name in OFF_BY_FAR)
+    return all(each.is_freed for each in choices if each.name in GROSS_ERROR_NAMES)
 
 
 class _Selection:
@@ -112,65 +115,69 @@ class _Selection:
         self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
         self.open: list[int] = []
 
-    def off_by_far(self) -> list[int]:
+    def free_gross_errors(self) -> list[int]:
         """Free parameters with a gross error, and return those that are then not trusted either.
 
         By backward elimination: all candidates are free at first. The one with the smallest deviation is fixed and the
         others are judged again, until all free ones are grossly wrong. So of several that explain the same, one
         remains.
         """
-        names, parameters = OFF_BY_ALL, self._told.parameters
+        names, parameters = DISTRUSTED_NAMES, self._told.parameters
         self.open = [i for i in self._candidates if parameters[i].name in names]
         while self.open:
-            looked = {i: self.look(i) for i in self.open}
-            held = {i: each for i, each in looked.items() if not self._is_by_far(each)}
+            looked = {i: self.assess(i) for i in self.open}
+            held = {i: each for i, each in looked.items() if not self._is_gross_error(each)}
             if not held:
                 break
             self.open.remove(min(held, key=lambda i: held[i].off_sigmas))
-        return self.open_all() if any(parameters[i].name in OFF_BY_FAR for i in self.open) else self.open.copy()
+        return (
+            self.free_doubtful()
+            if any(parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
+            else self.open.copy()
+        )
 
-    def open_all(self) -> list[int]:
+    def free_doubtful(self) -> list[int]:
         """Free what is not trusted after a gross error, besides what is free; return the former."""
-        doubted = [i for i in self._candidates if self._told.parameters[i].name in OFF_BY_ALL]
+        doubted = [i for i in self._candidates if self._told.parameters[i].name in DISTRUSTED_NAMES]
         self.open = [*doubted, *(i for i in self.open if i not in doubted)]
         return doubted
 
-    def open_what_contradicts(self) -> None:
+    def free_contradicting(self) -> None:
         """Free parameters that contradict robot.yaml, the worst first."""
         while True:
-            able = {i: each for i in self._candidates if i not in self.open and not (each := self.look(i)).reason}
+            able = {i: each for i in self._candidates if i not in self.open and not (each := self.assess(i)).reason}
             if not able:
                 return
-            self.open.append(max(able, key=lambda i: _plausible(able[i])))
+            self.open.append(max(able, key=lambda i: _contradiction_score(able[i])))
 
-    def is_any_by_far(self) -> bool:
+    def has_gross_error(self) -> bool:
         """Return whether a free parameter is a gross error."""
-        is_one = (self._told.parameters[i].name in OFF_BY_FAR for i in self.open)
-        return any(own and self._is_by_far(self.look(i)) for i, own in zip(self.open, is_one, strict=True))
+        is_one = (self._told.parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
+        return any(own and self._is_gross_error(self.assess(i)) for i, own in zip(self.open, is_one, strict=True))
 
-    def _is_by_far(self, choice: CalibrationChoice) -> bool:
+    def _is_gross_error(self, choice: CalibrationChoice) -> bool:
         values = [choice.value]
         if choice.name == TIME_OFFSET:
             values.append(self._late_s.get(choice.owner, 0.0))
-        is_far = all(_BY_FAR < abs(value) / OPEN_SIGMAS[choice.name] < MOST_SIGMAS for value in values)
+        is_far = all(_GROSS_SHARE < abs(value) / FREED_SIGMAS[choice.name] < MAX_FREED_SIGMAS for value in values)
         return is_far and choice.off_sigmas > self.at_least and (choice.held_out_gain or 0.0) > 0.0
 
-    def look(self, index: int) -> CalibrationChoice:
+    def assess(self, index: int) -> CalibrationChoice:
         """Return the assessment of one parameter given the free ones, with the reason if it may not be freed."""
         told, parameter = self._told, self._told.parameters[index]
         sigmas = np.array([each.sigma for each in told.parameters])
-        sigmas[self.open] = [OPEN_SIGMAS[told.parameters[i].name] for i in self.open]
+        sigmas[self.open] = [FREED_SIGMAS[told.parameters[i].name] for i in self.open]
         prior, is_asked = parameter.sigma, parameter.name in self._asked
         whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
         gain = _cross_validated_gain(told, sigmas, index)
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
-        most = MOST_SIGMAS * OPEN_SIGMAS[parameter.name]
+        most = MAX_FREED_SIGMAS * FREED_SIGMAS[parameter.name]
         reason = ""
-        is_wrong = parameter.name in OFF_BY_ALL and off_sigmas > _CERTAINLY * self.at_least
+        is_wrong = parameter.name in DISTRUSTED_NAMES and off_sigmas > _CLAIM_MARGIN * self.at_least
         if parameter.name == TIME_OFFSET:  # passes of tags must agree
             is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
         if whole.variance >= prior**2 and not is_wrong:
-            reason = TELLS_LESS
+            reason = LESS_CERTAIN
         elif gain is None:
             reason = "only one section of the drives determines it, and no other confirms that"
         elif gain <= 0.0:
@@ -197,12 +204,12 @@ class _Selection:
 
 def _free(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
     """Return the choice to free a parameter, with its estimate under the prior that it then has."""
-    limit = OPEN_SIGMAS[choice.name]
+    limit = FREED_SIGMAS[choice.name]
     share = limit**2 / (limit**2 + choice.sigma**2)
     return replace(choice, is_freed=True, value=share * choice.value, sigma=share**0.5 * choice.sigma, reason=reason)
 
 
-def _plausible(choice: CalibrationChoice) -> float:
+def _contradiction_score(choice: CalibrationChoice) -> float:
     """Return the squared sigmas of the contradiction with robot.yaml, less the prior log odds against an error.
 
     A contradiction between wheels and tags about the scale has the same sigmas for both. A radius is measured over many
@@ -217,7 +224,7 @@ def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, inde
     Each section's likelihood is taken under the estimate of all others, and under robot.yaml. None where no two
     sections have information about the parameter.
     """
-    prior, limit, gains = told.parameters[index].sigma, OPEN_SIGMAS[told.parameters[index].name], []
+    prior, limit, gains = told.parameters[index].sigma, FREED_SIGMAS[told.parameters[index].name], []
     for k in range(len(told.vector)):
         own = np.arange(len(told.vector)) == k
         out, others = (_estimate(told, which, sigmas, index) for which in (own, ~own))
@@ -231,7 +238,7 @@ def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, inde
 
 def _estimate(told: CalibrationInformation, which: BoolArray, sigmas: FloatArray, index: int) -> _NumberEstimate:
     """Estimate a parameter from some sections (S,), without a prior on it and with those of the others."""
-    limit = OPEN_SIGMAS[told.parameters[index].name]
+    limit = FREED_SIGMAS[told.parameters[index].name]
     unit = sigmas.copy()
     unit[index] = limit
     information = unit[:, None] * told.information[which].sum(axis=0) * unit

@@ -19,23 +19,23 @@ from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import budgets_of
 from groundsbot.offline.self_calibration.information import information_of
-from groundsbot.offline.self_calibration.left_open import by_robot
+from groundsbot.offline.self_calibration.left_open import group_by_robot
 from groundsbot.offline.self_calibration.robot import (
-    OPEN_SIGMAS,
+    FREED_SIGMAS,
     Correction,
     OwnedParameter,
-    as_if_unknown,
     correct_robot,
     open_parameters,
+    with_unknown_calibration,
 )
-from groundsbot.offline.self_calibration.selection import OFF_BY_ALL, choose, is_overruled
+from groundsbot.offline.self_calibration.selection import DISTRUSTED_NAMES, choose, is_overruled
 from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 # Corrected before the map is made, which estimates them to first order or, on the floor, not at all. Wheel readings are
 # in metres and stamps on one clock by then; both remain estimated to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
-TIMES_MAPPED: Final = 2  # how often runs are mapped when self-calibration precedes their map
+N_MAPPINGS: Final = 2  # how often runs are mapped when self-calibration precedes their map
 _ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, RANGE_OFFSET})
 
 
@@ -54,7 +54,7 @@ class FreedRobots(NamedTuple):
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
-    put_in: dict[OwnedParameter, Correction]
+    applied: dict[OwnedParameter, Correction]
     searches: dict[str, TimeOffsetSearch]
 
 
@@ -73,26 +73,26 @@ def free_parameters(
         names: parameters to free whether or not they contradict robot.yaml; if empty, those that do.
         corners: the map will be refined on corners, which also observe the focal length.
     """
-    started, searches = _as_if_unknown(runs, noise)
+    started, searches = _initialise_unknown(runs, noise)
     if not started:
         return FreedRobots(list(runs), (), {}, {})
-    opened_runs = [replace(each, robot=as_if_unknown(each.robot)) for each, _ in started]
+    opened_runs = [replace(each, robot=with_unknown_calibration(each.robot)) for each, _ in started]
     segments = [without_unconfirmed_tracks(segment) for run in opened_runs for segment in segments_of(run, noise)]
-    efforts = budgets_of(segments, TIMES_MAPPED)
+    efforts = budgets_of(segments, N_MAPPINGS)
     maps = [
-        solve_local_map(segment, effort, noise_is_open=True).without_factors()
+        solve_local_map(segment, effort, noise_is_open=True).without_factorisation()
         for segment, effort in zip(segments, efforts, strict=True)
     ]
     told = information_of(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
     starts = {owned: each for _, learnt in started for owned, each in learnt.items()}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
-    choices = choose(told.about({owned: each.value for owned, each in starts.items()}), names, late_s)
-    freed = {OwnedParameter(each.owner, each.name): OPEN_SIGMAS[each.name] for each in choices if each.is_freed}
-    right = put_right(choices)
+    choices = choose(told.relative_to({owned: each.value for owned, each in starts.items()}), names, late_s)
+    freed = {OwnedParameter(each.owner, each.name): FREED_SIGMAS[each.name] for each in choices if each.is_freed}
+    right = applied_corrections(choices)
     if is_overruled(choices):
         # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
         # numbers.
-        right = {owned: each for owned, each in right.items() if owned.name not in OFF_BY_ALL} | starts
+        right = {owned: each for owned, each in right.items() if owned.name not in DISTRUSTED_NAMES} | starts
     return FreedRobots(
         [
             run
@@ -110,7 +110,7 @@ def free_parameters(
     )
 
 
-def _as_if_unknown(
+def _initialise_unknown(
     runs: Sequence[Run], noise: NoiseParameters
 ) -> tuple[list[tuple[Run, dict[OwnedParameter, Correction]]], dict[str, TimeOffsetSearch]]:
     """Return runs of calibrated robots with start values, these corrections, and time offset searches by robot.
@@ -119,15 +119,15 @@ def _as_if_unknown(
     """
     found: list[tuple[Run, dict[OwnedParameter, Correction]]] = []
     searches: dict[str, TimeOffsetSearch] = {}
-    for own in by_robot(runs):
+    for own in group_by_robot(runs):
         robot = runs[own[0]].robot
         if robot.is_left_open:
             continue
-        start = estimate_start_values([replace(runs[i], robot=as_if_unknown(robot)) for i in own], noise)
-        if start.searched is not None:
-            searches[robot.robot_id] = start.searched
-        learnt = {OwnedParameter(robot.robot_id, name): each for name, each in start.learnt.items()}
-        found += [(with_start_values(runs[i], start.learnt), learnt) for i in own]
+        start = estimate_start_values([replace(runs[i], robot=with_unknown_calibration(robot)) for i in own], noise)
+        if start.search is not None:
+            searches[robot.robot_id] = start.search
+        learnt = {OwnedParameter(robot.robot_id, name): each for name, each in start.corrections.items()}
+        found += [(with_start_values(runs[i], start.corrections), learnt) for i in own]
     return found, searches
 
 
@@ -138,28 +138,28 @@ def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> 
     return replace(camera, fx_px=camera.fx_px * (1.0 + focal.value), fy_px=camera.fy_px * (1.0 + focal.value))
 
 
-def about_the_files(
+def relative_to_files(
     calibration: Sequence[CalibrationResult], put_in: Mapping[OwnedParameter, Correction]
 ) -> list[CalibrationResult]:
     """Return corrections relative to the files as they were given: those applied before plus the map's."""
     found = []
     for each in calibration:
         before = put_in.get(OwnedParameter(each.owner, each.name), _NOTHING).value
-        found.append(replace(each, value=_one_after_the_other(each.name, before, each.value)))
+        found.append(replace(each, value=_compose(each.name, before, each.value)))
     return found
 
 
-def put_right(choices: Sequence[CalibrationChoice]) -> dict[OwnedParameter, Correction]:
+def applied_corrections(choices: Sequence[CalibrationChoice]) -> dict[OwnedParameter, Correction]:
     """Return the corrections applied to robots' files before the map; two of one parameter are composed."""
     right: dict[OwnedParameter, Correction] = {}
     for each in choices:
         if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH):
             owned = OwnedParameter(each.owner, each.name)
             before = right.get(owned, _NOTHING).value
-            right[owned] = Correction(_one_after_the_other(each.name, before, each.value), each.sigma)
+            right[owned] = Correction(_compose(each.name, before, each.value), each.sigma)
     return right
 
 
-def _one_after_the_other(name: str, before: float, after: float) -> float:
+def _compose(name: str, before: float, after: float) -> float:
     """Return the composition of two corrections of one parameter: relative ones multiply, others add."""
     return before + after + (before * after if name in _SCALES else 0.0)

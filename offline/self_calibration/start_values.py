@@ -27,8 +27,8 @@ _SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
 class StartValues(NamedTuple):
     """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the time offset search."""
 
-    learnt: dict[str, Correction]
-    searched: TimeOffsetSearch | None
+    corrections: dict[str, Correction]
+    search: TimeOffsetSearch | None
 
 
 def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
@@ -47,7 +47,7 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
         more = _estimate([with_start_values(run, found) for run in runs], noise, shown)
         if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
             break
-        found = {name: _together(name, each, more.get(name)) for name, each in found.items()}
+        found = {name: _compose(name, each, more.get(name)) for name, each in found.items()}
     return StartValues(found, searched)
 
 
@@ -102,7 +102,7 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Wind
     return found
 
 
-def _together(name: str, before: Correction, more: Correction | None) -> Correction:
+def _compose(name: str, before: Correction, more: Correction | None) -> Correction:
     """Return the composition of two corrections; a turn of c is to first order a track scale of 1 / (1 - c)."""
     if more is None:
         return before

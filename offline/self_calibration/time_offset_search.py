@@ -20,9 +20,9 @@ from groundsbot.offline.self_calibration.pass_model import (
     PRIOR_SIGMA,
     LinearisedTracks,
     linearise,
-    places_of_tags,
+    tag_positions,
 )
-from groundsbot.offline.self_calibration.passes import REACH_S, Passes, gather_passes
+from groundsbot.offline.self_calibration.passes import REACH_S, Passes, find_passes
 
 _STEP_S: Final = 0.1
 _GRID_STEPS: Final = 5
@@ -80,7 +80,7 @@ class _OffsetEstimate(NamedTuple):
         return self._replace(parameters=np.concatenate([[offset_s], self.parameters[1:]]))
 
 
-class _Pulls(NamedTuple):
+class _PassEquations(NamedTuple):
     """Normal equations of the parameters from each of G passes, its tag position eliminated."""
 
     information: FloatArray  # (G, 8, 8)
@@ -102,7 +102,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
         None where it is not observable: for robots that stand still or drive at one speed and turning rate, too few
         observations, an offset beyond a second, or several equally good offsets.
     """
-    passes = gather_passes(runs)
+    passes = find_passes(runs)
     if passes is None or len(passes) < _FEWEST_PASSES:
         return None
     curve = _curve(passes)
@@ -125,7 +125,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
 def _curve(passes: Passes) -> dict[float, tuple[_OffsetEstimate, float]]:
     """Return the optimum and its cost by offset; each starts from its neighbour's towards zero."""
     zero = np.zeros(len(PARAMETERS))
-    start = _OffsetEstimate(zero, places_of_tags(passes, zero), np.full(2, 2.0))
+    start = _OffsetEstimate(zero, tag_positions(passes, zero), np.full(2, 2.0))
     found = {0.0: _iterate(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
     for sign in (1.0, -1.0):
         last = found[0.0][0]
@@ -153,7 +153,7 @@ def _iterate(
         model = linearise(passes, estimate.parameters, estimate.tags_m)
         estimate = estimate._replace(scale=_scale(passes, model.residual, estimate.scale))
         weights = _weights(passes, model.residual, estimate.scale)[0]
-        pulls = _pulls(passes, model, weights)
+        pulls = _pass_equations(passes, model, weights)
         information = pulls.information.sum(axis=0) + np.diag(PRIOR_SIGMA**-2)
         gradient = pulls.gradient.sum(axis=0) + estimate.parameters / PRIOR_SIGMA**2
         step = np.zeros(len(PARAMETERS))
@@ -195,7 +195,7 @@ def _cost(passes: Passes, estimate: _OffsetEstimate) -> float:
     return float(losses.sum() + of_scales + 0.5 * ((estimate.parameters / PRIOR_SIGMA) ** 2).sum())
 
 
-def _pulls(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _Pulls:
+def _pass_equations(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _PassEquations:
     """Return normal equations of each pass from weights (M, 2), its tag position eliminated by the Schur complement."""
     rows = np.concatenate([model.by_tag, model.by_parameters, model.residual[..., None]], axis=-1)
     squares = (rows * weights[..., None]).swapaxes(-1, -2) @ rows
@@ -204,7 +204,7 @@ def _pulls(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _Pul
     least = 1e-9 * (1.0 + np.trace(of_tag, axis1=-2, axis2=-1))
     solved = np.linalg.solve(of_tag + least[:, None, None] * np.eye(2), cross)
     left = own - cross.swapaxes(-1, -2) @ solved
-    return _Pulls(left[:, :-1, :-1], left[:, :-1, -1], -solved[..., -1], -solved[..., :-1])
+    return _PassEquations(left[:, :-1, :-1], left[:, :-1, -1], -solved[..., -1], -solved[..., :-1])
 
 
 def _scatter(passes: Passes, found: _OffsetEstimate) -> tuple[float, float]:
@@ -216,8 +216,8 @@ def _scatter(passes: Passes, found: _OffsetEstimate) -> tuple[float, float]:
     """
     model = linearise(passes, found.parameters, found.tags_m)
     weights, curvature = _weights(passes, model.residual, found.scale)
-    gradient = _pulls(passes, model, weights).gradient
-    information = _pulls(passes, model, weights * curvature).information
+    gradient = _pass_equations(passes, model, weights).gradient
+    information = _pass_equations(passes, model, weights * curvature).information
     whole = information.sum(axis=0) + np.diag(PRIOR_SIGMA**-2)
     by_offset = np.linalg.inv(whole)[0]
     until = np.cumsum(by_offset @ information @ by_offset)

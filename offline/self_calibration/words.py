@@ -5,10 +5,10 @@ from types import MappingProxyType
 from typing import Final
 
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, MapResult
-from groundsbot.offline.self_calibration.selection import TELLS_LESS
+from groundsbot.offline.self_calibration.selection import LESS_CERTAIN
 
 # Drives that determine each parameter.
-DRIVES: Final[Mapping[str, str]] = MappingProxyType(
+CALIBRATION_DRIVES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "wheel_scale": "give a measured --distance, or exact tag sizes: wheels and tags can be scaled together",
         "wheel_ratio": "drive straight for 20 m and more, past tags at both ends",
@@ -45,11 +45,11 @@ def choice_words(choice: CalibrationChoice) -> str:
     """Return that a parameter was freed, or why not and what to drive."""
     if choice.is_freed:
         return "freed"
-    drive = f"; to determine it, {DRIVES[choice.name]}" if choice.reason == TELLS_LESS else ""
+    drive = f"; to determine it, {CALIBRATION_DRIVES[choice.name]}" if choice.reason == LESS_CERTAIN else ""
     return f"kept at robot.yaml's sigma {choice.prior_sigma:.5f}: {choice.reason}{drive}"
 
 
-def learnt_lines(result: MapResult, chosen: Sequence[CalibrationResult]) -> list[str]:
+def correction_lines(result: MapResult, chosen: Sequence[CalibrationResult]) -> list[str]:
     """Return a line for each correction, with the decision about it."""
     words = {(each.owner, each.name): choice_words(each) for each in result.choices}
     return [

@@ -23,7 +23,7 @@ from groundsbot.offline.corners import CornerSolution, SpatialState
 from groundsbot.offline.measurements import REACH_M, UNMODELLED_SIGMA_M
 
 _STEPS: Final = 6
-_STRAIGHT_SIGMAS: Final = 2.0
+_LINEARITY_SIGMAS: Final = 2.0
 # Squared sigmas between two equally likely hypotheses: together their variance is an eighth larger.
 _COVERED: Final = 0.5
 
@@ -46,11 +46,11 @@ class PlacedTags:
     place_m: FloatArray
     turn: FloatArray
     covariance: FloatArray
-    nats: float = 0.0
-    straightness: float = 1.0
+    negative_log_likelihood: float = 0.0
+    linearity: float = 1.0
 
     @property
-    def is_known(self) -> bool:
+    def is_within_reach(self) -> bool:
         """Whether the tags are within reach at all, rather than far off where corners contain no information."""
         return float(np.trace(self.covariance)) < REACH_M**2
 
@@ -73,8 +73,8 @@ class TagFit:
     T_anchors: FloatArray
     covariance: FloatArray
     cost_increase: float
-    freedom: int
-    nats: float
+    degrees_of_freedom: int
+    negative_log_likelihood: float
 
     @property
     def T_a_b(self) -> FloatArray:
@@ -87,9 +87,9 @@ class TagFit:
         return float(self.covariance[2, 2] ** 0.5)
 
     @property
-    def closes(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether the differences of the tags pass the chi-square test."""
-        return self.cost_increase < float(chi2.isf(FALSE_ALARM, self.freedom))
+        return self.cost_increase < float(chi2.isf(FALSE_ALARM, self.degrees_of_freedom))
 
     def covers(self, other: "TagFit") -> bool:
         """Return whether this covariance suffices for both hypotheses, whichever is true."""
@@ -125,11 +125,11 @@ def placed_tags(
         by[k, :2, 2] = -rotate_quarter(place[k, :2])
         by[k, 5, 2] = -1.0
     rows = by.reshape(-1, 3 + six.size)
-    straight = _straightness(solution, int(tags[0]), anchor)
+    straight = _linearity(solution, int(tags[0]), anchor)
     return PlacedTags(pose, place, turn, variance_factor * rows @ joint @ rows.T, nats, straight)
 
 
-def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
+def _linearity(solution: CornerSolution, tag: int, anchor: int) -> float:
     """Return the cost increase for a two-sigma rotation of the tag over its prediction (see `PlacedTags`)."""
     if solution.factor is None:
         return 0.0
@@ -138,13 +138,13 @@ def _straightness(solution: CornerSolution, tag: int, anchor: int) -> float:
     heading[columns.turns[tag]] = state.turns[tag, 2]
     heading[columns.poses[anchor, 2]] -= 1.0
     way = solution.factor.solve(heading[:-1])
-    way *= _STRAIGHT_SIGMAS / np.sqrt(heading[:-1] @ way)
+    way *= _LINEARITY_SIGMAS / np.sqrt(heading[:-1] @ way)
 
     def cost_at(state: SpatialState) -> float:
         return solution.problem.system(state, is_whole=False)[1]
 
     rises = [cost_at(solution.problem.retract(state, step)) - cost_at(state) for step in (way, -way)]
-    return min(rises) / (0.5 * _STRAIGHT_SIGMAS**2)
+    return min(rises) / (0.5 * _LINEARITY_SIGMAS**2)
 
 
 def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
@@ -166,7 +166,11 @@ def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
     rise = float(residual @ np.linalg.solve(S, residual))
     # The likelihood integrated over all poses of the tags and over all transforms, with uniform priors (Laplace).
     logarithms = [float(np.linalg.slogdet(each)[1]) for each in (S, information, a.covariance, b.covariance)]
-    nats = 0.5 * (rise + logarithms[0] + logarithms[1] - logarithms[2] - logarithms[3]) + a.nats + b.nats
+    nats = (
+        0.5 * (rise + logarithms[0] + logarithms[1] - logarithms[2] - logarithms[3])
+        + a.negative_log_likelihood
+        + b.negative_log_likelihood
+    )
     return TagFit(a, b, T, np.linalg.inv(information), rise, 6 * k - 3, nats)
 
 

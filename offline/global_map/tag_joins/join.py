@@ -24,7 +24,7 @@ from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.sam import Graph, Parameter, StartFactors, State, build_graph, solve
 
 # Negligible against the heading information of tags and wheels; it acts only where they have none.
-_HELD_RAD: Final = 1.0
+_HEADING_PRIOR_RAD: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class TagJoin:
     b: str
     tags: tuple[TagKey, ...]
     T_a_b: FloatArray
-    rivals: tuple[FloatArray, ...]
+    alternatives: tuple[FloatArray, ...]
     verdict: Verdict
     reason: str
 
@@ -90,7 +90,7 @@ def join_over_tags(
 _Key = tuple[tuple[int, ...], tuple[int, ...]]  # the members of two components
 
 
-class _Try(NamedTuple):
+class _Candidate(NamedTuple):
     """Two components that share tags."""
 
     a: SolvedComponent
@@ -113,7 +113,7 @@ class _Joiner:
         """Join components, most certain first, until no join is left; of contradicting joins none is made."""
         components, self.made = solved, {}
         while True:
-            tries = [each for a, b in combinations(components, 2) if (each := self._try(a, b)) is not None]
+            tries = [each for a, b in combinations(components, 2) if (each := self._candidate(a, b)) is not None]
             if self._undo_weak_joins(tries):
                 return self.join(solved)
             good = [each for each in tries if not each.join.reason]
@@ -121,14 +121,14 @@ class _Joiner:
                 self.refused |= {_key(a, b): join for a, b, join in tries}
                 return components
             a, b, join = min(good, key=lambda each: each.join.verdict.best.heading_sigma_rad)
-            whole = self._together(a, b, join.verdict.best.T_a_b)
+            whole = self._solve_together(a, b, join.verdict.best.T_a_b)
             if whole.refined is None:
-                self.refused[_key(a, b)] = join.refuse("; ".join(whole.told) or "both together have no solution")
+                self.refused[_key(a, b)] = join.refuse("; ".join(whole.messages) or "both together have no solution")
             else:
                 self.made[_key(a, b)] = join
                 components = [whole, *(each for each in components if each is not a and each is not b)]
 
-    def _undo_weak_joins(self, tries: Sequence[_Try]) -> bool:
+    def _undo_weak_joins(self, tries: Sequence[_Candidate]) -> bool:
         """Withdraw weak joins whose components share tags that contradict each other; return whether there were any."""
         wrong = {
             m for a, b, join in tries if join.reason and not join.is_weak for m in (*_key(a, b)[0], *_key(a, b)[1])
@@ -138,17 +138,17 @@ class _Joiner:
             self.refused[key] = join.refuse("other tags that their runs share contradict that it stayed in place")
         return bool(back)
 
-    def _try(self, a: SolvedComponent, b: SolvedComponent) -> _Try | None:
+    def _candidate(self, a: SolvedComponent, b: SolvedComponent) -> _Candidate | None:
         a, b = sorted((a, b), key=lambda each: min(segment.name for segment in each.graph.segments))
         key = _key(a, b)
         if key in self.refused or any(frozenset((m, n)) in self._decided for m in key[0] for n in key[1]):
             return None
         if key not in self._judged:
-            self._judged[key] = self._judge(a, b)
+            self._judged[key] = self._join_of(a, b)
         join = self._judged[key]
-        return None if join is None else _Try(a, b, join)
+        return None if join is None else _Candidate(a, b, join)
 
-    def _judge(self, a: SolvedComponent, b: SolvedComponent) -> TagJoin | None:
+    def _join_of(self, a: SolvedComponent, b: SolvedComponent) -> TagJoin | None:
         """Return the join; None where no shared tag has a pose in space in both, or one is in several places."""
         tags = tuple(sorted({tag.whole for tag in a.graph.tags} & {tag.whole for tag in b.graph.tags}))
         if not tags or not all(tag in each.graph.tags for tag in tags for each in (a, b)):
@@ -160,14 +160,14 @@ class _Joiner:
         names = [each.graph.segments[i].name for each, i in zip((a, b), seen, strict=True)]
         starts = [_poses(each)[each.graph.first_pose[i]] for each, i in zip((a, b), seen, strict=True)]
         T_a_b, *rivals = (
-            se2.compose(se2.between(starts[0], fit.T_a_b), starts[1]) for fit in (found.best, *found.rivals)
+            se2.compose(se2.between(starts[0], fit.T_a_b), starts[1]) for fit in (found.best, *found.alternatives)
         )
         return TagJoin(names[0], names[1], tags, T_a_b, tuple(rivals), found, found.reason(names[0], names[1], tags))
 
-    def _together(self, a: SolvedComponent, b: SolvedComponent, T_a_b: FloatArray) -> SolvedComponent:
+    def _solve_together(self, a: SolvedComponent, b: SolvedComponent, T_a_b: FloatArray) -> SolvedComponent:
         """Solve both in one. On the floor they may rotate about a single tag, so headings get weak priors."""
         if b.members.members[0] < a.members.members[0]:
-            return self._together(b, a, se2.inverse(T_a_b))
+            return self._solve_together(b, a, se2.inverse(T_a_b))
         placed = [(a, np.zeros(3)), (b, T_a_b)]
         poses = {}
         for each, T in placed:
@@ -188,7 +188,7 @@ class _Joiner:
         T_frame_start = solution.state.poses[graph.first_pose]
         refined, told = refine(graph, solution, self._upright_sigma_rad)
         return SolvedComponent(
-            Group(members, T_frame_start), graph, solution, a.suspects + b.suspects, refined, tuple(told)
+            Group(members, T_frame_start), graph, solution, a.outliers + b.outliers, refined, tuple(told)
         )
 
 
@@ -196,7 +196,7 @@ def _with_heading_priors(graph: Graph, start: State) -> Graph:
     """Return the graph with weak heading priors at the starts of all segments."""
     poses = graph.first_pose[1:]
     measured = graph.problem.measured
-    softly = np.tile(np.diag([0.0, 0.0, 1.0 / _HELD_RAD]), (len(poses), 1, 1))
+    softly = np.tile(np.diag([0.0, 0.0, 1.0 / _HEADING_PRIOR_RAD]), (len(poses), 1, 1))
     starts = StartFactors(
         pose=np.concatenate([measured.starts.pose, poses]),
         T_map_start=np.concatenate([measured.starts.T_map_start, start.poses[poses]]),

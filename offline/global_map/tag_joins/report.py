@@ -14,7 +14,7 @@ from groundsbot.offline.maps import AlignmentResult, AlternativeResult
 
 def join_results(components: Sequence[SolvedComponent], joins: Sequence[TagJoin]) -> tuple[AlignmentResult, ...]:
     """Return a result for each join made, as in the map, and for each ambiguous one."""
-    return tuple(_result(components, join) for join in joins if not join.reason or join.rivals)
+    return tuple(_result(components, join) for join in joins if not join.reason or join.alternatives)
 
 
 def join_warnings(joins: Sequence[TagJoin], results: Sequence[AlignmentResult]) -> list[str]:
@@ -47,7 +47,7 @@ def _result(components: Sequence[SolvedComponent], join: TagJoin) -> AlignmentRe
         inlier_rmse_m=float(np.sqrt((apart_m**2).sum(axis=1).mean())),
         outliers=(),
         is_sure=not join.reason,
-        rivals=tuple(AlternativeResult(T, tags) for T in join.rivals),
+        rivals=tuple(AlternativeResult(T, tags) for T in join.alternatives),
         is_weak=join.is_weak,
         covariance=covariance,
     )

@@ -24,10 +24,10 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 
 # Then sigma is at most 1.4 times its first-order value; where a tag is seen frontally it may be anything.
-_LEAST_STRAIGHTNESS: Final = 0.5
+_MIN_LINEARITY: Final = 0.5
 _SAME_RAD: Final = 1e-3  # optima closer than this are one
 # Root mean square of a rotation's second-order part phi^2 / 2, over sigma^2: E phi^4 / 4 = 3/4 sigma^4.
-_BENT: Final = 0.75**0.5
+_RMS_SECOND_ORDER: Final = 0.75**0.5
 
 
 @dataclass(frozen=True)
@@ -41,35 +41,35 @@ class Verdict:
     """
 
     best: TagFit
-    rivals: tuple[TagFit, ...]
-    most_heading_sigma_rad: float
+    alternatives: tuple[TagFit, ...]
+    max_heading_sigma_rad: float
 
     def reason(self, a: str, b: str, tags: Sequence[TagKey]) -> str:
         """Return why component b, by the name of a run that saw the tags, is not joined to a; empty where it is."""
         ids = ", ".join(str(tag.tag_id) for tag in tags)
         head = f"{b} shares only tag{'s' * (len(tags) > 1)} {ids} with {a}"
         fit = self.best
-        if not fit.closes:
-            off = f"{fit.cost_increase:.0f} squared sigmas, where chance explains {fit.freedom}"
+        if not fit.is_consistent:
+            off = f"{fit.cost_increase:.0f} squared sigmas, where chance explains {fit.degrees_of_freedom}"
             if len(tags) > 1:
                 return f"{head}, each run one of them, and they contradict each other ({off}): were tags moved?"
             return f"{head}, which has another height or another tilt there ({off}): was it moved?"
-        if fit.heading_sigma_rad > self.most_heading_sigma_rad:
-            known, wanted = degrees(fit.heading_sigma_rad), degrees(self.most_heading_sigma_rad)
+        if fit.heading_sigma_rad > self.max_heading_sigma_rad:
+            known, wanted = degrees(fit.heading_sigma_rad), degrees(self.max_heading_sigma_rad)
             return (
                 f"{head}, seen too poorly to join them: it gives their relative heading to {known:.1f} deg, and "
                 f"{wanted:.1f} deg are needed; view it from near and from the side, or drive past one more shared tag"
             )
-        if min(fit.a.straightness, fit.b.straightness) < _LEAST_STRAIGHTNESS:
+        if min(fit.a.linearity, fit.b.linearity) < _MIN_LINEARITY:
             return (
                 f"{head}, seen too frontally to join them: its orientation hardly shows; view it from the side, or "
                 "drive past one more shared tag"
             )
-        if self.rivals:
-            turns = ", ".join(f"{degrees(each.T_a_b[2]):.1f}" for each in (fit, *self.rivals))
+        if self.alternatives:
+            turns = ", ".join(f"{degrees(each.T_a_b[2]):.1f}" for each in (fit, *self.alternatives))
             return (
-                f"{head}, whose corners allow {1 + len(self.rivals)} orientations, so {b} may be turned by {turns} "
-                "deg: view it from the side, or drive past one more shared tag"
+                f"{head}, whose corners allow {1 + len(self.alternatives)} orientations, so {b} may be turned by "
+                f"{turns} deg: view it from the side, or drive past one more shared tag"
             )
         return ""
 
@@ -83,20 +83,23 @@ def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, ta
         b: another.
         tags: of both.
     """
-    sides = [_ways(maps, each, tags) for each in (a, b)]
+    sides = [_pose_hypotheses(maps, each, tags) for each in (a, b)]
     if not all(sides):
         return None
-    fits = sorted((fit_transform_of_tags(one, other) for one, other in product(*sides)), key=lambda fit: fit.nats)
+    fits = sorted(
+        (fit_transform_of_tags(one, other) for one, other in product(*sides)),
+        key=lambda fit: fit.negative_log_likelihood,
+    )
     best = fits[0]
     rivals: list[TagFit] = []
     for fit in fits[1:]:
-        near = fit.nats < best.nats + MARGIN_NATS
+        near = fit.negative_log_likelihood < best.negative_log_likelihood + MARGIN_NATS
         if near and not any(other.covers(fit) for other in (best, *rivals)):
             rivals.append(fit)
-    return Verdict(best, tuple(rivals), min(_most_heading_sigma(each, tags[0]) for each in (a, b)))
+    return Verdict(best, tuple(rivals), min(_max_heading_sigma(each, tags[0]) for each in (a, b)))
 
 
-def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[TagKey]) -> list[PlacedTags]:
+def _pose_hypotheses(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[TagKey]) -> list[PlacedTags]:
     """Return possible poses of the tags in a component; of several tags only the map's, as wrong ones would not fit."""
     refined = component.refined
     if refined is None:
@@ -107,12 +110,12 @@ def _ways(maps: Sequence[LocalMap], component: SolvedComponent, tags: Sequence[T
     factor = _variance_factor(maps, component, refined)
     anchor = int(component.graph.problem.anchor[which[0]])
     own = refined.solution
-    solves = [own, *(_other_solves(own, int(which[0])) if len(which) == 1 else ())]
+    solves = [own, *(_other_optima(own, int(which[0])) if len(which) == 1 else ())]
     ways = [placed_tags(each, which, anchor, factor, (each.cost - own.cost) / factor) for each in solves]
-    return [each for each in ways if each.is_known]
+    return [each for each in ways if each.is_within_reach]
 
 
-def _other_solves(own: CornerSolution, tag: int) -> list[CornerSolution]:
+def _other_optima(own: CornerSolution, tag: int) -> list[CornerSolution]:
     """Return other optima of the whole component, started from the other poses that the tag's corners allow."""
     found: list[CornerSolution] = []
     for start in alternative_states(own.problem, own.state, tag):
@@ -136,7 +139,7 @@ def _variance_factor(maps: Sequence[LocalMap], component: SolvedComponent, refin
     return max(left, *(variance_factor(maps[m]) for m in component.members.members))
 
 
-def _most_heading_sigma(component: SolvedComponent, tag: TagKey) -> float:
+def _max_heading_sigma(component: SolvedComponent, tag: TagKey) -> float:
     """Return the largest heading sigma about a tag with which a component may be rotated.
 
     A rotation by phi brings points at distance L nearer by L phi^2 / 2, which first-order covariances do not contain.
@@ -147,7 +150,11 @@ def _most_heading_sigma(component: SolvedComponent, tag: TagKey) -> float:
         return 0.0
     anchor = int(component.graph.problem.anchor[_indices(component, [tag])[0]])
     far_m, sigma_m = radial_sigmas(refined.solution, anchor, component.graph.first_pose.tolist())
-    return float(np.sqrt(np.hypot(sigma_m, UNMODELLED_SIGMA_M) / (_BENT * np.maximum(far_m, UNMODELLED_SIGMA_M))).min())
+    return float(
+        np.sqrt(
+            np.hypot(sigma_m, UNMODELLED_SIGMA_M) / (_RMS_SECOND_ORDER * np.maximum(far_m, UNMODELLED_SIGMA_M))
+        ).min()
+    )
 
 
 def _indices(component: SolvedComponent, tags: Sequence[TagKey]) -> IntArray:

@@ -15,16 +15,16 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import (
     CHANCE_NATS,
-    Explanation,
     FitState,
+    Hypothesis,
     HypothesisTest,
     LinearisedFit,
     distances,
+    fit_members,
     gate_ratio,
-    hold,
     is_same_distance,
     rotate_quarter,
-    through,
+    transform_from_two_tags,
 )
 from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
@@ -69,7 +69,7 @@ class StartSearch:
         self._known = known
         self._pairs: list[tuple[int, TagKey]] = []
         self._left: list[tuple[int, int]] | None = None  # pairs to look at; None when it begins anew
-        self._found: list[Explanation] = []
+        self._found: list[Hypothesis] = []
         self.reason = "no tag of the map was seen yet"
 
     def search(self, seen: SeenTags) -> Start | None:
@@ -99,7 +99,7 @@ class StartSearch:
             self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
             return None
         rivalry = HypothesisTest(fit.places_a, fit.places_b)
-        found = sorted(((rivalry.evidence(each), each) for each in self._found), key=lambda f: -f[0])
+        found = sorted(((rivalry.log_bayes_factor(each), each) for each in self._found), key=lambda f: -f[0])
         evidence, best = found[0]
         if rivalry.alternatives(best, found, [each for _, each in found]):
             self.reason = "ambiguous, because two groups of tags put the start in different places"
@@ -108,8 +108,8 @@ class StartSearch:
         if len(fitting) < LEAST_FITTING:
             self.reason = f"{len(fitting)} tags fit the map, {LEAST_FITTING} must, as any one may have been moved"
             return None
-        if best.n < n and evidence <= CHANCE_NATS:
-            self.reason = f"of {n} tags that may be the map's {best.n} fit, which chance may bring about"
+        if best.n_members < n and evidence <= CHANCE_NATS:
+            self.reason = f"of {n} tags that may be the map's {best.n_members} fit, which chance may bring about"
             return None
         self.reason = ""
         return Start(best.T_a_b, tuple(self._pairs[i] for i in np.flatnonzero(best.members)))
@@ -136,21 +136,21 @@ class _RigidFit:
         fits &= self._own[first] != self._own[second]
         return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
 
-    def grow(self, i: int, j: int) -> Explanation | None:
+    def grow(self, i: int, j: int) -> Hypothesis | None:
         """What fits with two pairs; None where they do not themselves."""
         members = np.zeros(self.n, dtype=np.bool_)
         members[[i, j]] = True
-        T = through(self.places_a[[i, j]], self.places_b[[i, j]])
+        T = transform_from_two_tags(self.places_a[[i, j]], self.places_b[[i, j]])
         for _ in range(_STEPS):
-            held = hold(self._linear(T), members)
+            held = fit_members(self._linear(T), members)
             T = held.T_a_b
-            off, spread = held.others()
+            off, spread = held.predict_others()
             fitting = members | (gate_ratio(off, spread) < 1.0)
             if (fitting == members).all():
                 break
             members = fitting
-        held = hold(self._linear(T), members)
-        return Explanation(members, held.linear, held) if held.closes else None
+        held = fit_members(self._linear(T), members)
+        return Hypothesis(members, held.linear, held) if held.is_consistent else None
 
     def _linear(self, T: FloatArray) -> LinearisedFit:
         cos, sin = np.cos(T[2]), np.sin(T[2])

@@ -145,7 +145,7 @@ def fuse(
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class _DifferenceBlocks:
     """Differences of B blocks of motions, with what they depend on and what their variances are made of.
 
     Attributes:
@@ -239,7 +239,7 @@ def _blocks(
     sigmas: FloatArray,
     known: IntArray,
     block_of: IntArray,
-) -> _Blocks:
+) -> _DifferenceBlocks:
     _, block = np.unique(block_of[known], return_inverse=True)
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])[known]
     jacobian = np.column_stack([-wheels.jacobian[:, 2], turns.jacobian])[known]
@@ -247,7 +247,7 @@ def _blocks(
     other = wheels.parts.rest[known, 2, 2]
     n = int(block.max()) + 1
     per_block = np.bincount(block, minlength=n)
-    return _Blocks(
+    return _DifferenceBlocks(
         difference_rad=_sum_by_block(block, difference, n),
         jacobian=np.stack([np.bincount(block, column, n) for column in jacobian.T], axis=1),
         unit=np.stack([np.bincount(block, each, n) for each in (turns.duration_s[known], *heading)]),

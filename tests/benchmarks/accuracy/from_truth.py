@@ -37,7 +37,7 @@ def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParame
     result = build_map(runs, noise, workings=workings)
     if len(result.components) > 1:
         raise ValueError(f"{len(result.components)} components; {'; '.join(result.warnings)}")
-    (solved,) = workings.solved
+    (solved,) = workings.components
     refined, told = refine(solved.graph, solve(solved.graph.problem, _true_state(solved.graph, truth)))
     if refined is None:
         raise ValueError("; ".join(told))

@@ -38,7 +38,7 @@ from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import component_of, solve_global_map
-from groundsbot.offline.local_map.archive import archive_map, local_map_of
+from groundsbot.offline.local_map.archive import archive_map, restore_local_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.localization.localization import localize_maps
 from groundsbot.offline.localization.online.drive import TagReading
@@ -246,7 +246,7 @@ def against(run: LocatedRun, online: OnlineLocalizer) -> tuple[float | None, flo
 def extended_against(scene: Scene) -> tuple[float | None, float | None]:
     """The kept map solved with the run against all runs solved at once: places in sigmas, and sigmas; the worst."""
     at_once = _join([*(solve_local_map(each.segment) for each in scene.map_drives), scene.local_map])
-    extended = _join([*(local_map_of(each) for each in scene.known.kept), scene.local_map])
+    extended = _join([*(restore_local_map(each) for each in scene.known.kept), scene.local_map])
     if at_once is None or extended is None:
         return None, None
     sigmas, own = (np.sqrt(np.diag(each.joint_covariance)[3:]) for each in (at_once, extended))

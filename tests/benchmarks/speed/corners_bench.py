@@ -65,7 +65,7 @@ def measure(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
         stages, workings = Stages(), Diagnostics()
         build_map(runs, stages=stages, workings=workings)
         floor.append(sum(each.cpu_seconds for each in stages.costs if each.name == SOLVE))
-    solved = workings.solved[0]
+    solved = workings.components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     problem = corners.problem
     found = solve_corners(problem, start)

@@ -92,9 +92,9 @@ class Trial:
         """In a word."""
         if self.alignment is None:
             return UNSURE
-        if self.alignment.is_sure:
+        if self.alignment.is_accepted:
             return RIGHT if self.agrees(self.alignment, self.T_a_b) else WRONG
-        return AMBIGUOUS if self.alignment.rivals else UNSURE
+        return AMBIGUOUS if self.alignment.alternatives else UNSURE
 
     def group_outcome(self) -> str:
         """In words, where the wrong tags moved as one."""
@@ -119,7 +119,7 @@ class Trial:
         """Whether the truth and what the moved tags say are among the rivals."""
         if self.alignment is None:
             return False
-        told = (self.alignment, *self.alignment.rivals)
+        told = (self.alignment, *self.alignment.alternatives)
         return all(any(self.agrees(each, T) for each in told) for T in (self.T_a_b, self.T_a_b_moved))
 
 

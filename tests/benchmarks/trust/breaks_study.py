@@ -103,7 +103,7 @@ def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
 def _align_for_sure(before: LocalMap, after: LocalMap) -> bool:
     shared = sorted(set(before.graph.tags) & set(after.graph.tags))
     alignment = align(condense(before, shared), condense(after, shared)) if len(shared) > 1 else None
-    return alignment is not None and alignment.is_sure
+    return alignment is not None and alignment.is_accepted
 
 
 def _rms_m(maps: Sequence[LocalMap], broken: BrokenDrive) -> float:

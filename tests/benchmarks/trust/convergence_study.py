@@ -75,8 +75,8 @@ def study_seed(seed: int) -> Figures:
         is_right(plain, best),
         is_right(ours.solution, best),
         not ours.goodness.fits,
-        not windows.judge(plain.state).fits,
-        not windows.judge(best.state).fits,
+        not windows.goodness_of_fit(plain.state).fits,
+        not windows.goodness_of_fit(best.state).fits,
         seconds,
     )
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.condensed_map import condense
-from groundsbot.offline.alignment.joint_fit import JointFit, hold
+from groundsbot.offline.alignment.joint_fit import JointFit, fit_members
 from groundsbot.offline.alignment.merging import Group
 from groundsbot.offline.alignment.pairwise import align
 from groundsbot.offline.foundation.stages import Stages
@@ -38,15 +38,15 @@ def test_the_rise_is_that_of_the_joint_solve_though_the_maps_are_bent(a: int, b:
     sure = align(condense(maps[0], maps[0].graph.tags), condense(maps[1], maps[1].graph.tags))
     assert sure is not None
     everything = np.ones(fit.n, dtype=np.bool_)
-    linear, held = fit.solve(fit.unbent(sure.T_a_b), everything)
+    linear, held = fit.solve(fit.point_without_errors(sure.T_a_b), everything)
     _, together = solve_global_map(maps, Group((0, 1), np.array([np.zeros(3), linear.at.T_a_b])), Stages())
     rise = 2.0 * (together.cost - sum(each.solution.cost for each in maps))
     assert held.cost_increase == pytest.approx(rise, rel=0.05, abs=1.0)
     assert held.cost_increase < chi2.isf(1e-4, 2 * fit.n - 3)
     # In map axes, as if a bend were none, the same maps seem to contradict each other.
-    assert abs(hold(fit.linearise(fit.unbent(linear.at.T_a_b)), everything).cost_increase - rise) > 3.0 * abs(
-        held.cost_increase - rise
-    )
+    assert abs(
+        fit_members(fit.linearise(fit.point_without_errors(linear.at.T_a_b)), everything).cost_increase - rise
+    ) > 3.0 * abs(held.cost_increase - rise)
 
 
 def test_a_condensed_map_has_the_places_and_the_covariance_of_the_solve() -> None:
@@ -92,5 +92,5 @@ def test_a_tag_a_metre_off_is_noticed_where_its_own_sigma_is_larger() -> None:
     tag_m[b.tags.index(wrong)] += [0.8, 0.6]
     found = align(a, replace(b, tag_m=tag_m))
     assert found is not None
-    assert found.is_sure
+    assert found.is_accepted
     assert found.outliers == (wrong,)

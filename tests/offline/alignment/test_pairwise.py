@@ -59,9 +59,9 @@ def test_any_transform_is_found(T_a_b: FloatArray, seed: int) -> None:
     alignment = align_points(name_points(se2.apply(T_a_b, b)), name_points(b))
     assert_same_transform(alignment.T_a_b, T_a_b, atol=1e-7)
     assert alignment.n_inliers == 6
-    assert alignment.is_sure
+    assert alignment.is_accepted
     assert alignment.rmse_m < 1e-9
-    assert alignment.rise < 1e-9
+    assert alignment.cost_increase < 1e-9
 
 
 @pytest.mark.parametrize("theta", NEAR_PI)
@@ -78,7 +78,7 @@ def test_outliers_are_named_and_do_not_bend_the_transform() -> None:
     shift = np.random.default_rng(4).uniform(2.0, 9.0, (5, 2))
     a[:5] += shift
     alignment = align_points(name_points(a), name_points(b))
-    assert alignment.is_sure
+    assert alignment.is_accepted
     assert alignment.inlier.tolist() == 5 * [False] + 7 * [True]
     np.testing.assert_allclose(alignment.T_a_b, clean, atol=1e-9)
     np.testing.assert_allclose(alignment.off_m[:5], np.linalg.norm(shift, axis=1), atol=0.3)
@@ -108,7 +108,7 @@ def test_two_shared_tags_are_enough_where_no_other_contradicts() -> None:
     alignment = align_points(name_points(se2.apply(T_a_b, b)), name_points(b))
     assert_same_transform(alignment.T_a_b, T_a_b, atol=1e-9)
     assert alignment.n_inliers == 2
-    assert alignment.is_sure
+    assert alignment.is_accepted
 
 
 def test_two_that_fit_among_others_that_do_not_may_be_chance() -> None:
@@ -116,7 +116,7 @@ def test_two_that_fit_among_others_that_do_not_may_be_chance() -> None:
     a = b + np.array([[0.0, 0.0], [0.0, 0.0], [7.0, 3.0], [-2.0, -6.0]])
     alignment = align_points(name_points(a), name_points(b))
     assert alignment.inlier.tolist() == [True, True, False, False]
-    assert not alignment.is_sure
+    assert not alignment.is_accepted
 
 
 @pytest.mark.parametrize("n", [0, 1])
@@ -165,8 +165,8 @@ def test_a_symmetric_layout_is_ambiguous() -> None:
     a = b.copy()
     a[[0, 1, 4, 5]] *= -1.0
     alignment = align_points(name_points(a), name_points(b))
-    assert not alignment.is_sure
-    (rival,) = alignment.rivals
+    assert not alignment.is_accepted
+    (rival,) = alignment.alternatives
     stayed = (a == b).all(axis=1)
     assert {tuple(alignment.inlier), tuple(rival.inlier)} == {tuple(stayed), tuple(~stayed)}
 
@@ -185,9 +185,9 @@ def test_a_loose_group_is_a_rival_where_the_others_may_have_moved_as_one() -> No
 
     alignment = align(loose(moved, "a"), loose(np.concatenate([near, far]), "b"))
     assert alignment is not None
-    assert not alignment.is_sure
-    (rival,) = alignment.rivals
-    assert alignment.evidence_nats > rival.evidence_nats + MARGIN_NATS
+    assert not alignment.is_accepted
+    (rival,) = alignment.alternatives
+    assert alignment.log_bayes_factor > rival.log_bayes_factor + MARGIN_NATS
     assert rival.inlier.tolist() == 5 * [False] + 4 * [True]
 
 
@@ -196,8 +196,8 @@ def test_a_corridor_with_a_pattern_that_repeats_and_ids_put_up_anew_is_ambiguous
     b = np.array([[4.0 * door, side] for door in range(7) for side in (-1.0, 1.0)])
     a = b + np.where(np.arange(14)[:, None] % 4 < 2, [4.0, 0.0], [0.0, 0.0])
     alignment = align_points(name_points(a), name_points(b))
-    assert not alignment.is_sure
-    ways = [alignment.T_a_b, *(rival.T_a_b for rival in alignment.rivals)]
+    assert not alignment.is_accepted
+    ways = [alignment.T_a_b, *(rival.T_a_b for rival in alignment.alternatives)]
     for shift_m in (0.0, 4.0):
         assert min(np.abs(way - [shift_m, 0.0, 0.0]).max() for way in ways) < 1e-6
 
@@ -209,7 +209,7 @@ def test_a_measured_start_settles_what_tags_leave_open() -> None:
         measured = Placement(np.array([shift_m + 0.1, 0.05, 0.02]), np.diag([0.1, 0.1, 0.03]) ** 2)
         alignment = align(observe(name_points(a)), observe(name_points(b), "b"), measured)
         assert alignment is not None
-        assert alignment.is_sure
+        assert alignment.is_accepted
         assert_same_transform(alignment.T_a_b, np.array([shift_m, 0.0, 0.0]), atol=1e-6)
 
 
@@ -257,7 +257,7 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
     alignment, by_near_end = align(a, b), align(observe(name_points(moved)), observe(name_points(near), "b"))
     assert alignment is not None
     assert by_near_end is not None
-    assert alignment.evidence_nats > by_near_end.evidence_nats + MARGIN_NATS
+    assert alignment.log_bayes_factor > by_near_end.log_bayes_factor + MARGIN_NATS
 
 
 def test_a_part_that_hangs_loosely_may_have_moved_as_one() -> None:

@@ -5,13 +5,19 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from groundsbot.offline.alignment.model_selection import chance_nats
-from groundsbot.offline.alignment.tag_gate import TAG_GATE, gate_ratio, log_likelihood_ratio, log_wrong, squared_sigmas
+from groundsbot.offline.alignment.model_selection import log_chance_likelihood
+from groundsbot.offline.alignment.tag_gate import (
+    TAG_GATE,
+    gate_ratio,
+    log_likelihood_ratio,
+    log_outlier_density,
+    squared_sigmas,
+)
 
 
 def test_a_wrong_tag_is_somewhere_and_each_order_of_magnitude_is_as_likely() -> None:
     def share(from_m: float, to_m: float) -> float:
-        return float(quad(lambda r: 2.0 * np.pi * r * np.exp(log_wrong(np.array(r * r))), from_m, to_m)[0])
+        return float(quad(lambda r: 2.0 * np.pi * r * np.exp(log_outlier_density(np.array(r * r))), from_m, to_m)[0])
 
     assert share(0.0, 100.0) == pytest.approx(1.0, rel=1e-6)
     assert share(3.0, 9.0) == pytest.approx(share(9.0, 27.0), rel=0.03)
@@ -20,7 +26,7 @@ def test_a_wrong_tag_is_somewhere_and_each_order_of_magnitude_is_as_likely() -> 
 def test_a_tag_is_worth_what_the_normal_density_is_over_that_of_a_wrong_one() -> None:
     covariance = np.array([[0.5, 0.2], [0.2, 0.3]])
     off_m = np.array([[0.4, -0.9]])
-    by_chance = log_wrong(np.array([0.4**2 + 0.9**2 + 0.8]))
+    by_chance = log_outlier_density(np.array([0.4**2 + 0.9**2 + 0.8]))
     worth = log_likelihood_ratio(off_m, covariance[None])
     assert worth == pytest.approx(multivariate_normal(np.zeros(2), covariance).logpdf(off_m[0]) - by_chance)
 
@@ -51,6 +57,6 @@ def test_chance_is_what_wrong_tags_are_worth_about_each_at_the_typical_heading()
     by_tag = []
     for i in range(5):
         off = (a_i - a_i[i])[None] - turn[:, None] * (b_i - b_i[i])[None]
-        log_each = log_wrong(np.abs(np.delete(off, i, axis=1)) ** 2)
+        log_each = log_outlier_density(np.abs(np.delete(off, i, axis=1)) ** 2)
         by_tag.append(2.0 * np.pi * np.exp(log_each.sum(axis=1).mean()))
-    assert chance_nats(a, b) == pytest.approx(np.log(2.0 * np.mean(by_tag)), abs=0.05)
+    assert log_chance_likelihood(a, b) == pytest.approx(np.log(2.0 * np.mean(by_tag)), abs=0.05)

@@ -189,10 +189,10 @@ def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path
     n = 2 * len(component.tags)
     assert errors.nees_tags_per_dim is not None
     assert chi2.ppf(0.0005, n) < n * errors.nees_tags_per_dim < chi2.ppf(0.9995, n)
-    floor = component_of(workings.solved[0].graph, workings.solved[0].solution)
+    floor = component_of(workings.components[0].graph, workings.components[0].solution)
     for refined, known in zip(component.start_to_start, floor.start_to_start, strict=True):
         assert np.linalg.det(refined.covariance) < np.linalg.det(known.covariance)
-    np.testing.assert_array_equal(workings.solved[0].poses_of(1), component.runs[1].T_map_base)
+    np.testing.assert_array_equal(workings.components[0].poses_of(1), component.runs[1].T_map_base)
 
 
 def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Diagnostics]) -> None:
@@ -214,7 +214,7 @@ def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Diagnos
 
 def test_covariances_are_those_of_the_whole_matrix(room: tuple[Path, MapResult, Diagnostics]) -> None:
     _, result, workings = room
-    solved = workings.solved[0]
+    solved = workings.components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
     assert found.converged
@@ -243,14 +243,14 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
     tags: FloatArray = np.array([tag.position_m for tag in component.tags])
     np.testing.assert_allclose(se2.apply(poses[edges.pose], edges.place_m), tags[edges.tag], atol=1e-9)
     np.testing.assert_allclose(se2.compose(poses[edges.first], edges.motion)[:, :2], poses[edges.first + 1, :2])
-    floor = edges_of(workings.solved[0].graph, workings.solved[0].solution)
+    floor = edges_of(workings.components[0].graph, workings.components[0].solution)
     np.testing.assert_array_equal(edges.place_information, floor.place_information)
 
 
 def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
     room: tuple[Path, MapResult, Diagnostics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
     assert refine(solved.graph, solved.solution)[0] is not None
     monkeypatch.setattr(bundle_adjustment, "_FREE_FACTOR_BYTES", 1 << 20)
     monkeypatch.setattr(bundle_adjustment, "_FACTOR_BYTES_PER_BYTE", 0)
@@ -262,7 +262,7 @@ def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
 
 def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """As seen they would be some sigma_corner_px over a side's length askew."""
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     looks = corners.problem.corners.observations
     expected = with_predicted_facings(corners.problem.corners, start).observations.outward
@@ -271,7 +271,7 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
 
 
 def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
 
     def sigmas_px(graph: Graph) -> FloatArray:
         return corner_graph(graph, solved.solution.state)[0].problem.corners.observations.sigma_px
@@ -289,7 +289,7 @@ def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResu
 
 
 def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
     problem = corner_graph(solved.graph, solved.solution.state)[0].problem
     own = compiled_motions(problem.odometry, np.arange(len(problem.odometry.first)))
     assert problem.motions is solved.graph.problem.arrowhead.odometry
@@ -312,7 +312,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
     room: tuple[Path, MapResult, Diagnostics],
 ) -> None:
     """Pictures tilted by half a degree: each tag is turned round in turn, and costs its pictures more."""
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
     tilt = np.radians([0.5, 0.5, 0.0])
@@ -330,7 +330,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
 
 def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (some 300 pictures tell)."""
-    solved = room[2].solved[0]
+    solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
     assert not initial_attitude_sigmas(found.problem, found.state).any()

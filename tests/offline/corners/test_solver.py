@@ -19,7 +19,7 @@ def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part(tmp_path: Pa
     simulate("nsh_flat", 2, tmp_path / "drives", render=False)
     workings = Diagnostics()
     build_map(read_runs(find_logs([tmp_path / "drives"])), workings=workings)
-    (solved,) = workings.solved
+    (solved,) = workings.components
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)
     assert found.converged, found.reason

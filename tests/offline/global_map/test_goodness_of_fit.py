@@ -28,7 +28,7 @@ def map_runs(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
 
 
 def by_windows(solution: Solution, least_factor: float = 0.0) -> GoodnessOfFit:
-    return fit_windows(solution.problem, least_factor=least_factor).judge(solution.state)
+    return fit_windows(solution.problem, least_factor=least_factor).goodness_of_fit(solution.state)
 
 
 @pytest.mark.parametrize(("kind", "n_tags", "fits"), [(CLEAN, 0, True), (MOVED, 4, False)])

@@ -11,9 +11,9 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import calibration_of, component_of, solve_global_map
-from groundsbot.offline.global_map.overdispersion import _alone, misfit_of, noise_freedom
+from groundsbot.offline.global_map.overdispersion import _solve_alone, misfit_of, noise_degrees_of_freedom
 from groundsbot.offline.global_map.pass_scatter import scatter_of_passes, scatter_warnings
-from groundsbot.offline.global_map.scale_checks import checks_of
+from groundsbot.offline.global_map.scale_checks import compare_wheels_and_tags
 from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.findings import Findings
@@ -62,7 +62,7 @@ def squared_sigmas(component: Component) -> float:
 def test_gentle_drives_keep_their_sigmas() -> None:
     maps, graph, solution = solve_drives(CLEAN)
     assert misfit_of(maps, graph, solution) is None
-    scatter = scatter_of_passes(graph, solution, 1.0, noise_freedom(maps))
+    scatter = scatter_of_passes(graph, solution, 1.0, noise_degrees_of_freedom(maps))
     assert (scatter.factors == 1.0).all()
     assert scatter_warnings(graph, scatter) == []
     component = component_of(graph, solution)
@@ -83,7 +83,7 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
         assert misfit.run == graph.segments[1].name
     before = component_of(graph, solution)
     after = inflate_covariances(
-        before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_freedom(maps))
+        before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_degrees_of_freedom(maps))
     )
     assert after.sigma_factor == misfit.variance_factor**0.5
     assert squared_sigmas(before) > 1.05
@@ -92,7 +92,7 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
 
 def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatter() -> None:
     maps, graph, solution = solve_drives(MOVED, 1)
-    scatter = scatter_of_passes(graph, solution, 1.0, noise_freedom(maps))
+    scatter = scatter_of_passes(graph, solution, 1.0, noise_degrees_of_freedom(maps))
     (moved,) = make_scene(SEED, MOVED, 1, MOVED_M).ids
     (which,) = np.flatnonzero(scatter.factors > 1.0)
     assert graph.tags[which].tag_id == moved
@@ -110,7 +110,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
     assert not grown.any()
     assert (after.sigma_factor, after.misfit) == (1.0, None)
     # Where everything grows anyway, a tag needs less of its own.
-    less = scatter_of_passes(graph, solution, 100.0, noise_freedom(maps))
+    less = scatter_of_passes(graph, solution, 100.0, noise_degrees_of_freedom(maps))
     assert not less.added_m2.any()
 
 
@@ -122,11 +122,11 @@ def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
     again = build_graph([graph.segments[0], apart])
     start = again.start(solution.state.poses, {}, graph.calibration_of(solution.state))
     split = solve(again.problem, start)
-    alone = _alone(maps[1], again, split, 1)
+    alone = _solve_alone(maps[1], again, split, 1)
     assert alone.problem.n_residuals == maps[1].solution.problem.n_residuals
     assert len(alone.state.tags) == len(sightings)
     assert alone.cost < maps[1].solution.cost
-    assert _alone(maps[0], again, split, 0) is maps[0].solution
+    assert _solve_alone(maps[0], again, split, 0) is maps[0].solution
 
 
 def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
@@ -135,13 +135,13 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     found, misfit = Findings(), misfit_of(maps, graph, solution)
     assert misfit is not None
     nothing = parse_measurements(TapeOptions(), [segment.name for segment in graph.segments], list(graph.tags))
-    found.take(maps, SolvedComponent(group, graph, solution, []), nothing, Stages())
+    found.add(maps, SolvedComponent(group, graph, solution, []), nothing, Stages())
     (component,) = found.components
     factor = misfit.variance_factor**0.5
     assert (component.misfit, component.sigma_factor) == (misfit, factor)
     for own, computed in (
         (found.calibration, calibration_of(graph.parameters, solution, 0)),
-        (found.checks, checks_of(graph, solution, 0)),
+        (found.checks, compare_wheels_and_tags(graph, solution, 0)),
     ):
         assert len(own) > 0
         np.testing.assert_allclose([each.sigma for each in own], [factor * each.sigma for each in computed])

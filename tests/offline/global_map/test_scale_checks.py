@@ -8,7 +8,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import TAG_SCALE
 from groundsbot.offline.foundation.stages import Stages
-from groundsbot.offline.global_map.scale_checks import check_warnings
+from groundsbot.offline.global_map.scale_checks import comparison_warnings
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.warnings import calibration_warnings
 from groundsbot.offline.maps.parameter_results import CalibrationResult, ConsistencyCheck
@@ -104,7 +104,7 @@ def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
 def test_sigmas_count_both_what_readings_and_what_robot_yaml_leave_open() -> None:
     checks = [ConsistencyCheck("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
     assert checks[0].sigmas == pytest.approx(0.05 / np.hypot(0.003, 0.01))
-    assert len(check_warnings(checks)) == 1
+    assert len(comparison_warnings(checks)) == 1
 
 
 def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:

@@ -15,7 +15,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.global_map.weak_constraints import weak_parts
+from groundsbot.offline.global_map.weak_constraints import weak_constraint_warnings
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.mapping.inputs import read_runs
@@ -73,7 +73,7 @@ def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_
     graph, solution = solve_drives({"a": (1, 2), "b": (3, 4)})
     assert solution.unobservable.segments == (1,)
     assert solution.rank == graph.problem.columns.n - 3
-    (sentence,) = [s for s in weak_parts(graph, solution) if s.startswith("b ")]
+    (sentence,) = [s for s in weak_constraint_warnings(graph, solution) if s.startswith("b ")]
     assert "b shares no tag with the others" in sentence
     first_of_b = graph.problem.columns.poses[graph.first_pose[1]]
     assert (np.sqrt(solution.covariance(first_of_b).diagonal()) > 100.0).all()
@@ -89,7 +89,10 @@ def test_a_run_that_shares_no_tag_is_named_and_its_covariance_says_that_nothing_
 def test_a_run_that_shares_one_tag_can_turn_about_it() -> None:
     graph, solution = solve_drives({"a": (1, 2), "b": (2, 3)})
     assert solution.unobservable.n_directions == 1
-    assert any("b shares only tag 2 with the others, about which it can turn" in s for s in weak_parts(graph, solution))
+    assert any(
+        "b shares only tag 2 with the others, about which it can turn" in s
+        for s in weak_constraint_warnings(graph, solution)
+    )
 
 
 @pytest.mark.parametrize(

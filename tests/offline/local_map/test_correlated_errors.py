@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.offline.local_map.correlated_errors import SharedErrors, fit_shared_errors
+from groundsbot.offline.local_map.correlated_errors import CorrelatedErrors, fit_correlated_errors
 from groundsbot.offline.local_map.goodness_of_fit import fit_windows, in_windows
 from groundsbot.offline.sam.factors.odometry_and_readings import State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors
@@ -34,7 +34,7 @@ def test_errors_that_neighbours_share_raise_no_alarm(seed: int) -> None:
     graph = drifting_graph(drive)
     best = solve(graph.problem, drive.true_state(graph))
     windows = fit_windows(graph.problem)
-    assert windows.judge(best.state).fits
+    assert windows.goodness_of_fit(best.state).fits
 
 
 def test_a_moved_tag_is_noticed_among_them() -> None:
@@ -42,7 +42,7 @@ def test_a_moved_tag_is_noticed_among_them() -> None:
     drifting = with_drifting_readings(drive.segment, SIGMAS, DRIFT_M, seed=1)
     graph = build_graph([with_a_moved_tag(drive, drifting)])
     best = solve(graph.problem, drive.true_state(graph))
-    assert not fit_windows(graph.problem).judge(best.state).fits
+    assert not fit_windows(graph.problem).goodness_of_fit(best.state).fits
 
 
 def test_a_wrong_end_is_noticed_among_them() -> None:
@@ -54,8 +54,8 @@ def test_a_wrong_end_is_noticed_among_them() -> None:
     assert wrong.converged
     assert wrong.cost > 1.01 * right.cost
     windows = fit_windows(graph.problem)
-    assert windows.judge(right.state).fits
-    assert not windows.judge(wrong.state).fits
+    assert windows.goodness_of_fit(right.state).fits
+    assert not windows.goodness_of_fit(wrong.state).fits
 
 
 @pytest.mark.parametrize("drawn", [0.0, 1.0])
@@ -73,9 +73,9 @@ def test_the_shared_part_is_found(drawn: float) -> None:
         places = np.zeros((len(windows.columns.tags), 2))
         true = drive.true_state(build_graph([drive.segment]))
         places[windows.readings.tag] = true.tags[readings.tag]
-        found = fit_shared_errors(solve(windows, replace(true, tags=places), losses=PLAIN_SQUARES), cell)
-        shared.append(found.shared[0])
-        own.append(found.own[0])
+        found = fit_correlated_errors(solve(windows, replace(true, tags=places), losses=PLAIN_SQUARES), cell)
+        shared.append(found.common_variance[0])
+        own.append(found.independent_variance[0])
     # Shared parts are held to what was assumed before, none; the own ones take up what is lacking.
     assert np.mean(own) == pytest.approx(1.0, abs=0.05 + 0.05 * drawn)
     assert 0.5 * drawn <= np.mean(shared) < max(1.1 * drawn, 0.04)
@@ -83,14 +83,16 @@ def test_the_shared_part_is_found(drawn: float) -> None:
 
 def test_factors_and_freedom_follow_from_the_parts() -> None:
     """Two cells of one and three readings: variances of own 1 and shared 2 make 3 and 7 of a reading's."""
-    errors = SharedErrors(np.array([1.0, 0.5]), np.array([100.0, 100.0]), np.array([2.0, 0.0]), np.array([5.0, 5.0]))
+    errors = CorrelatedErrors(
+        np.array([1.0, 0.5]), np.array([100.0, 100.0]), np.array([2.0, 0.0]), np.array([5.0, 5.0])
+    )
     cell = np.array([0, 1, 1, 1])
     np.testing.assert_allclose(errors.factors(cell) ** 2, [[3.0, 0.5], [7.0, 0.5], [7.0, 0.5], [7.0, 0.5]])
     known = np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0], [0.0, 0.0]])  # to be shared, reading by reading
     wanted = [[3.0, 0.5], [7.0, 3.5], [10.0, 9.5], [7.0, 0.5]]
     np.testing.assert_allclose(errors.factors(cell, known) ** 2, wanted)
     # Sums over readings: own 4 and 2, shared 2 (1 + 3 + 3 + 3) = 20.
-    assert errors.freedom(cell) == pytest.approx(26.0**2 / (4.0**2 / 100.0 + 2.0**2 / 100.0 + 20.0**2 / 5.0))
+    assert errors.degrees_of_freedom(cell) == pytest.approx(26.0**2 / (4.0**2 / 100.0 + 2.0**2 / 100.0 + 20.0**2 / 5.0))
 
 
 def test_drives_that_only_a_tape_joins_have_nothing_to_contradict() -> None:
@@ -106,6 +108,6 @@ def test_drives_that_only_a_tape_joins_have_nothing_to_contradict() -> None:
     alone = segment.odometry.dead_reckon()
     poses = np.concatenate([alone, alone + placed])
     state = State(poses, np.zeros((0, 2)), np.zeros(len(problem.prior.sigma)))
-    verdict = fit_windows(replace(problem, measured=measured)).judge(state)
+    verdict = fit_windows(replace(problem, measured=measured)).goodness_of_fit(state)
     assert verdict.expected == 0
     assert verdict.fits

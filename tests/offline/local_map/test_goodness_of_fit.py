@@ -40,9 +40,9 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     wrong = solve(graph.problem, graph.start(drive.segment.odometry.dead_reckon(), {}, {}))
     assert wrong.cost > 1.01 * right.cost
     windows = fit_windows(graph.problem)
-    assert windows.judge(right.state).fits
-    assert windows.judge(right.state).warnings("a_run") == []
-    verdict = windows.judge(wrong.state)
+    assert windows.goodness_of_fit(right.state).fits
+    assert windows.goodness_of_fit(right.state).warnings("a_run") == []
+    verdict = windows.goodness_of_fit(wrong.state)
     assert not verdict.fits
     (sentence,) = verdict.warnings("a_run")
     assert sentence.startswith("a_run: its readings contradict each other")
@@ -75,13 +75,13 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
     tags = [TagKey(FAMILY, i) for i in range(3)]
     (segment,) = segments_of(make_run([drive.track], tags=tags, positions=positions), NoiseParameters())
     rounds = []
-    left_over = goodness_of_fit._mean_squares
+    left_over = goodness_of_fit._losses_and_redundancies
 
     def counted(solution: Solution) -> tuple[FloatArray, FloatArray]:
         rounds.append(solution)
         return left_over(solution)
 
-    monkeypatch.setattr(goodness_of_fit, "_mean_squares", counted)
+    monkeypatch.setattr(goodness_of_fit, "_losses_and_redundancies", counted)
     windows = fit_windows(build_graph([segment]).problem)
     assert (windows.factors < 0.1).all()
     assert len(rounds) <= 8
@@ -99,7 +99,7 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
     drive = make_long_drive(5, LENGTH_M)
     graph = build_graph([with_a_moved_tag(drive)])
     best = solve(graph.problem, drive.true_state(graph))
-    assert not fit_windows(graph.problem).judge(best.state).fits
+    assert not fit_windows(graph.problem).goodness_of_fit(best.state).fits
 
 
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])

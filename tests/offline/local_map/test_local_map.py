@@ -172,7 +172,7 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
     monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
     check = local_map._Check(build_graph([segment]), SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs))
     assert 0 < len(check._tags) < len(segment.tags)
-    assert check.judge(whole.solution).fits
+    assert check.goodness_of_fit(whole.solution).fits
 
 
 def test_a_start_of_another_problem_is_refused() -> None:

@@ -157,7 +157,7 @@ def test_timelines_show_speed_tags_gaps_and_events(inside: Inside) -> None:
     assert max(first["tags"]) == 4
     assert first["t_s"][-1] == pytest.approx(5.5, abs=0.3)
     assert (first["gaps"], first["events"]) == ([], [])
-    solved = workings.solved[0]
+    solved = workings.components[0]
     segment = solved.graph.segments[0]
     track = segment.run.wheel_segments[0]
     kept = (track.stamps_ns < START_NS + 2 * S) | (track.stamps_ns > START_NS + 3 * S)
@@ -252,7 +252,7 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
     trace = _trace("a_one", {"a_one": "#000000"}, poses)
     assert len(trace["x"]) <= _MOST_POINTS + 1
     assert [trace["x"][0], trace["x"][-1]] == pytest.approx([poses[0, 0], poses[-1, 0]], abs=1e-3)
-    segment = inside[1].solved[0].graph.segments[0]
+    segment = inside[1].components[0].graph.segments[0]
     rng = np.random.default_rng(0)
     n, m = 10_000, 30_000
     long = replace(

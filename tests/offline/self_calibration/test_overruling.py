@@ -15,8 +15,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.self_calibration.option import Calibrate
-from groundsbot.offline.self_calibration.robot import OFF_BY_FAR
-from groundsbot.offline.self_calibration.robot_table import NOT_BELIEVED, WRONG, is_news
+from groundsbot.offline.self_calibration.robot import GROSS_ERROR_NAMES
+from groundsbot.offline.self_calibration.robot_table import DISTRUSTED, WRONG, is_different
 from groundsbot.onboard.log.reading.reader import find_logs
 
 SEED = 3
@@ -62,13 +62,13 @@ def test_all_is_found_that_is_off_by_far(result: MapResult, drives: Path) -> Non
             # Who steers answers what the floor does: that looks like a camera farther ahead (docs/estimate.md).
             beyond = 0.1 if name == "mount_x_m" else 0.01
             assert abs(number.found - value) < 4.0 * number.sigma + beyond, (robot, name, number, value)
-            assert number.verdict in (WRONG, NOT_BELIEVED)
-            assert is_news(number)
+            assert number.verdict in (WRONG, DISTRUSTED)
+            assert is_different(number)
     (size,) = [each for each in result.robot_numbers if each.name == "tag_scale"]
     assert abs(size.found - true["tags"][0]["size_m"]) < 4.0 * size.sigma
     assert size.sigma < 0.002
     freed = {(each.owner, each.name) for each in result.choices if each.is_freed}
-    assert {(robot, name) for robot in ("hallway", "loop") for name in OFF_BY_FAR} <= freed
+    assert {(robot, name) for robot in ("hallway", "loop") for name in GROSS_ERROR_NAMES} <= freed
     assert all(("wheel" not in name) for _, name in freed)  # they carry the metre
 
 

@@ -29,15 +29,15 @@ from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
 from groundsbot.offline.self_calibration.information import information_of
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
 from groundsbot.offline.self_calibration.robot import (
-    OPEN_SIGMAS,
+    FREED_SIGMAS,
     Correction,
     OwnedParameter,
     correct_robot,
     open_parameters,
 )
-from groundsbot.offline.self_calibration.robot_table import AGREES, ASKED, WRONG, verdict_lines
-from groundsbot.offline.self_calibration.selection import TELLS_LESS, CalibrationInformation, choose, is_overruled
-from groundsbot.offline.self_calibration.words import DRIVES, refusal_lines
+from groundsbot.offline.self_calibration.robot_table import AGREES, REQUESTED, WRONG, verdict_lines
+from groundsbot.offline.self_calibration.selection import LESS_CERTAIN, CalibrationInformation, choose, is_overruled
+from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
 from tests.support.data.drives import CAMERA, MadeTag, make_drive, make_robot, picture_stamps, write_drive
@@ -135,7 +135,7 @@ def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
     assert value_of(result, "track_scale") == pytest.approx(1.0 / 1.08 - 1.0, abs=2e-3)
     assert value_of(result, "mount_yaw_rad") == pytest.approx(-0.06, abs=3e-3)
     prior = {each.name: each.prior_sigma for each in result.calibration}
-    assert prior["track_scale"] == OPEN_SIGMAS["track_scale"]
+    assert prior["track_scale"] == FREED_SIGMAS["track_scale"]
     assert prior["mount_x_m"] == wrong.mount.x_m_sigma
 
 
@@ -173,8 +173,8 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     result = map_runs(log, make_robot("a"), Calibrate(is_on=True, names=("wheel_ratio", "wheel_scale")))
     assert freed_names(result) == {"wheel_ratio"}
     reasons = {each.name: each.reason for each in result.choices}
-    assert reasons["wheel_scale"] == TELLS_LESS
-    assert {each.name for each in result.robot_numbers if each.verdict == ASKED} == {"wheel_ratio"}
+    assert reasons["wheel_scale"] == LESS_CERTAIN
+    assert {each.name for each in result.robot_numbers if each.verdict == REQUESTED} == {"wheel_ratio"}
     (refused_line,) = refusal_lines(result)
     assert refused_line.startswith("not freed: wheel_scale of a: kept at robot.yaml's sigma")
     assert "--distance" in refused_line
@@ -277,16 +277,16 @@ def test_what_was_learnt_of_edges_is_written() -> None:
 
 
 def test_every_number_that_may_be_freed_can_be_opened() -> None:
-    assert set(NAMES) == set(OPEN_SIGMAS) == set(DRIVES)
+    assert set(NAMES) == set(FREED_SIGMAS) == set(CALIBRATION_DRIVES)
     robot = make_robot("a")
     batch = OwnedParameter(f"{robot.tags[0].batch} {robot.tags[0].family}", TAG_SCALE)
     everything = open_parameters(
-        robot, {OwnedParameter("a", name): sigma for name, sigma in OPEN_SIGMAS.items()} | {batch: 0.15}
+        robot, {OwnedParameter("a", name): sigma for name, sigma in FREED_SIGMAS.items()} | {batch: 0.15}
     )
     sigmas = dict(zip(WHEEL_PARAMETERS, [each.sigma for each in parameters_of_wheels(everything)], strict=True))
-    assert sigmas == pytest.approx({name: OPEN_SIGMAS[name] for name in WHEEL_PARAMETERS})
-    assert everything.tags[0].relative_sigma == pytest.approx(OPEN_SIGMAS[TAG_SCALE])
-    assert everything.mount.roll_rad_sigma == OPEN_SIGMAS["mount_roll_rad"]
+    assert sigmas == pytest.approx({name: FREED_SIGMAS[name] for name in WHEEL_PARAMETERS})
+    assert everything.tags[0].relative_sigma == pytest.approx(FREED_SIGMAS[TAG_SCALE])
+    assert everything.mount.roll_rad_sigma == FREED_SIGMAS["mount_roll_rad"]
     assert everything.mount.z_m_sigma == robot.mount.z_m_sigma
     assert open_parameters(robot, {}) == robot
     assert open_parameters(robot, {OwnedParameter("another", "track_scale"): 0.1}) == robot

@@ -11,8 +11,8 @@ from groundsbot.calib.geometry.se2 import wrap_angle
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.self_calibration.pass_model import PARAMETERS, linearise, places_of_tags
-from groundsbot.offline.self_calibration.passes import WheelAxis, gather_passes
+from groundsbot.offline.self_calibration.pass_model import PARAMETERS, linearise, tag_positions
+from groundsbot.offline.self_calibration.passes import WheelAxis, find_passes
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_robot, make_run
@@ -183,7 +183,7 @@ def test_sigma_is_what_estimates_err_by() -> None:
 
 
 def test_of_a_long_drive_some_passes_of_all_its_parts_are_worked_out() -> None:
-    passes = gather_passes([position_run(legs=12 * TO_AND_FRO)])
+    passes = find_passes([position_run(legs=12 * TO_AND_FRO)])
     assert passes is not None
     assert len(passes) == 200
     counts = np.bincount(passes.group)
@@ -203,7 +203,7 @@ def test_no_pass_goes_over_a_pause_or_is_read_while_the_robot_stands() -> None:
     run = position_run(legs=(*TO_AND_FRO, (0.0, 0.0, 100.0), *TO_AND_FRO))
     looks_ns = run.positions.stamps_ns
     seen = replace(run, positions=run.positions.where((looks_ns - looks_ns[0]) // S % 9 < 4))  # nothing for 5 s
-    passes = gather_passes([seen])
+    passes = find_passes([seen])
     assert passes is not None
     begins_s = passes.stations_s[passes.first_station]
     lasts_s = np.maximum.reduceat(passes.stations_s, passes.first_station) - begins_s
@@ -222,11 +222,11 @@ def smooth(wheels: WheelAxis) -> WheelAxis:
 
 
 def test_derivatives_are_those_of_residuals() -> None:
-    passes = gather_passes([position_run(0.2, in_camera=True, legs=2 * ROUND)])
+    passes = find_passes([position_run(0.2, in_camera=True, legs=2 * ROUND)])
     assert passes is not None
     passes = replace(passes, wheels=smooth(passes.wheels))
     at = np.array([0.11, 0.02, -0.1, 0.1, -0.2, 0.05, 0.03, 0.04])
-    tags_m = places_of_tags(passes, at)
+    tags_m = tag_positions(passes, at)
     model = linearise(passes, at, tags_m)
     for i in range(len(PARAMETERS)):
         h = np.zeros(len(at))
@@ -246,9 +246,9 @@ def differences(after: FloatArray, before: FloatArray) -> FloatArray:
 
 
 def test_where_readings_put_their_tag_is_where_it_is() -> None:
-    passes = gather_passes([position_run(0.0, in_camera=True)])
+    passes = find_passes([position_run(0.0, in_camera=True)])
     assert passes is not None
     zero = np.zeros(len(PARAMETERS))
-    residual = linearise(passes, zero, places_of_tags(passes, zero)).residual
+    residual = linearise(passes, zero, tag_positions(passes, zero)).residual
     assert residual[:, 0].std() == pytest.approx(0.03, rel=0.2)  # the noise
     assert residual[:, 1].std() == pytest.approx(0.01, rel=0.4)
