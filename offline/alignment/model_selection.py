@@ -157,8 +157,7 @@ def _log_choices(n: int, k: int) -> float:
 
 
 def log_chance_likelihood(places_a: FloatArray, places_b: FloatArray) -> float:
-    """Return the log likelihood of tags at positions (n, 2) under chance, over all transforms
-    as in `_log_marginal_likelihood`.
+    """Return the log likelihood of tags at positions (n, 2) under chance, over all transforms.
 
     With u and v the vectors from the unchanged tag to another in both maps, that tag is off by r^2 = u^2 + v^2 - 2 u v
     cos(phi) at a heading phi, and the mean of log r^2 over all headings is log max(u^2, v^2) (Jensen's formula). No
