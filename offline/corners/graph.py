@@ -75,7 +75,9 @@ def corner_graph(
         odometry=floor.odometry,
         corners=CornerFactors(looks, cameras),
         readings=_readings_where(floor.readings, kept),
-        prior=CalibrationPrior(sigmas),
+        prior=replace(floor.prior, sigma=sigmas, rows=np.pad(floor.prior.rows, ((0, 0), (0, len(of_corners)))))
+        if len(floor.prior.rows)
+        else CalibrationPrior(sigmas),
         measured=floor.measured,
         columns=columns_of(len(state.poses), seen, sigmas),
         anchor=floor.anchor,

@@ -160,6 +160,7 @@ class CornerProblem:
                 axis=1,
             ),
             columns.turns[self.upright.tag],
+            columns.calibration[None, :] if len(self.prior.rows) else np.zeros((0, 1), dtype=np.int64),
             look,
             look[self.pairs].reshape(len(self.pairs), 2 * N_LOOK),
         ]
@@ -204,6 +205,7 @@ class CornerProblem:
             _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,
             _normal(distances.linearise(state, columns), None) if len(distances.distance_m) else _NONE,
             _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
+            joint_prior_normal(self.prior, state) if len(self.prior.rows) else _NONE,
         ]
 
     def _level_observations(self, state: SpatialState, system: FrontalSystem) -> float:
@@ -324,6 +326,12 @@ def prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, 
     residual = prior.residual(state)
     weight = 1.0 / np.where(prior.sigma > 0.0, prior.sigma, 1.0)
     return Normal((weight**2)[:, None, None], weight[:, None] * residual), float((residual**2).sum())
+
+
+def joint_prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, float]:
+    """Normal equations of what is known of several calibration numbers together, and the sum of its squares."""
+    residual = prior.rows @ state.calibration + prior.values
+    return Normal((prior.rows.T @ prior.rows)[None], (prior.rows.T @ residual)[None]), float(residual @ residual)
 
 
 def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:

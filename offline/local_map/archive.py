@@ -9,6 +9,7 @@ the smaller map; and no log is needed.
 import json
 from dataclasses import asdict, astuple, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from groundsbot.offline.measurements import (
     SAME_SIZE_M,
     CovarianceParts,
     Detections,
+    HeadingDifferences,
     Positions,
     Readings,
     Run,
@@ -70,7 +72,30 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
         tags_m=state.tags,
         calibration=state.calibration,
         goodness=np.array(astuple(local_map.goodness), dtype=np.float64),
+        **({} if odometry.differences is None else _archived_differences(odometry.differences)),
     )
+
+
+def _archived_differences(differences: HeadingDifferences) -> dict[str, Any]:
+    return {
+        "gyro_step": differences.step,
+        "gyro_rows": differences.rows,
+        "gyro_values": differences.values,
+        "gyro_walk_rows": differences.walk_rows,
+        "gyro_owner": differences.owner,
+    }
+
+
+def _differences(kept: ArchivedSegment) -> HeadingDifferences | None:
+    if (
+        kept.gyro_step is None
+        or kept.gyro_rows is None
+        or kept.gyro_values is None
+        or kept.gyro_walk_rows is None
+        or kept.gyro_owner is None
+    ):
+        return None
+    return HeadingDifferences(kept.gyro_step, kept.gyro_rows, kept.gyro_values, kept.gyro_walk_rows, kept.gyro_owner)
 
 
 def restore_local_map(kept: ArchivedSegment) -> LocalMap:
@@ -189,7 +214,8 @@ def _segment(kept: ArchivedSegment) -> Segment:
         kept.reading_in_camera,
         distance_m=kept.distance_m,
     )
-    return replace(segment, name=kept.name, warnings=kept.warnings)
+    odometry = replace(segment.odometry, differences=_differences(kept))
+    return replace(segment, name=kept.name, warnings=kept.warnings, odometry=odometry)
 
 
 def check_extendable(known: MapResult) -> None:

@@ -56,6 +56,7 @@ class ArchivedSegment:
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.
         goodness: (5,) the fields of `Goodness`.
+        gyro_step, gyro_rows, gyro_values, gyro_walk_rows, gyro_owner: as `HeadingDifferences`; None without a gyro.
     """
 
     name: str
@@ -89,6 +90,11 @@ class ArchivedSegment:
     tags_m: FloatArray
     calibration: FloatArray
     goodness: FloatArray
+    gyro_step: IntArray | None = None
+    gyro_rows: FloatArray | None = None
+    gyro_values: FloatArray | None = None
+    gyro_walk_rows: FloatArray | None = None
+    gyro_owner: str | None = None
 
 
 def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str, Any]:
@@ -96,6 +102,8 @@ def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str
     arrays: dict[str, Any] = {}
     for each in fields(kept):
         value = getattr(kept, each.name)
+        if value is None:
+            continue
         is_text = isinstance(value, str | tuple)
         arrays[f"{key}{each.name}"] = np.array(value, dtype=np.str_) if is_text else np.asarray(value)
     return arrays
@@ -117,6 +125,8 @@ def _values(kind: type[ArchivedCalibration | ArchivedSegment], arrays: Any, key:
     """Of a dataclass: texts and counts as Python's own, all else as arrays."""
     values: dict[str, Any] = {}
     for each in fields(kind):
+        if each.default is None and f"{key}{each.name}" not in arrays:
+            continue
         array = arrays[f"{key}{each.name}"]
         if array.dtype.kind == "U":
             values[each.name] = str(array) if array.ndim == 0 else tuple(array.tolist())

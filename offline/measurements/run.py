@@ -12,7 +12,7 @@ from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
-from groundsbot.offline.measurements.motion_model.gyro import GyroSamples
+from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_samples
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
@@ -22,6 +22,7 @@ from groundsbot.onboard.log import (
     Allowance,
     CameraCalibration,
     Event,
+    Gyro,
     LogLosses,
     LogMessage,
     PlanarOdometry,
@@ -103,6 +104,7 @@ class _RunMessages:
     calibration: CameraCalibration | None = None
     wheels: list[WheelRow] = field(default_factory=list)
     odometry: list[PlanarOdometry] = field(default_factory=list)
+    gyro: list[tuple[int, float]] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
     readings: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
@@ -115,6 +117,8 @@ class _RunMessages:
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
         elif isinstance(message, TagDetections):
             self._add_detections(message)
+        elif isinstance(message, Gyro):
+            self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))
         elif isinstance(message, PlanarOdometry):
             self.odometry.append(message)
         elif isinstance(message, TagObservations):
@@ -136,7 +140,16 @@ class _RunMessages:
         self.readings.add_detections(message)
 
 
-_TOPICS = ("/run", "/camera/calibration", "/wheels", "/tags/detections", "/odometry", "/tags/observations", "/events")
+_TOPICS = (
+    "/run",
+    "/camera/calibration",
+    "/wheels",
+    "/gyro",
+    "/tags/detections",
+    "/odometry",
+    "/tags/observations",
+    "/events",
+)
 
 
 @dataclass(frozen=True)
@@ -186,6 +199,8 @@ def load_run(
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
+    gyro, of_gyro = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
+    warnings += of_gyro
     collected.readings.check_tags(log)
     read = collected.readings.collect(log_bytes, inputs.n_logs)
     warnings += _not_used(collected, read.every, log_bytes)
@@ -212,6 +227,7 @@ def load_run(
         lost=losses.in_words,
         corners_refined=read.corners_refined,
         events=tuple(sorted(collected.events)),
+        gyro=gyro,
     ).shift_stamps(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
 
 

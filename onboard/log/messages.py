@@ -18,6 +18,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from groundsbot.onboard.groundsbot_pb2 import (
     ClockAnchor,
     Event,
+    Gyro,
     PlanarOdometry,
     RunInfo,
     Severity,
@@ -37,6 +38,7 @@ __all__ = [
     "Event",
     "EventKind",
     "FrameTransform",
+    "Gyro",
     "PlanarOdometry",
     "RunInfo",
     "Severity",
@@ -70,6 +72,7 @@ TOPICS: Final[dict[str, Topic]] = {
         Topic("/camera/calibration", CameraCalibration, None, every_file=True),
         Topic("/tf", FrameTransform, None, every_file=True),
         Topic("/wheels", WheelEncoders, 100.0),
+        Topic("/gyro", Gyro, None),
         Topic("/tags/detections", TagDetections, 15.0),
         Topic("/camera/image", CompressedImage, None),
         Topic("/clock", ClockAnchor, 1.0),

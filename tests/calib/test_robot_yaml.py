@@ -14,6 +14,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.yaml_file import parse_mapping, validate
 from groundsbot.calib.robot.robot_yaml import (
     Devices,
+    Gyro,
     Mount,
     RecorderOptions,
     Robot,
@@ -31,6 +32,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "wheels": Wheels,
     "mount": Mount,
     "tags": TagBatch,
+    "gyro": Gyro,
     "devices": Devices,
     "recorder": RecorderOptions,
 }

@@ -16,6 +16,7 @@ from groundsbot.offline.importing.robot import NOMINAL_TRACK_M, WheelScale
 from groundsbot.offline.measurements import MAX_RANGE_M
 
 MAX_WHEEL_SPEED_M_S: Final = 20.0  # beyond it the unit is wrong, a counter was reset, or a time is
+MAX_YAW_RATE_RAD_S: Final = 50.0  # no robot turns faster; degrees taken for radians would
 _NS_PER_S: Final = 1_000_000_000
 _TIMES: Final = ("t_s", "t_ns")
 _ODOMETRY: Final = (("left_m_s", "right_m_s"), ("left_ticks", "right_ticks"), ("v_m_s", "omega_rad_s"))
@@ -85,6 +86,23 @@ def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
         said = "forward and turning speeds, each the mean since the row before"
     _check_speeds(table, form[0], wheels)
     return wheels, said
+
+
+def read_gyro(path: Path) -> list[tuple[int, float]]:
+    """Read `gyro.csv`: columns t_s (or t_ns) and omega_rad_s, the yaw rate to the left; (stamp in ns, rad/s) by row.
+
+    Raises:
+        OfflineError: a wrong column or value, or time not advancing.
+    """
+    table = read_table(path)
+    unknown = [name for name in table.columns if name not in (*_TIMES, "omega_rad_s")]
+    if unknown or "omega_rad_s" not in table or sum(name in table for name in _TIMES) != 1:
+        raise OfflineError(f"{path} line 1: has the columns {','.join(table.columns)}; use t_s,omega_rad_s (or t_ns)")
+    rates = table.numbers("omega_rad_s")
+    for row, rate in enumerate(rates):
+        if abs(rate) >= MAX_YAW_RATE_RAD_S:
+            table.fail(row, "omega_rad_s", f"must be below {MAX_YAW_RATE_RAD_S:g} rad/s; was it in degrees?")
+    return list(zip(table.stamps_ns(strictly=True), rates, strict=True))
 
 
 def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:

@@ -14,6 +14,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.forms import (
     Observation,
     WheelPath,
+    read_gyro,
     read_observations,
     read_odometry,
     read_paper_landmarks,
@@ -32,10 +33,11 @@ from groundsbot.offline.importing.robot import (
     wheel_scale,
 )
 from groundsbot.offline.importing.run_writer import Entry, ImportReport, check_output, write_run
-from groundsbot.onboard.log import PlanarOdometry, RunInfo, TagObservation, TagObservations
+from groundsbot.onboard.log import Gyro, PlanarOdometry, RunInfo, TagObservation, TagObservations
 
 _HEADER_PAIR: Final = ("odometry.csv", "observations.csv")
 _PAPER_PAIR: Final = ("odom.csv", "landmarks.csv")
+_GYRO: Final = "gyro.csv"  # beside either pair
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class _Drive:
     in_camera: bool
     range_scale_sigma: float
     remarks: list[str]
+    gyro: list[tuple[int, float]]
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportReport:
@@ -101,6 +104,9 @@ def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
         if not (folder / name).is_file():
             raise OfflineError(f"{folder / name}: is missing beside the other file of its pair; add it")
     drive = _paper_drive(folder, options) if pairs[0] == _PAPER_PAIR else _header_drive(folder, options)
+    if (folder / _GYRO).is_file():
+        drive.gyro.extend(read_gyro(folder / _GYRO))
+        drive.remarks.append(f"{_GYRO}: {plural(len(drive.gyro), 'reading')} of the yaw rate")
     outside = _n_outside(drive)
     if outside and outside == len(drive.observations):
         raise OfflineError(
@@ -120,7 +126,7 @@ def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
     in_camera = options.has_mount or options.robot is None
     where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot, and no --camera option)"
     remarks = [f"odometry.csv: {form}", f"observations.csv: taken to be in {where}, y to the left"]
-    return _Drive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks)
+    return _Drive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks, [])
 
 
 def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
@@ -137,7 +143,7 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
         f"odom.csv: the paper's form, {rate_hz:g} states a second",
         "landmarks.csv: the paper's form, in the camera's frame, y turned from right to left",
     ]
-    return _Drive(wheels, n_states, observations, True, TOLD_SIZE_SIGMA, remarks)
+    return _Drive(wheels, n_states, observations, True, TOLD_SIZE_SIGMA, remarks, [])
 
 
 def _n_outside(drive: _Drive) -> int:
@@ -148,7 +154,9 @@ def _n_outside(drive: _Drive) -> int:
 def _messages(drive: _Drive, family: str) -> Iterator[Entry]:
     """(stamp, topic, message) in order of time; at one time the odometry first."""
     frame = "camera_planar" if drive.in_camera else "base"
-    return merge(_odometry(drive.wheels), _observations(drive.observations, frame, family), key=lambda each: each[0])
+    gyro = ((at, "/gyro", Gyro(stamp_ns=at, yaw_rate_rad_s=rate)) for at, rate in drive.gyro)
+    observations = _observations(drive.observations, frame, family)
+    return merge(_odometry(drive.wheels), gyro, observations, key=lambda each: each[0])
 
 
 def _odometry(wheels: WheelPath) -> Iterator[Entry]:

@@ -7,19 +7,25 @@ rest of the walk counts as white noise. Stamps are late by a time offset. A tilt
 scale smaller by 1 - cos(a), and is part of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.robot import Gyro
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
+from groundsbot.calib.robot import Gyro, Robot
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.measurements.plausibility import check_stamps
 
 # Before the nodes of the bias, in the order of the columns.
 GYRO_PARAMETERS: Final = ("gyro_scale", "gyro_time_offset_s")
 GYRO_BIAS: Final = "gyro_bias_rad_s"
 # Where samples are missing for more than so many of their periods, the turn in between is not known.
 _GAP_PERIODS: Final = 3.5
+# No robot turns faster; degrees taken for radians would.
+_FASTEST_RAD_S: Final = 50.0
+_LEAST_SAMPLES: Final = 10
 _LEAST_NODE_S: Final = 10.0
 _MOST_NODES: Final = 16
 _NODE_SHARE: Final = 0.3  # of the white noise's sigma that what walks between nodes may add
@@ -56,6 +62,41 @@ class GyroSamples:
             duration_s=np.diff(times_s),
             is_known=_is_covered(times_s, samples_s, gaps),
         )
+
+
+def gyro_samples(
+    readings: Sequence[tuple[int, float]], robot: Robot, where: str
+) -> tuple[GyroSamples | None, list[str]]:
+    """Return the yaw rates of one log by its robot's file, None where there are too few, and warnings.
+
+    Args:
+        readings: stamp in ns and yaw rate in rad/s of each message, in order.
+        robot: whose gyro's time offset and scale are applied.
+        where: names file and topic in errors.
+
+    Raises:
+        OfflineError: a stamp or a rate is none that a gyro can have given.
+    """
+    if not readings:
+        return None, []
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in readings], dtype=np.int64)
+    rates = np.array([rate for _, rate in readings], dtype=np.float64)
+    check_stamps(stamps_ns, where)
+    wrong = np.flatnonzero(~(np.abs(rates) < _FASTEST_RAD_S))
+    if len(wrong):
+        raise OfflineError(
+            f"{where}: yaw_rate_rad_s is {rates[wrong[0]]:g} in reading {wrong[0] + 1}, must be a number below "
+            f"{_FASTEST_RAD_S:g} rad/s; were degrees recorded?"
+        )
+    later = stamps_ns > np.concatenate([[stamps_ns[0] - 1], np.maximum.accumulate(stamps_ns)[:-1]])
+    warnings = []
+    if not later.all():
+        warnings.append(f"{plural(int((~later).sum()), 'gyro reading')} not later than the one before; left out")
+    if later.sum() < _LEAST_SAMPLES:
+        return None, [*warnings, f"{where} has {int(later.sum())} readings, too few to use; the map is by the wheels"]
+    gyro = robot.gyro or Gyro()
+    late_ns = round(gyro.time_offset_s * 1e9)
+    return GyroSamples(stamps_ns[later] - late_ns, (1.0 + gyro.scale) * rates[later]), warnings
 
 
 @dataclass(frozen=True)

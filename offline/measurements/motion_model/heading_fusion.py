@@ -128,7 +128,7 @@ def fuse(
     )
     by_gyro = np.where(turns.is_known[:, None], turns.jacobian, 0.0)
     known = np.flatnonzero(turns.is_known)
-    jacobian = np.column_stack([-wheels.jacobian[:, 2], by_gyro])
+    jacobian = _difference_jacobian(wheels, turns)
     sigma = np.sqrt(C[known, 2, 2] + variance[known])
     walk_sigma = fit.gyro.bias_walk_rad_s_per_sqrt_s * np.sqrt(np.diff(node_stamps_ns) * 1e-9)
     walk = np.zeros((len(walk_sigma), jacobian.shape[1]))
@@ -216,10 +216,7 @@ def _fit(
     for _ in range(_ROUNDS):
         found = np.asarray(minimize(cost, found, method="L-BFGS-B").x)
         _, calibration = blocks.solve(start * np.exp(found), of_blocks)
-        slipped = _slips(wheels, turns, nodes, start * np.exp(found), calibration, known)
-        if np.array_equal(slipped > 0.0, extra > 0.0):
-            break
-        extra = slipped
+        extra = _slips(wheels, turns, nodes, start * np.exp(found), calibration, known)
         of_blocks[:] = _sum_by_block(block, extra[known], len(of_blocks))
     sigma = np.sqrt(np.diag(np.linalg.pinv(0.5 * _curvature(cost, found))))
     white, walk, *heading = (start * np.exp(found)).tolist()
@@ -242,7 +239,7 @@ def _blocks(
 ) -> _DifferenceBlocks:
     _, block = np.unique(block_of[known], return_inverse=True)
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])[known]
-    jacobian = np.column_stack([-wheels.jacobian[:, 2], turns.jacobian])[known]
+    jacobian = _difference_jacobian(wheels, turns)[known]
     heading = wheels.parts.of(HEADING_NOISE)[:, known, 2, 2]
     other = wheels.parts.rest[known, 2, 2]
     n = int(block.max()) + 1
@@ -256,6 +253,17 @@ def _blocks(
         prior_sigma=np.array([*sigmas, gyro.scale_sigma, gyro.time_offset_s_sigma, gyro.bias_rad_s_sigma]),
         spacing_s=np.diff(nodes) * 1e-9,
     )
+
+
+def _difference_jacobian(wheels: SegmentOdometry, turns: GyroTurns) -> FloatArray:
+    """(M, P) derivative of the differences by WHEEL_PARAMETERS, GYRO_PARAMETERS and the bias.
+
+    The true turn is that of the wheels and noise, so the gyro's turn is regressed on that of the wheels,
+    by its scale too: with a scale times the gyro's own turn, noise would shrink with scale and track together, and the
+    best fit would be a robot that does not turn, wherever the prior of the track is wide.
+    """
+    turn_rad = wheels.motion[:, 2]
+    return np.column_stack([-wheels.jacobian[:, 2], turn_rad, turns.jacobian[:, 1:]])
 
 
 def _sum_by_block(block: IntArray, values: FloatArray, n: int) -> FloatArray:
@@ -273,7 +281,7 @@ def _slips(
     """(M,) rad^2 by which motions differ beyond chance."""
     white, walk, *heading = sigmas.tolist()
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])
-    jacobian = np.column_stack([-wheels.jacobian[:, 2], turns.jacobian])
+    jacobian = _difference_jacobian(wheels, turns)
     rest = difference + jacobian @ calibration
     spacing_s = float(np.diff(nodes).max()) * 1e-9
     variance = (

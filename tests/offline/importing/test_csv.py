@@ -17,6 +17,7 @@ from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.offline.importing.csv.forms import read_odometry
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions, WheelScale
+from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.csv_folders import (
@@ -52,6 +53,17 @@ def test_tags_of_one_time_are_one_message(tmp_path: Path) -> None:
     assert not second.observations[0].cartesian.has_z
     assert list(second.observations[0].covariance) == []
     assert (report.n_observations, report.n_tags) == (3, 2)
+
+
+def test_a_gyro_beside_the_pair_is_in_the_log_and_in_the_run(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * i:.1f},{0.01 * i}\n" for i in range(21))
+    files = {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS, "gyro.csv": f"t_s,omega_rad_s\n{rows}"}
+    report = import_folder(folder_with(tmp_path, files), tmp_path / "logs", TRACK)
+    assert "gyro.csv: 21 readings of the yaw rate" in report.remarks
+    run = load_run(report.run_folder)
+    assert run.gyro is not None
+    np.testing.assert_allclose(run.gyro.yaw_rate_rad_s, 0.01 * np.arange(21))
+    assert run.gyro.stamps_ns.tolist() == [round(1e8 * i) for i in range(21)]
 
 
 def test_the_log_is_in_order_of_time_with_the_run_first(tmp_path: Path) -> None:

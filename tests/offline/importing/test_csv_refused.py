@@ -40,6 +40,16 @@ BAD_ODOMETRY = [
 ]
 
 
+BAD_GYROS = [
+    ("", "gyro.csv: is empty"),
+    ("t_s,omega\n0,0\n", "gyro.csv line 1: has the columns t_s,omega; use t_s,omega_rad_s (or t_ns)"),
+    ("omega_rad_s\n0\n", "gyro.csv line 1: has the columns omega_rad_s; use t_s,omega_rad_s (or t_ns)"),
+    ("t_s,omega_rad_s\n0,0\n1,nan\n", "gyro.csv line 3, column omega_rad_s: 'nan' is not finite"),
+    ("t_s,omega_rad_s\n0,0\n1,90\n", "gyro.csv line 3, column omega_rad_s: '90' must be below 50 rad/s; was it in deg"),
+    ("t_s,omega_rad_s\n1,0\n0.5,0\n", "gyro.csv line 3, column t_s: '0.5' runs backwards after '1'"),
+]
+
+
 @contextmanager
 def refusal(folder: Path, said: str) -> Iterator[None]:
     """One line that says so, and no log."""
@@ -53,6 +63,13 @@ def refusal(folder: Path, said: str) -> Iterator[None]:
 def test_bad_odometry_is_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
     with refusal(tmp_path, said):
         import_run(tmp_path, odometry=text)
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_GYROS)
+def test_a_bad_gyro_is_refused_and_nothing_is_left(tmp_path: Path, text: str, said: str) -> None:
+    folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS, "gyro.csv": text})
+    with refusal(tmp_path, said):
+        import_folder(folder, tmp_path / "logs", TRACK)
 
 
 def test_lines_end_where_csv_ends_them(tmp_path: Path) -> None:

@@ -1,0 +1,77 @@
+"""Maps of drives with a gyro: the heading of a whole drive is known, and a kept map goes on from there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import Truth
+from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.segment import segments_of
+from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.graph import build_graph
+from groundsbot.offline.sam.solver import PLAIN_SQUARES
+from tests.support.data.gyros import SimulatedGyro, gyro_runs
+
+
+@pytest.fixture(scope="module")
+def drives() -> tuple[list[Run], Truth]:
+    """Two drives of nsh with a gyro."""
+    return gyro_runs("nsh", 1, SimulatedGyro())
+
+
+@pytest.fixture(scope="module")
+def mapped(drives: tuple[list[Run], Truth]) -> MapResult:
+    """The map of both."""
+    return build_map(drives[0])
+
+
+def test_tags_are_known_as_they_stand(drives: tuple[list[Run], Truth], mapped: MapResult) -> None:
+    """Without a gyro a typical tag of this floor is off by a metre."""
+    errors = evaluate(mapped, drives[1]).components[0]
+    assert len(mapped.components) == 1
+    assert errors.tags_rmse_m is not None
+    assert errors.tags_rmse_m < 0.4
+    assert errors.nees_tags_per_dim is not None
+    assert 0.3 < errors.nees_tags_per_dim < 2.0
+    names = {each.name for each in mapped.calibration}
+    assert {"gyro_scale", "gyro_time_offset_s", "gyro_bias_rad_s_0"} <= names
+
+
+def test_the_joint_factor_of_the_calibration_has_the_gradient_of_its_cost(drives: tuple[list[Run], Truth]) -> None:
+    (segment,) = segments_of(drives[0][0], NoiseParameters())
+    problem = build_graph([segment]).problem
+    state = solve_local_map(segment).solution.state
+    state = State(state.poses, state.tags, state.calibration + 1e-4)
+    system, cost = problem.arrowhead.linearise(state)
+    assert cost == pytest.approx(problem.cost(state, PLAIN_SQUARES), rel=1e-9)
+    free = np.flatnonzero(problem.columns.calibration >= 0)
+    for k, index in enumerate(free):
+        step = np.zeros(len(state.calibration))
+        step[index] = 1e-7
+        up, down = (
+            problem.cost(State(state.poses, state.tags, state.calibration + sign * step), PLAIN_SQUARES)
+            for sign in (1.0, -1.0)
+        )
+        gradient = system.gradient[len(system.gradient) - len(free) + k]
+        assert gradient == pytest.approx((up - down) / 2e-7, rel=2e-3, abs=2e-2)
+
+
+def test_a_kept_map_is_extended_as_if_all_drives_were_mapped_at_once(
+    drives: tuple[list[Run], Truth], mapped: MapResult, tmp_path: Path
+) -> None:
+    runs, _ = drives
+    write_map(build_map(runs[:1]), tmp_path)
+    extended = build_map(runs[1:], extending=read_map(tmp_path))
+    (one,), (whole,) = extended.components, mapped.components
+    assert {tag.tag_id for tag in one.tags} == {tag.tag_id for tag in whole.tags}
+    found = {tag.tag_id: tag for tag in one.tags}
+    for tag in whole.tags:
+        sigma_m = float(np.sqrt(np.trace(tag.covariance)))
+        assert np.hypot(*(found[tag.tag_id].position_m - tag.position_m)) < sigma_m
