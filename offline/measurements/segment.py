@@ -135,7 +135,7 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
         gyro_fit=fused[1] if fused else None,
         tags=tuple(run.tags[i] for i in seen),
         readings=replace(readings, tag=tag),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *(fused[1].slip_warnings if fused else ())),
     )
 
 

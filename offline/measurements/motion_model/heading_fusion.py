@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from scipy.optimize import minimize
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Gyro, NoiseParameters
 from groundsbot.offline.measurements.motion_model.gyro import (
@@ -32,6 +32,7 @@ HEADING_NOISE: Final = ("sigma_heading_rad_per_sqrt_m", "sigma_heading_rad_per_s
 _BLOCK_S: Final = 0.5
 # Beyond so many sigmas wheels have slipped: once in 15,000 motions by chance.
 _SLIP_SIGMAS: Final = 4.0
+_TOLD_SLIP_RAD: Final = np.radians(2.0)
 _ROUNDS: Final = 3
 # How far off a data sheet may be, as a factor at one sigma; of the wheels nobody knows it better than that.
 _FACTOR_GYRO: Final = 3.0
@@ -53,6 +54,20 @@ class GyroFit:
     heading_sigmas: FloatArray
     interval: FloatArray
     extra_variance: FloatArray
+
+    @property
+    def slip_warnings(self) -> list[str]:
+        """Say where wheels slipped by so much that it matters to whoever drives; nothing where they did not."""
+        slips_rad = np.sqrt(self.extra_variance)
+        largest_rad = float(slips_rad.max(initial=0.0))
+        if largest_rad < _TOLD_SLIP_RAD:
+            return []
+        n = int((slips_rad >= _TOLD_SLIP_RAD).sum())
+        motions, most_deg = plural(n, "motion"), np.degrees(largest_rad)
+        sentence = (
+            f"the wheels slipped in {motions}: they turned by up to {most_deg:.0f} degrees otherwise than the gyro"
+        )
+        return [f"{sentence}, whose heading counts there"]
 
 
 def with_gyro(

@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.local_map.local_map import solve_local_map
+from groundsbot.offline.localization.localization import localize
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
@@ -61,6 +63,17 @@ def test_the_joint_factor_of_the_calibration_has_the_gradient_of_its_cost(drives
         )
         gradient = system.gradient[len(system.gradient) - len(free) + k]
         assert gradient == pytest.approx((up - down) / 2e-7, rel=2e-3, abs=2e-2)
+
+
+def test_a_drive_is_localized_in_a_kept_map(drives: tuple[list[Run], Truth], mapped: MapResult, tmp_path: Path) -> None:
+    runs, _ = drives
+    write_map(build_map(runs[:1]), tmp_path)
+    found = localize(runs[1], read_map(tmp_path))
+    (located,) = found.runs
+    first, second = (next(each for each in mapped.runs if each.run == run.name) for run in runs)
+    there = se2.between(first.T_map_start, second.T_map_start)
+    sigma_m = float(np.sqrt(np.trace(located.covariance[0, :2, :2])))
+    assert np.hypot(*(located.T_map_base[0] - there)[:2]) < 3.0 * sigma_m
 
 
 def test_a_kept_map_is_extended_as_if_all_drives_were_mapped_at_once(

@@ -1,5 +1,6 @@
 """A gyro's yaw rate: integrated, fused with the wheels, and what both say of each other's calibration."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -134,6 +135,9 @@ def test_wheels_that_slip_are_heard_less() -> None:
     assert keyframes_ns[step] <= wheels.stamps_ns[3000] <= keyframes_ns[step + 1]
     true = np.diff(np.interp(keyframes_ns, wheels.stamps_ns, np.cumsum(rate) / RATE_HZ))
     assert both.motion[step, 2] == pytest.approx(true[step], abs=0.01)
+    (sentence,) = fit.slip_warnings
+    assert re.match(r"the wheels slipped in 1 motion: they turned by up to 1[12] degrees otherwise", sentence)
+    assert fuse_drive(0)[2].slip_warnings == []
 
 
 def test_parts_keep_the_differences_of_their_motions() -> None:
