@@ -1,7 +1,6 @@
 from .coarse_segment import coarse_keyframes, coarsen, refine_poses, telling_keyframes
 from .covariance_components import CovarianceParts
-from .motion_model.gyro import GyroSamples, HeadingDifferences
-from .motion_model.heading_fusion import GyroFit
+from .motion_model.gyro import HeadingDifferences
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
@@ -38,8 +37,6 @@ __all__ = [
     "UNMODELLED_SIGMA_M",
     "CovarianceParts",
     "Detections",
-    "GyroFit",
-    "GyroSamples",
     "HeadingDifferences",
     "MeasuredDistance",
     "MeasuredStart",
