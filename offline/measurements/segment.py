@@ -12,7 +12,7 @@ from groundsbot.offline.measurements.keyframes import (
     keyframe_at,
     tags_at_candidates,
 )
-from groundsbot.offline.measurements.motion_model.heading_fusion import GyroFit, with_gyro
+from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, GyroFit, with_gyro
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.readings import Readings, concatenate_observations
@@ -118,24 +118,19 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
     seen, tag = np.unique(readings.tag, return_inverse=True)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
-    fused = run.gyro and with_gyro(
-        odometry,
-        run.gyro,
-        keyframe_stamps_ns,
-        run.robot.gyro or Gyro(),
-        np.array(run.robot.wheels.relative_sigmas),
-        noise,
-        name,
-    )
+    fused = FusedOdometry(odometry, None, [])
+    if run.gyro is not None:
+        gyro, sigmas = run.robot.gyro or Gyro(), np.array(run.robot.wheels.relative_sigmas)
+        fused = with_gyro(odometry, run.gyro, keyframe_stamps_ns, gyro, sigmas, noise, name)
     return Segment(
         name=name,
         run=run,
         stamps_ns=keyframe_stamps_ns,
-        odometry=fused[0] if fused else odometry,
-        gyro_fit=fused[1] if fused else None,
+        odometry=fused.odometry,
+        gyro_fit=fused.fit,
         tags=tuple(run.tags[i] for i in seen),
         readings=replace(readings, tag=tag),
-        warnings=(*warnings, *(fused[1].slip_warnings if fused else ())),
+        warnings=(*warnings, *fused.warnings),
     )
 
 

@@ -26,6 +26,7 @@ _GAP_PERIODS: Final = 3.5
 # No robot turns faster; degrees taken for radians would.
 _FASTEST_RAD_S: Final = 50.0
 _LEAST_SAMPLES: Final = 10
+_FROZEN_NS: Final = 1_000_000_000
 _LEAST_NODE_S: Final = 10.0
 _MOST_NODES: Final = 16
 _NODE_SHARE: Final = 0.3  # of the white noise's sigma that what walks between nodes may add
@@ -92,11 +93,23 @@ def gyro_samples(
     warnings = []
     if not later.all():
         warnings.append(f"{plural(int((~later).sum()), 'gyro reading')} not later than the one before; left out")
-    if later.sum() < _LEAST_SAMPLES:
-        return None, [*warnings, f"{where} has {int(later.sum())} readings, too few to use; the map is by the wheels"]
+    stamps_ns, rates = stamps_ns[later], rates[later]
+    frozen = _is_frozen(stamps_ns, rates)
+    if frozen.any():
+        warnings.append(f"{plural(int(frozen.sum()), 'gyro reading')} of one value for a second or longer; left out")
+        stamps_ns, rates = stamps_ns[~frozen], rates[~frozen]
+    if len(rates) < _LEAST_SAMPLES:
+        return None, [*warnings, f"{where} has {len(rates)} readings, too few to use; the map is by the wheels"]
     gyro = robot.gyro or Gyro()
     late_ns = round(gyro.time_offset_s * 1e9)
-    return GyroSamples(stamps_ns[later] - late_ns, (1.0 + gyro.scale) * rates[later]), warnings
+    return GyroSamples(stamps_ns - late_ns, (1.0 + gyro.scale) * rates), warnings
+
+
+def _is_frozen(stamps_ns: IntArray, rates: FloatArray) -> BoolArray:
+    """(N,) readings that repeat one value for `_FROZEN_NS` or longer, as no gyro with noise does."""
+    run = np.cumsum(np.diff(rates, prepend=np.nan) != 0.0) - 1
+    first, last = np.flatnonzero(np.diff(run, prepend=-1)), np.flatnonzero(np.diff(run, append=run[-1] + 1))
+    return np.asarray((stamps_ns[last] - stamps_ns[first] >= _FROZEN_NS)[run])
 
 
 @dataclass(frozen=True)

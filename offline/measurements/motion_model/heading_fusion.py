@@ -10,7 +10,7 @@ Kirubarajan, "Estimation with applications to tracking and navigation", 2001, se
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -34,6 +34,12 @@ _BLOCK_S: Final = 0.5
 _SLIP_SIGMAS: Final = 4.0
 _TOLD_SLIP_RAD: Final = np.radians(2.0)
 _ROUNDS: Final = 3
+# Sigmas are looked for up to a thousand times from where they are expected.
+_MOST_LOG: Final = float(np.log(1e3))
+# A gyro that turns less or more than this share of what the wheels do has another axis, sign or unit; tracked robots
+# turn half as far as their wheels say.
+_RATIOS: Final = (0.3, 3.0)
+_TURNS_RAD: Final = 1.0  # of root-sum-square over half seconds, for the ratio to mean anything
 # How far off a data sheet may be, as a factor at one sigma; of the wheels nobody knows it better than that.
 _FACTOR_GYRO: Final = 3.0
 _FACTOR_WHEELS: Final = 30.0
@@ -70,6 +76,14 @@ class GyroFit:
         return [f"{sentence}, whose heading counts there"]
 
 
+class FusedOdometry(NamedTuple):
+    """Motions with the gyro where it is of use, the fit of its noise, and warnings."""
+
+    odometry: SegmentOdometry
+    fit: GyroFit | None
+    warnings: list[str]
+
+
 def with_gyro(
     wheels: SegmentOdometry,
     samples: GyroSamples,
@@ -78,7 +92,7 @@ def with_gyro(
     sigmas: FloatArray,
     noise: NoiseParameters,
     owner: str,
-) -> tuple[SegmentOdometry, GyroFit] | None:
+) -> FusedOdometry:
     """Fuse the motions of a segment with its gyro, under the noise that their differences show.
 
     Args:
@@ -91,16 +105,33 @@ def with_gyro(
         owner: of the bias.
 
     Returns:
-        None where the gyro covers no motion.
+        The motions by the wheels, and no fit, where the gyro covers none of them or turns unlike the robot.
     """
     nodes = bias_nodes(int(stamps_ns[0]), int(stamps_ns[-1]), gyro)
     turns = samples.turns(stamps_ns, nodes)
     if not turns.is_known.any():
-        return None
+        return FusedOdometry(wheels, None, [])
+    ratio = turn_ratio(wheels, turns)
+    if ratio is not None and not _RATIOS[0] < ratio < _RATIOS[1]:
+        sentence = f"the gyro turns {ratio:.2f} times as far as the wheels: another axis, sign or unit? It is left out"
+        return FusedOdometry(wheels, None, [sentence])
     fit = _fit(wheels, turns, gyro, nodes, sigmas, noise)
     own = noise.model_copy(update=dict(zip(HEADING_NOISE, fit.heading_sigmas.tolist(), strict=True)))
     nodes = bias_nodes(int(stamps_ns[0]), int(stamps_ns[-1]), fit.gyro)
-    return fuse(wheels.with_noise(own), samples.turns(stamps_ns, nodes), nodes, fit, own, owner), fit
+    fused = fuse(wheels.with_noise(own), samples.turns(stamps_ns, nodes), nodes, fit, own, owner)
+    return FusedOdometry(fused, fit, fit.slip_warnings)
+
+
+def turn_ratio(wheels: SegmentOdometry, turns: GyroTurns) -> float | None:
+    """Return the regression of the gyro's turns on those of the wheels; None where these turn too little."""
+    known = np.flatnonzero(turns.is_known)
+    _, block = np.unique(np.floor(np.cumsum(turns.duration_s) / _BLOCK_S)[known], return_inverse=True)
+    n = int(block.max(initial=-1)) + 1
+    duration_s = _sum_by_block(block, turns.duration_s[known], n)
+    rates = [_sum_by_block(block, each[known], n) / duration_s for each in (wheels.motion[:, 2], turns.turn_rad)]
+    by_wheels, by_gyro = ((rate - np.median(rate)) * duration_s for rate in rates)
+    square = float(by_wheels @ by_wheels)
+    return float(by_wheels @ by_gyro) / square if square > _TURNS_RAD**2 else None
 
 
 def fuse(
@@ -229,7 +260,7 @@ def _fit(
         return blocks.solve(start * np.exp(logs), of_blocks)[0] + float(((logs / width) ** 2).sum())
 
     for _ in range(_ROUNDS):
-        found = np.asarray(minimize(cost, found, method="L-BFGS-B").x)
+        found = np.asarray(minimize(cost, found, method="L-BFGS-B", bounds=[(-_MOST_LOG, _MOST_LOG)] * 4).x)
         _, calibration = blocks.solve(start * np.exp(found), of_blocks)
         extra = _slips(wheels, turns, nodes, start * np.exp(found), calibration, known)
         of_blocks[:] = _sum_by_block(block, extra[known], len(of_blocks))

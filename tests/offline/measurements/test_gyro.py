@@ -52,9 +52,9 @@ def fuse_drive(
     odometry = compose_odometry(wheels, keyframes_ns, TRACK_M * (1.0 + track_scale), NoiseParameters())
     samples = samples_of(rate, rng, bias, scale)
     fused = with_gyro(odometry, samples, keyframes_ns, Gyro(), sigmas, NoiseParameters(), "a")
-    assert fused is not None
+    assert fused.fit is not None
     heading = np.interp(keyframes_ns, samples.stamps_ns, np.cumsum(rate) / RATE_HZ)
-    return odometry, *fused, np.diff(heading)
+    return odometry, fused.odometry, fused.fit, np.diff(heading)
 
 
 def likeliest(odometry: SegmentOdometry, sigmas: FloatArray) -> FloatArray:
@@ -129,15 +129,44 @@ def test_wheels_that_slip_are_heard_less() -> None:
     slipped[3000:] += 0.1
     odometry = compose_odometry(replace(wheels, right_m=slipped), keyframes_ns, TRACK_M, NoiseParameters())
     fused = with_gyro(odometry, samples_of(rate, rng), keyframes_ns, Gyro(), SIGMAS, NoiseParameters(), "a")
-    assert fused is not None
-    both, fit = fused
+    both, fit, _ = fused
+    assert fit is not None
     (step,) = np.flatnonzero(fit.extra_variance > 0.05**2)
     assert keyframes_ns[step] <= wheels.stamps_ns[3000] <= keyframes_ns[step + 1]
     true = np.diff(np.interp(keyframes_ns, wheels.stamps_ns, np.cumsum(rate) / RATE_HZ))
     assert both.motion[step, 2] == pytest.approx(true[step], abs=0.01)
-    (sentence,) = fit.slip_warnings
+    (sentence,) = fused.warnings
     assert re.match(r"the wheels slipped in 1 motion: they turned by up to 1[12] degrees otherwise", sentence)
     assert fuse_drive(0)[2].slip_warnings == []
+
+
+@pytest.mark.parametrize("times", [-1.0, 57.3, 0.1])
+def test_a_gyro_of_another_sign_axis_or_unit_is_left_out(times: float) -> None:
+    rng = np.random.default_rng(0)
+    wheels, rate, keyframes_ns = weaving(rng)
+    odometry = compose_odometry(wheels, keyframes_ns, TRACK_M, NoiseParameters())
+    samples = samples_of(times * rate, rng, bias=0.02)
+    found = with_gyro(odometry, samples, keyframes_ns, Gyro(), SIGMAS, NoiseParameters(), "a")
+    assert found.odometry is odometry
+    assert found.fit is None
+    assert re.match(
+        r"the gyro turns -?[\d.]+ times as far as the wheels: another axis, sign or unit\?", found.warnings[0]
+    )
+
+
+def test_a_track_half_as_wide_as_it_acts_is_no_reason_to_doubt_the_gyro() -> None:
+    assert fuse_drive(0, track_scale=-0.45, sigmas=np.array([0.05, 0.02, 0.3]))[2].gyro.noise_rad_per_sqrt_s > 0.0
+
+
+def test_a_frozen_gyro_is_left_out_while_it_is() -> None:
+    rng = np.random.default_rng(0)
+    rates = 0.1 * rng.standard_normal(600)
+    rates[200:400] = 0.3
+    readings = [(i * S // 100, float(rate)) for i, rate in enumerate(rates)]
+    samples, warnings = gyro_samples(readings, make_robot("a"), "log: /gyro")
+    assert samples is not None
+    assert len(samples.stamps_ns) == 400
+    assert warnings == ["200 gyro readings of one value for a second or longer; left out"]
 
 
 def test_parts_keep_the_differences_of_their_motions() -> None:
@@ -158,16 +187,16 @@ def test_nodes_of_the_bias_lie_closer_the_more_it_walks() -> None:
 
 def test_a_file_corrects_scale_and_stamps() -> None:
     robot = make_robot("a").model_copy(update={"gyro": Gyro(scale=0.1, time_offset_s=0.5)})
-    samples, warnings = gyro_samples([(i * S, 1.0) for i in range(1, 20)], robot, "log: /gyro")
+    samples, warnings = gyro_samples([(i * S, 1.0 + i) for i in range(1, 20)], robot, "log: /gyro")
     assert samples is not None
     assert warnings == []
     assert samples.stamps_ns[0] == S // 2
-    np.testing.assert_allclose(samples.yaw_rate_rad_s, 1.1)
+    np.testing.assert_allclose(samples.yaw_rate_rad_s, 1.1 * (1.0 + np.arange(1, 20)))
 
 
 @pytest.mark.parametrize("rate", [60.0, float("nan"), float("inf")])
 def test_rates_that_no_robot_turns_at_are_refused(rate: float) -> None:
-    readings = [(i * S, rate if i == 5 else 0.1) for i in range(20)]
+    readings = [(i * S, rate if i == 5 else 0.1 * i) for i in range(20)]
     with pytest.raises(OfflineError, match=r"/gyro: yaw_rate_rad_s is .* in reading 6, must be a number below 50"):
         gyro_samples(readings, make_robot("a"), "log: /gyro")
 
@@ -175,9 +204,9 @@ def test_rates_that_no_robot_turns_at_are_refused(rate: float) -> None:
 def test_too_few_readings_and_readings_out_of_order_are_said() -> None:
     robot: Robot = make_robot("a")
     assert gyro_samples([], robot, "log: /gyro") == (None, [])
-    samples, warnings = gyro_samples([(i * S, 0.0) for i in range(3)], robot, "log: /gyro")
+    samples, warnings = gyro_samples([(i * S, 0.1 * i) for i in range(3)], robot, "log: /gyro")
     assert samples is None
     assert "3 readings, too few" in warnings[0]
-    samples, warnings = gyro_samples([(i * S, 0.0) for i in [*range(20), 4, 5]], robot, "log: /gyro")
+    samples, warnings = gyro_samples([(i * S, 0.1 * i) for i in [*range(20), 4, 5]], robot, "log: /gyro")
     assert samples is not None
     assert warnings == ["2 gyro readings not later than the one before; left out"]
