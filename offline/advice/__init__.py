@@ -1,6 +1,6 @@
-"""Where one more pass or one more tag would help a map most.
+"""The additional drive or tag that would reduce the uncertainty of a map most.
 
-In: a solved graph. Out: candidates with what each would do to the worst tag. The paper has no such block.
+In: a solved graph. Out: candidates, each with the predicted sigma of the worst tag. The paper has no such block.
 """
 
 from lazy_loader import attach_stub

@@ -1,8 +1,9 @@
-"""Where one more drive, or one more tag, would help a map most: candidates judged by what they do to its worst tag.
+"""Advice on what to record next: candidates ranked by the largest tag sigma that they would leave.
 
-The figure is the largest sigma of any tag, along its worst direction, as it would be with the candidate's measurements
-too: worked out from the solved map's joint covariance, without another solve (`information_gain`). A candidate of each
-kind is told, the best first: a pass (`passes`), and a tag that the same drives would have read (`new_tags`).
+The criterion is the largest sigma of any tag along its worst direction, predicted with the candidate's measurements
+added. It follows from the joint covariance of the solved map, without another solve (`information_gain`). The best
+candidate of each kind is reported: a drive to repeat (`passes`), and a new tag that the same drives would have observed
+(`new_tags`).
 """
 
 from collections.abc import Sequence
@@ -29,12 +30,12 @@ from groundsbot.offline.maps import AdviceResult
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import MAX_RELATIVE_ERROR, Graph, Solution, State
 
-# Corners of a way are enough to draw it.
+# Enough points to draw a path.
 _MOST_POINTS: Final = 40
 
 
 class Candidates(NamedTuple):
-    """What could be done, and what that is judged by."""
+    """Candidates, and the statistics that they are judged by."""
 
     passages: list[TagPassage]
     drives: DrivePaths
@@ -44,7 +45,7 @@ class Candidates(NamedTuple):
 
 
 class RatedCandidate(NamedTuple):
-    """A candidate and (T,) the tags' sigmas, now and then."""
+    """A candidate with the tags' sigmas (T,), now and predicted."""
 
     kind: str
     candidate: Pass | TagSite
@@ -53,7 +54,7 @@ class RatedCandidate(NamedTuple):
 
 
 def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResult]:
-    """The best pass and the best tag for one component, the better one first; none where covariances mean nothing.
+    """Return the best drive to repeat and the best new tag, the better first; none if covariances are unreliable.
 
     Args:
         graph: of the component.
@@ -67,11 +68,11 @@ def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResul
 
 
 def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
-    """The best pass and the best tag, as far as there are any, the better one first."""
+    """Return the best drive to repeat and the best new tag, as far as there are candidates, the better one first."""
     _, drives, view, passes, places = candidates_of(graph, solution.state)
     gains: list[tuple[str, Pass | TagSite, InformationGain]] = []
     for each in passes:
-        with suppress(LinAlgError):  # a pass that rounding leaves untied tells nothing
+        with suppress(LinAlgError):  # rounding left its poses unobservable
             gains.append(("pass", each, gain_of_pass(graph, solution.state, each)))
     gains += [("tag", each, gain_of_place(drives, view, each)) for each in places]
     known = joint_covariance_of(solution, [gain for _, _, gain in gains])
@@ -88,7 +89,7 @@ def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
 
 
 def candidates_of(graph: Graph, state: State) -> Candidates:
-    """For a component with readings."""
+    """Return all candidates for a component; it must have observations."""
     ways = ways_m(graph)
     sightings = passages_of(graph, ways)
     drives = drives_of(graph, state, ways)
@@ -97,7 +98,7 @@ def candidates_of(graph: Graph, state: State) -> Candidates:
 
 
 def joint_covariance_of(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:
-    """The joint covariance of all tags and of whatever else the gains are about."""
+    """Return the joint covariance of all tags and of the other columns that the gains refer to."""
     tags = solution.problem.columns.tags.reshape(-1)
     others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
     columns: IntArray = np.concatenate([tags, others])

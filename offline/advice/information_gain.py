@@ -1,13 +1,13 @@
-"""What more measurements would do to the covariances of a solved map: a low-rank update each, and no solve.
+"""Covariances of a solved map with hypothetical measurements added: a low-rank update each, without a solve.
 
-Measurements with variables of their own (the poses of a drive not yet driven, a tag not yet hung) are condensed to what
-they say of the variables that the map has: the Schur complement S = W W^T of their normal equations. Under them the
-covariance P becomes
+Variables that only the new measurements have (the poses of a future drive, a tag not yet mounted) are marginalised: the
+Schur complement of the normal equations gives their information S = W W^T on the variables of the map. It changes the
+covariance P into
 
     P' = P - P W (I + W^T P W)^-1 W^T P,
 
-of which only the 2x2 blocks of the tags are worked out. Davison, "Active search for real-time vision" (2005), and Ila,
-Porta and Andrade-Cetto, "Information-based compact pose SLAM" (2010), choose measurements by what they tell.
+of which only the 2x2 blocks of the tags are computed. Davison, "Active search for real-time vision" (2005), and Ila,
+Porta and Andrade-Cetto, "Information-based compact pose SLAM" (2010), select measurements by such information gain.
 """
 
 from typing import Final, NamedTuple
@@ -18,28 +18,28 @@ from scipy import linalg, sparse
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam import Linearised, stack
 
-# Directions of an information matrix that tell this much less than the best one are rounding.
+# Eigenvalues of an information matrix below this share of the largest are rounding errors.
 _LEAST_SHARE: Final = 1e-10
-# An own pose is tied to the one before it and the one after: three numbers each.
+# Half bandwidth: each new pose has factors with the one before it and the one after, of three parameters each.
 _BAND: Final = 5
 
 
 class InformationGain(NamedTuple):
-    """What measurements not yet made would tell: information W W^T about some columns of the tangent space."""
+    """Information W W^T of hypothetical measurements on some columns of the tangent space."""
 
     columns: IntArray  # (k,)
     root: FloatArray  # (k, r) W
 
 
 class JointCovariance(NamedTuple):
-    """What a map knows: the joint covariance of some columns of its tangent space, those of its tags first."""
+    """Joint covariance of some columns of a map's tangent space, those of its tags first."""
 
     columns: IntArray  # (n,) of the T tags first
     covariance: FloatArray  # (n, n)
     n_tags: int
 
     def of(self, columns: IntArray) -> FloatArray:
-        """(k, k) of some of the columns; 0 where held (-1)."""
+        """Return the covariance (k, k) of some of the columns; 0 for fixed ones (-1)."""
         own = self._rows(columns)
         joint = self.covariance[np.ix_(own, own)]
         held = columns < 0
@@ -47,12 +47,12 @@ class JointCovariance(NamedTuple):
         return joint
 
     def sigmas_m(self) -> FloatArray:
-        """(T,) of each tag along its worst direction."""
+        """Return the sigma (T,) of each tag along its worst direction."""
         diagonal = self._blocks(np.zeros((0, 2 * self.n_tags)))
         return _largest_sigmas(*diagonal)
 
     def sigmas_with_m(self, gain: InformationGain) -> FloatArray:
-        """(T,) as `sigmas_m`, were these measurements made too."""
+        """Return `sigmas_m` as predicted with these measurements added, (T,)."""
         own = self._rows(gain.columns)
         told = self.covariance[:, own] @ gain.root
         square = np.eye(gain.root.shape[1]) + gain.root.T @ told[own]
@@ -61,12 +61,12 @@ class JointCovariance(NamedTuple):
         return _largest_sigmas(*self._blocks(taken))
 
     def _rows(self, columns: IntArray) -> IntArray:
-        """(k,) where columns are; anywhere for those that are held."""
+        """Return the row (k,) of each column; an arbitrary one for fixed columns."""
         order = np.argsort(self.columns)
         return np.asarray(order[np.searchsorted(self.columns[order], np.maximum(columns, self.columns.min()))])
 
     def _blocks(self, taken: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(T,) xx, xy and yy of each tag, less the squares of the columns of `taken` (r, 2 T)."""
+        """Return xx, xy and yy (T,) of each tag, less the squares of the columns of `taken` (r, 2 T)."""
         n = 2 * self.n_tags
         diagonal = self.covariance.diagonal()[:n] - (taken**2).sum(axis=0)
         mixed = self.covariance.diagonal(1)[:n:2][: self.n_tags] - (taken[:, ::2] * taken[:, 1::2]).sum(axis=0)
@@ -74,18 +74,18 @@ class JointCovariance(NamedTuple):
 
 
 def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> InformationGain:
-    """What measurements tell of the map's columns when their own variables have given way.
+    """Return the information that measurements have on the map's columns once their own variables are marginalised.
 
-    Own variables must be tied down where the map's are known; nothing may be added here to help that, which would hold
-    the map in place.
+    The own variables must be observable given those of the map. No prior may be added here to make them so, as it would
+    constrain the map.
 
     Args:
         kinds: linearised, their columns being the own variables, 0 to n_own - 1, then those of the map in order.
-        n_own: how many; each is tied to at most _BAND on either side.
+        n_own: number of own variables; factors couple each to at most _BAND on either side.
         columns: (k,) of the map.
 
     Raises:
-        LinAlgError: own variables are not tied down.
+        LinAlgError: own variables are not observable.
     """
     jacobian, _ = stack(kinds, n_own + len(columns))
     normal = sparse.coo_array(jacobian.T @ jacobian)
@@ -102,6 +102,6 @@ def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: Int
 
 
 def _largest_sigmas(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
-    """Roots of the larger eigenvalues of symmetric 2x2 matrices."""
+    """Return the square roots of the larger eigenvalues of symmetric 2x2 matrices."""
     largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
     return np.sqrt(np.maximum(largest, 0.0))

@@ -1,8 +1,8 @@
-"""Tags that could be hung up: places beside the way, and what the same drives would have told had a tag been there.
+"""Candidate sites for new tags beside the driven paths, and what the same drives would have observed of a tag there.
 
-Where walls are is not known. So a place lies as far from the way as a tag of the map is seen from, ahead to the left or
-to the right, and faces the robot there; it is read from where the robots' cameras have it in view as they have the
-tags of the map.
+The positions of walls are unknown. So a site lies as far from the path as the map's tags are typically observed from,
+ahead to the left or to the right, and faces the robot there. It counts as observed from every pose where the robots'
+cameras would have it in view as they have the tags of the map.
 """
 
 from collections.abc import Iterator
@@ -19,53 +19,53 @@ from groundsbot.offline.advice.passes import SIGHTING_GAP_M
 from groundsbot.offline.sam import Columns, Graph, ReadingFactors, State
 
 MOST_TAGS: Final = 18
-# Places along the way from which these are chosen, and keyframes among which their viewers are sought.
+# Sites along the paths from which these are chosen, and keyframes that are checked for a view of them.
 _MOST_PLACES: Final = 160
 _MOST_VIEWERS: Final = 20_000
 _LEAST_SPACING_M: Final = 1.0
-# A tag printed on a wall is not read from farther to its side.
+# A tag on a wall is not detected at a larger angle to its normal.
 MOST_SLANT_RAD: Final = np.radians(65.0)
-# Readings of one passing by share most of what they tell: some stand for all, so far along it.
+# Observations of one track share most of their information: those at these fractions of it stand for all.
 _WITHIN_SIGHTING: Final = np.array([0.25, 0.75])
 _MOST_SIGHTINGS: Final = 3
 _NEAREST_IN_RANGE: Final = 9
 
 
 class TagViews(NamedTuple):
-    """How the tags of a map were seen, about the sensor."""
+    """Where the tags of a map were observed, relative to the sensor, and with which variance."""
 
     near_m: float
     far_m: float
     half_angle_rad: float
     typical_m: float
     typical_rad: float
-    n_a_passage: float  # readings
-    range_m: FloatArray  # (M,) of all readings, rising
+    n_a_passage: float  # observations
+    range_m: FloatArray  # (M,) of all observations, ascending
     variance: FloatArray  # (M, 2) of range and bearing
 
 
 class TagSite(NamedTuple):
-    """Where a tag could hang, and the poses that would read it: some for each passing by."""
+    """Candidate position of a tag, and the poses that would observe it: some for each track."""
 
     segment: int
-    keyframe: int  # beside which it lies
+    keyframe: int  # the one that it lies beside
     position_m: FloatArray  # (2,)
     viewers: IntArray  # (k,) poses
     n_passages: int
 
 
 class DrivePaths(NamedTuple):
-    """What the places are laid along and seen from."""
+    """The driven paths along which sites are placed and from which they are observed."""
 
     graph: Graph
     state: State
     ways: list[FloatArray]
-    sensors: FloatArray  # (P, 3) where what reads the tags is at each pose, in map
-    example: IntArray  # (P,) a reading of the same segment; -1 where it has none
+    sensors: FloatArray  # (P, 3) pose of the tag sensor at each keyframe, in map
+    example: IntArray  # (P,) index of an observation of the same segment; -1 if it has none
 
 
 def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
-    """Of a solved component."""
+    """Return the driven paths of a solved component."""
     mounts = [segment.T_base_camera if segment.readings.in_camera.any() else np.zeros(3) for segment in graph.segments]
     lengths = [len(segment.stamps_ns) for segment in graph.segments]
     sensors = se2.compose(state.poses, np.repeat(np.array(mounts), lengths, axis=0))
@@ -75,7 +75,7 @@ def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
 
 
 def view_of(drives: DrivePaths, n_sightings: int) -> TagViews:
-    """How the readings of a map came about; there must be some."""
+    """Return statistics of the observations of a map; there must be some."""
     readings = drives.graph.problem.readings
     sight = se2.apply(se2.inverse(drives.sensors[readings.pose]), drives.state.tags[readings.tag])
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
@@ -93,10 +93,10 @@ def view_of(drives: DrivePaths, n_sightings: int) -> TagViews:
 
 
 def places_of(drives: DrivePaths, view: TagViews, most: int = MOST_TAGS) -> list[TagSite]:
-    """Places beside the ways, at most so many, of which a part lies about the first start and the rest far from tags.
+    """Return at most `most` sites beside the paths, a third near the first start and the others far from tags.
 
-    Everything is seen from the first start, so that where no tag holds its heading all of the map turns about it. Of
-    the rest those that are passed more than once go first: there a tag joins what nothing joined.
+    All positions are relative to the first start, so an uncertain heading there rotates the whole map about it. Of the
+    others, sites that are passed more than once come first: a tag there adds a loop closure.
     """
     spacing_m = max(_LEAST_SPACING_M, 2.0 * sum(float(way[-1]) for way in drives.ways) / _MOST_PLACES)
     beside = {
@@ -113,7 +113,7 @@ def places_of(drives: DrivePaths, view: TagViews, most: int = MOST_TAGS) -> list
 
 
 def _places_with_two_views(drives: DrivePaths, view: TagViews, where: set[tuple[int, int]]) -> Iterator[TagSite]:
-    """Of places beside some segments and keyframes those that more than one pose views."""
+    """Yield the sites beside given (segment, keyframe) pairs that more than one pose would observe."""
     for segment, keyframe in sorted(where):
         for side in (1.0, -1.0):
             place = place_beside(drives, view, segment, keyframe, side)
@@ -122,9 +122,9 @@ def _places_with_two_views(drives: DrivePaths, view: TagViews, where: set[tuple[
 
 
 def place_beside(drives: DrivePaths, view: TagViews, segment: int, keyframe: int, side: float) -> TagSite:
-    """The place ahead of a keyframe, to its left (+1) or right (-1).
+    """Return the site ahead of a keyframe, to its left (+1) or right (-1).
 
-    Nobody views it where the keyframe's segment has no readings: how its robot would read it, nothing tells.
+    It has no viewers if the keyframe's segment has no observations, as nothing is known of its sensor then.
     """
     pose = int(drives.graph.first_pose[segment]) + keyframe
     sensor = drives.sensors[pose]
@@ -143,7 +143,7 @@ def place_beside(drives: DrivePaths, view: TagViews, segment: int, keyframe: int
 
 
 def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: TagViews) -> BoolArray:
-    """(P,) which sensors have a tag at a place in view that faces along a vector."""
+    """Return which sensors (P,) have a tag in view that is at a position and faces along a vector."""
     sight = se2.apply(se2.inverse(sensors), position_m)
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
     towards = sensors[:, :2] - position_m
@@ -153,13 +153,13 @@ def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, vi
 
 
 def gain_of_place(drives: DrivePaths, view: TagViews, place: TagSite, seen: BoolArray | None = None) -> InformationGain:
-    """What a tag there would have told of the poses that read it, and of the calibration.
+    """Return the information of a tag at a site on the poses that would observe it, and on the calibration.
 
     Args:
-        drives: of `drives_of`.
-        view: of `view_of`.
-        place: of `places_of`.
-        seen: (k,) which of its viewers have it in view; all where None.
+        drives: from `drives_of`.
+        view: from `view_of`.
+        place: from `places_of`.
+        seen: (k,) which of its viewers have it in view; all if None.
     """
     of_map = drives.graph.problem.columns
     poses = place.viewers if seen is None else place.viewers[seen]
@@ -171,7 +171,7 @@ def gain_of_place(drives: DrivePaths, view: TagViews, place: TagSite, seen: Bool
 
 
 def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
-    """Columns of one new tag, then of the map's poses and calibration; and which those are there."""
+    """Return columns of one new tag, then of the map's poses and calibration, and the map's indices of the latter."""
     wanted, free = of_map.poses[poses], of_map.calibration >= 0
     is_free = wanted >= 0
     by_pose = np.full(of_map.poses.shape, -1)
@@ -185,7 +185,7 @@ def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
 
 
 def _readings(drives: DrivePaths, view: TagViews, place: TagSite, poses: IntArray) -> ReadingFactors:
-    """As their like were read: so many of each passing by, with the sigmas of readings at that range."""
+    """Return hypothetical observations, as many per track as usual, with the variances of others at that range."""
     readings, like = drives.graph.problem.readings, drives.example[poses]
     sight = se2.apply(se2.inverse(drives.sensors[poses]), place.position_m)
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
@@ -209,9 +209,9 @@ def _readings(drives: DrivePaths, view: TagViews, place: TagSite, poses: IntArra
 
 
 def _passages(drives: DrivePaths, poses: IntArray, least: float) -> list[IntArray]:
-    """Rising poses, parted where a segment ends or drives on before it comes back; not more than a few, from all over.
+    """Split ascending poses into tracks where a segment ends or the robot drives on before it returns; keep a few.
 
-    A glimpse is not counted on: a passing by has the tag in view from as many poses as read a tag on average.
+    Tracks with fewer poses than a tag is observed from on average are dropped.
     """
     if not len(poses):
         return []
@@ -225,7 +225,7 @@ def _passages(drives: DrivePaths, poses: IntArray, least: float) -> list[IntArra
 
 
 def _spread_over(places: list[TagSite], tags_m: FloatArray, most: int) -> list[TagSite]:
-    """Each as far as can be from the tags and from those chosen before."""
+    """Choose sites by farthest-point sampling: each as far as possible from the tags and from those already chosen."""
     if len(places) <= most:
         return places
     where = np.array([place.position_m for place in places])

@@ -1,7 +1,7 @@
-"""Drives that could be driven once more: parts of the ways that a map's runs drove, from one tag to another.
+"""Drives that could be repeated: parts of the paths of a map's runs, from one tag to another.
 
-A pass is taken to tell what the part of the run that it repeats told, with errors of its own: its poses are new, tags
-and calibration are those of the map.
+A repeated drive is assumed to measure what the original did, with independent errors: its poses are new variables, its
+tags and calibration are those of the map.
 """
 
 from dataclasses import replace
@@ -13,22 +13,22 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.advice.information_gain import InformationGain, marginal_information
 from groundsbot.offline.sam import Columns, Graph, State
 
-# A pass is a trip, not the whole drive again: at most this share of the longest run, and so far.
+# A repeated drive is short: at most this share of the longest run, and at most so long.
 _LENGTH_SHARE: Final = 0.25
 _MOST_LENGTH_M: Final = 50.0
-# The advice must not take longer than the map: so many candidates, and so many keyframes of all of them together.
+# The advice must not take longer than the map: limits on the candidates, and on all their keyframes together.
 MOST_PASSES: Final = 40
 _MOST_KEYFRAMES: Final = 20_000
-# Some seconds of cubes of twice the tags that each of them passes.
+# A few seconds; work is the sum over candidates of (2 tags)^3.
 _MOST_WORK: Final = 2e9
-# What a pass tells costs the cube of the tags that it passes.
+# The cost of a candidate is cubic in the tags that it passes.
 _MOST_SIGHTINGS: Final = 60
-# A tag read again after so much way was passed again.
+# A tag that is observed again after so much driven distance begins a new track.
 SIGHTING_GAP_M: Final = 2.5
 
 
 class TagPassage(NamedTuple):
-    """A run passes a tag."""
+    """Track of one tag in one segment: the keyframes from which a passing robot observed it."""
 
     segment: int
     tag: int
@@ -37,7 +37,7 @@ class TagPassage(NamedTuple):
 
 
 class Pass(NamedTuple):
-    """Keyframes first to last of a segment, from the tag read first to the one read last."""
+    """Keyframes first to last of a segment, from the tag observed first to the one observed last."""
 
     segment: int
     first: int
@@ -47,12 +47,12 @@ class Pass(NamedTuple):
 
 
 def ways_m(graph: Graph) -> list[FloatArray]:
-    """Of each segment, (K,) how far it had driven at its keyframes."""
+    """Return the driven distance (K,) at the keyframes of each segment."""
     return [segment.along_m for segment in graph.segments]
 
 
 def passages_of(graph: Graph, ways: list[FloatArray]) -> list[TagPassage]:
-    """All of them, segment by segment in the order in which they begin."""
+    """Return all tracks, segment by segment in the order in which they begin."""
     found: list[TagPassage] = []
     number = {tag: i for i, tag in enumerate(graph.tags)}
     for c, segment in enumerate(graph.segments):
@@ -70,17 +70,17 @@ def passages_of(graph: Graph, ways: list[FloatArray]) -> list[TagPassage]:
 
 
 def most_length_m(ways: list[FloatArray]) -> float:
-    """Of a pass."""
+    """Return the maximum length of a repeated drive."""
     return min(_LENGTH_SHARE * max(float(way[-1]) for way in ways), _MOST_LENGTH_M)
 
 
 def passes_of(ways: list[FloatArray], sightings: list[TagPassage], most: int = MOST_PASSES) -> list[Pass]:
-    """From a sighting as far as a pass goes, for each of them or so many evenly chosen.
+    """Return one candidate per track, as long as allowed, thinned evenly to the limits on number and work.
 
     Args:
-        ways: of `ways_m`.
-        sightings: of `passages_of`.
-        most: how many.
+        ways: from `ways_m`.
+        sightings: from `passages_of`.
+        most: maximum number of candidates.
     """
     length_m = most_length_m(ways)
     found: list[Pass] = []
@@ -101,14 +101,14 @@ def passes_of(ways: list[FloatArray], sightings: list[TagPassage], most: int = M
 
 
 def _evenly(passes: list[Pass], most: int) -> list[Pass]:
-    """So many of them at most."""
+    """Return at most `most` of them, evenly chosen."""
     if len(passes) <= most:
         return passes
     return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
 
 
 def _tags_along(wanted: Pass, sightings: list[TagPassage]) -> set[int]:
-    """The tags seen on the way."""
+    """Return the tags that are observed during a candidate drive."""
     return {
         each.tag
         for each in sightings
@@ -117,7 +117,7 @@ def _tags_along(wanted: Pass, sightings: list[TagPassage]) -> set[int]:
 
 
 def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> InformationGain:
-    """What one more pass would tell of the map's tags and calibration."""
+    """Return the information of a repeated drive on the map's tags and calibration."""
     problem, offset = graph.problem, int(graph.first_pose[wanted.segment])
     first, last = offset + wanted.first, offset + wanted.last
     odometry, readings = problem.odometry, problem.readings
@@ -132,7 +132,7 @@ def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> InformationGain:
 
 
 def _own_columns(of_map: Columns, poses: IntArray, tags: IntArray) -> tuple[Columns, IntArray]:
-    """Columns of new copies of some poses, then of the map's own tags and calibration; and which those are there."""
+    """Return columns of copied poses, then of the map's tags and calibration, and the map's indices of the latter."""
     n_own, n_tags = 3 * len(poses), 2 * len(tags)
     by_pose = np.full(of_map.poses.shape, -1)
     by_pose[poses] = np.arange(n_own).reshape(-1, 3)

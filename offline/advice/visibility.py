@@ -1,7 +1,7 @@
-"""How likely a tag that hangs beside one pose is in view of others, when it is not known how they lie to each other.
+"""Probability that a tag mounted beside one pose is in view of other poses, given their relative uncertainty.
 
-Somebody who hangs up a tag goes by what is around. Where the map itself knows only to metres how a later drive passed
-there, that drive may have passed too far away: such readings must not be counted on.
+A person mounts the tag relative to the surroundings of that pose. A later drive whose relative pose the map knows only
+to metres may have passed too far away, so its observations are not certain.
 """
 
 from typing import Final
@@ -19,13 +19,13 @@ _ANGLES: Final = np.arange(8) * np.pi / 4.0
 
 
 def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
-    """(k,) with which probability each viewer of a place has a tag in view that hangs by the pose beside it.
+    """Return the probability (k,) that each viewer of a site has in view a tag mounted relative to the pose beside it.
 
     Args:
         drives: all of a component.
-        view: what is in view.
-        place: and its viewers, the pose beside it among them.
-        known: the joint covariance of these poses, and others.
+        view: limits of the field of view.
+        place: the site; its viewers include the pose beside it.
+        known: a joint covariance that includes these poses.
     """
     columns = drives.graph.problem.columns.poses
     beside = int(drives.graph.first_pose[place.segment]) + place.keyframe
@@ -44,11 +44,12 @@ def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite,
 
 
 def expected_sigmas_m(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
-    """(T,) the tags' largest sigmas with a tag at the place, the mean over which of its viewers have it in view.
+    """Return the tags' sigmas (T,) with a tag at the site: their mean over which viewers have it in view.
 
-    A single reading from a drive that nothing held is worth the most, so what counts is whether there is one: readings
-    that count by their probability would promise as good as all of it. What puts one viewer too far off mostly puts
-    those near it too far off as well, so they are taken to miss it in the order of their probabilities.
+    A single observation from an otherwise unconstrained drive carries the most information, so it matters whether there
+    is one at all. Weighting observations by their probability would predict nearly the full gain. If one viewer is too
+    far off, those near it mostly are as well; so viewers are assumed to lose the tag in the order of their
+    probabilities.
     """
     shares = visibility_probabilities(drives, view, place, known)
     levels = np.unique(shares)[::-1]
@@ -60,7 +61,7 @@ def expected_sigmas_m(drives: DrivePaths, view: TagViews, place: TagSite, known:
 
 
 def _place_jacobian(drives: DrivePaths, pose: int, place: TagSite) -> FloatArray:
-    """(2, 3) how the place moves in map with a pose that it hangs by, perturbed on the right."""
+    """Return the derivative (2, 3) of a site fixed to a pose, in map, by a right perturbation of that pose."""
     theta = drives.state.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     away = se2.apply(se2.inverse(drives.state.poses[pose]), place.position_m)

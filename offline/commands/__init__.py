@@ -1,6 +1,6 @@
 """The commands of `groundsbot-offline`: their options, and what each does with files.
 
-In: the command line. Out: files and lines for a person. `drives`, `finished_maps`, `imports` and `logs` hold options
+In: the command line. Out: files and lines for the user. `drives`, `finished_maps`, `imports` and `logs` define options
 and import nothing heavy; the other modules do the work. The paper has no such block.
 """
 

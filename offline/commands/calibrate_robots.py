@@ -1,4 +1,4 @@
-"""The `calibrate` command: drives in, robot.yaml out, with what the map of these drives made of its numbers."""
+"""The `calibrate` command: drives in, robot.yaml out, with its parameters as estimated by the map of these drives."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -31,7 +31,7 @@ _YAML: Final = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What the command line says."""
+    """Options of the command line."""
 
     logs: Sequence[Path]
     output: Path
@@ -44,7 +44,7 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The map that the drives gave, what of its calibration was written, and where."""
+    """The map of the drives, the parameters that were written, and the files."""
 
     result: MapResult
     learnt: tuple[CalibrationResult, ...]
@@ -52,19 +52,19 @@ class Calibrated:
 
 
 def calibrate_robots(options: CalibrateOptions) -> Calibrated:
-    """Maps the drives and writes a file for each robot, and its camera's beside it.
+    """Map the drives and write a file for each robot, and its camera's beside it.
 
     Raises:
-        GroundsbotError: one line that says what stands in the way; nothing is written then.
+        GroundsbotError: one line that says what is wrong; nothing is written then.
     """
     calibrate = parse_calibrate(options.calibrate)
     if not calibrate.is_on:
-        raise OfflineError("--calibrate off: then there is nothing to learn; say auto, or name what is to be freed")
+        raise OfflineError("--calibrate off: nothing would be estimated; give auto, or name the parameters to free")
     workings = Diagnostics()
     noise = read_noise_yaml(options.noise) if options.noise else None
     logs, robot_files = find_logs(list(options.logs)), read_robot_files(options.robots)
     if options.output.exists():
-        raise OfflineError(f"-o {options.output}: is there already; name a new file or folder, nothing is written over")
+        raise OfflineError(f"-o {options.output}: exists already and is not overwritten; name a new file or folder")
     with announce_compilation(echo_line), progress_bar() as show:
         stages = Stages(show)
         result = build_map(
@@ -87,18 +87,18 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
 
 
 def summary(calibrated: Calibrated) -> list[str]:
-    """What was learnt, what holds the scale, and where it is written."""
+    """Return lines on what was estimated, what determines the scale, and the files."""
     result = calibrated.result
     lines = correction_lines(result, calibrated.learnt)
     lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     lines += [f"written: {path}" for path in calibrated.files]
-    return [*lines, "for other drives: these ones would count twice, were they mapped with what they taught"]
+    return [*lines, "use it for other drives: mapping these ones with it would count their measurements twice"]
 
 
 def as_json(calibrated: Calibrated) -> dict[str, Any]:
-    """What was learnt and why the rest was not."""
+    """Return what was estimated, and why the rest was not."""
     words = {(each.owner, each.name): choice_words(each) for each in calibrated.result.choices}
     return {
         "learnt": [asdict(each) | {"choice": words.get((each.owner, each.name))} for each in calibrated.learnt],
@@ -111,14 +111,14 @@ def as_json(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def _robots(runs: Sequence[Run]) -> dict[str, Run]:
-    """A run of each robot, whose runs must all begin from the same numbers."""
+    """Return a run of each robot, whose runs must all begin from the same parameters."""
     found: dict[str, Run] = {}
     for run in sorted(runs, key=lambda each: each.name):
         first = found.setdefault(run.robot_id, run)
         if _numbers(run) != _numbers(first):
             raise OfflineError(
-                f"{run.log}: its robot.yaml or camera is another one than that in {first.log}; give the one that both "
-                f"are to begin from, --robot FILE with robot_id {run.robot_id}"
+                f"{run.log}: its robot.yaml or camera differs from that in {first.log}; give one to start from for "
+                f"both, --robot FILE with robot_id {run.robot_id}"
             )
     return found
 
@@ -132,7 +132,7 @@ def _numbers(run: Run) -> tuple[object, ...]:
 
 
 def _most_certain(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:
-    """Each number once: from the component that tells it best."""
+    """Return each parameter once: from the component with the smallest sigma."""
     best: dict[OwnedParameter, CalibrationResult] = {}
     for each in calibration:
         key = OwnedParameter(each.owner, each.name)
@@ -142,13 +142,13 @@ def _most_certain(calibration: Sequence[CalibrationResult]) -> list[CalibrationR
 
 
 def _paths(output: Path, robot_ids: Sequence[str]) -> dict[str, Path]:
-    """Where each robot's file goes."""
+    """Return the path of each robot's file."""
     if output.suffix not in _YAML:
         return {robot_id: output / f"{robot_id}.yaml" for robot_id in robot_ids}
     if len(robot_ids) > 1:
         raise OfflineError(
-            f"-o {output}: the logs are of several robots ({', '.join(robot_ids)}), each gets a file of its own; name "
-            "a folder"
+            f"-o {output}: the logs are of several robots ({', '.join(robot_ids)}), and each gets its own file; name a "
+            "folder"
         )
     return {robot_ids[0]: output}
 
@@ -158,10 +158,10 @@ def _camera(run: Run, learnt: dict[OwnedParameter, Correction]) -> CameraModel |
 
 
 def _write(robot: Robot, camera: CameraModel | None, path: Path) -> list[Path]:
-    """The robot's file, its camera's first: a robot.yaml that is there names a camera that is there."""
+    """Write the camera's file, then the robot's, so that a robot.yaml never names a missing camera."""
     camera_path = path.with_name(f"{path.stem}_camera.yaml")
     if camera is not None and camera_path.exists():
-        raise OfflineError(f"-o {path}: {camera_path} is there already; name another file, nothing is written over")
+        raise OfflineError(f"-o {path}: {camera_path} exists already and is not overwritten; name another file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if camera is None:

@@ -1,4 +1,4 @@
-"""`groundsbot-offline map`, `calibrate` and `localize`: their options, for commands that take drives."""
+"""`groundsbot-offline map`, `calibrate` and `localize`: options of the commands that take drives."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ RobotFiles = Annotated[
 ]
 Distances = Annotated[
     list[str] | None,
-    typer.Option(help="Between two runs' starts or tags, as measured: A,B=metres,sigma_m; repeatable."),
+    typer.Option(help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable."),
 ]
 
 
@@ -25,12 +25,12 @@ def map_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
     robot: RobotFiles = None,
     noise: Annotated[
-        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them; the others keep defaults.")
+        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them; others have defaults.")
     ] = None,
     start: Annotated[
         list[str] | None,
         typer.Option(
-            help="A run's start, as measured in the map: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad; "
+            help="Measured start of a run in the map: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad; "
             "repeatable.",
             metavar="START",
         ),
@@ -38,28 +38,26 @@ def map_command(
     distance: Distances = None,
     extend: Annotated[
         Path | None,
-        typer.Option(help="map.json of a map that is kept: its runs and the logs' in one new map, under its noise."),
+        typer.Option(help="map.json of an earlier map: make one new map of its runs and the logs, with its noise."),
     ] = None,
     keep_suspects: Annotated[
-        bool, typer.Option("--keep-suspects", help="Name tags that do not belong, but keep them as one tag each.")
+        bool, typer.Option("--keep-suspects", help="Report tags with outliers, but keep each as one tag.")
     ] = False,
     model: Annotated[
         MapModel,
-        typer.Option(
-            help="What the map is solved on last: tags' corners in pixels, or their places on the floor only."
-        ),
+        typer.Option(help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor."),
     ] = MapModel.FLOOR,
     upright_deg: Annotated[
         float | None,
         typer.Option(
-            help="All tags hang upright, faces vertical and edges level, to this sigma in degrees; only with --model "
+            help="All tags are upright, faces vertical and edges level, to this sigma in degrees; only with --model "
             "corners.",
         ),
     ] = None,
     calibrate: Annotated[
         str,
         typer.Option(
-            help="Which numbers of robot.yaml the drives may set beyond its sigmas: off, auto (those that drives "
+            help="Parameters of robot.yaml to estimate freely, regardless of its sigmas: off, auto (those that drives "
             "contradict), or names.",
             metavar="off|auto|PARAM,...",
         ),
@@ -67,15 +65,14 @@ def map_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool,
-        typer.Option("-v", "--verbose", help="Print all that was found, and what each stage took (`stages` in JSON)."),
+        typer.Option("-v", "--verbose", help="Print all results, and the cost of each stage (`stages` in JSON)."),
     ] = False,
     json_output: JsonFlag = False,
 ) -> None:
-    """Turns the drives in logs into one map of all tags and trajectories, in the frame of the first log's start.
+    """Make one map of all tags and trajectories from the drives in logs, in the frame of the first log's start.
 
-    Exit 3: the runs do not all hang together, so that the map has several components; a log is damaged, and the map is
-    without what is lost of it; or drives contradict the model, and all sigmas are larger for it. Which of these is
-    printed.
+    Exit 3: the runs are not all connected, so that the map has several components; or a log is damaged, and lost parts
+    are missing in the map; or drives contradict the model, and all sigmas were increased. The reason is printed.
     """
     from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
@@ -111,15 +108,15 @@ def calibrate(
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
     distance: Distances = None,
     model: Annotated[
-        MapModel, typer.Option(help="Ask tags' corners in pixels (focal length too), or their places on the floor.")
+        MapModel, typer.Option(help="Use tags' corners in pixels (focal length too), or their positions on the floor.")
     ] = MapModel.FLOOR,
-    calibrate: Annotated[str, typer.Option(help="As for `map`: what is freed.", metavar="auto|PARAM,...")] = AUTO,
+    calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
     json_output: JsonFlag = False,
 ) -> None:
-    """Learns wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
+    """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
 
-    The camera's file is written beside it. Of each number it says what was learnt, and which drive would tell more.
-    The drives need not hang together. Exit 3: a log is damaged, and the rest of it was used.
+    The camera's file is written beside it. For each parameter it prints the estimate, and which drive would improve it.
+    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used.
     """
     import json
 
@@ -140,22 +137,22 @@ def calibrate(
 
 def localize(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder.")],
-    folder: Annotated[Path, typer.Option("--map", help="What `map -o DIR` wrote; it stays as it is.", metavar="DIR")],
+    folder: Annotated[Path, typer.Option("--map", help="Folder of `map -o DIR`; it is not changed.", metavar="DIR")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the trajectory.", metavar="OUT")
     ] = None,
     robot: Annotated[list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.")] = None,
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.")] = None,
     component: Annotated[
-        int | None, typer.Option(min=0, help="Where to look, if the map has several. [default: where the tags fit]")
+        int | None, typer.Option(min=0, help="Component of the map, if it has several. [default: where the tags fit]")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the trajectory in OUT.")] = False,
     json_output: JsonFlag = False,
 ) -> None:
-    """Tells where a new run drove in a finished map, wherever it started; with covariances, the map's included.
+    """Localise a new run in a finished map, wherever it started; with covariances, the map's included.
 
-    Tags that were moved since are named and not used. Exit 3: the place of some of it is ambiguous or not told, or the
-    log is damaged; it is said what.
+    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, or the
+    log is damaged; the reason is printed.
     """
     import json
 

@@ -1,4 +1,4 @@
-"""`groundsbot-offline compare` and `export`: their options, for commands that take a finished map."""
+"""`groundsbot-offline compare` and `export`: options of the commands that take a finished map."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,18 +8,18 @@ import typer
 from groundsbot.offline.commands.arguments import JsonFlag
 from groundsbot.offline.export import ExportFormat, ExportOptions
 
-MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="What `map -o DIR` wrote.")]
+MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
 
 
 def compare(
     folder: MapFolder,
     truth: Annotated[Path | None, typer.Option(help="truth.json of the simulation.")] = None,
     survey: Annotated[
-        Path | None, typer.Option(help="Measured places of tags: tag_id,x_m,y_m, maybe sigma_m, family, instance.")
+        Path | None, typer.Option(help="Measured positions: tag_id,x_m,y_m, optionally sigma_m, family, instance.")
     ] = None,
     json_output: JsonFlag = False,
 ) -> None:
-    """Tells how far a map is from ground truth or from a survey, and whether its covariances are honest.
+    """Compare a map with ground truth or a survey: errors, and whether its covariances are consistent (NEES).
 
     A survey is aligned first, and its entries that look wrong are named. With several components the figures of the
     largest come first, then those of the others, each in its own frame.
@@ -50,12 +50,12 @@ def export(
         Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
     ],
     component: Annotated[
-        int | None, typer.Option(min=0, help="Which one, where the map has several: each has a frame of its own.")
+        int | None, typer.Option(min=0, help="Component of the map, if it has several: each has its own frame.")
     ] = None,
     origin: Annotated[
         str | None,
         typer.Option(
-            help="geojson: where the map's frame lies, LAT_DEG,LON_DEG,HEADING_DEG (WGS 84; of its x axis, clockwise "
+            help="geojson: origin of the map's frame, LAT_DEG,LON_DEG,HEADING_DEG (WGS 84; of its x axis, clockwise "
             "from north)."
         ),
     ] = None,
@@ -65,22 +65,20 @@ def export(
     ] = None,
     tag_height_m: Annotated[
         float | None,
-        typer.Option(
-            help="frc, limelight: taken for the height of tags of which neither --tag-poses nor the map tells."
-        ),
+        typer.Option(help="frc, limelight: height of tags that have none in --tag-poses or the map."),
     ] = None,
     face_viewers: Annotated[
         bool,
         typer.Option(
-            "--face-viewers", help="frc, limelight: take tags to face where they were seen from, by tens of degrees."
+            "--face-viewers", help="frc, limelight: assume tags face their observers; errors are tens of degrees."
         ),
     ] = False,
     field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
-    family: Annotated[str | None, typer.Option(help="frc: the family to write, which a layout cannot tell.")] = None,
+    family: Annotated[str | None, typer.Option(help="frc: the family to write; a layout holds only one.")] = None,
 ) -> None:
-    """Writes a finished map in the form of other tools: a graph for g2o, trajectories, places, layouts of tags.
+    """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
 
-    Nothing is written over, and nothing made up: what a form needs and a map does not hold is an option.
+    Nothing is overwritten, and nothing is assumed silently: what a format needs and a map does not hold is an option.
     """
     from groundsbot.offline.export import export_map
 

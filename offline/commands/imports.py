@@ -1,11 +1,11 @@
-"""`groundsbot-offline import`: its options, and which importer takes the recording."""
+"""`groundsbot-offline import`: its options, and the choice of the importer."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of runs; made if need be.", metavar="DIR")]
+OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of runs; made if missing.", metavar="DIR")]
 
 
 def import_recording(
@@ -16,33 +16,33 @@ def import_recording(
     output: OutputFolder,
     run_id: Annotated[str | None, typer.Option(help="Name of the run. [default: the recording's]")] = None,
     robot_id: Annotated[str | None, typer.Option(help="Name of the robot. [default: the recording's]")] = None,
-    robot: Annotated[Path | None, typer.Option(help="robot.yaml with wheels and mount; options win over it.")] = None,
+    robot: Annotated[Path | None, typer.Option(help="robot.yaml with wheels and mount; options override it.")] = None,
     track_width_m: Annotated[float | None, typer.Option(help="Distance between the wheels.")] = None,
     state_rate_hz: Annotated[float | None, typer.Option(help="States a second, for odom.csv.")] = None,
     wheel_radius_m: Annotated[float | None, typer.Option(help="Radius of both wheels, for ticks and joints.")] = None,
     ticks_per_turn: Annotated[float | None, typer.Option(help="Ticks in one turn of a wheel.")] = None,
-    camera_x_m: Annotated[float | None, typer.Option(help="Camera ahead of the wheels' middle. [default: 0]")] = None,
-    camera_y_m: Annotated[float | None, typer.Option(help="Camera left of the wheels' middle. [default: 0]")] = None,
-    camera_yaw_deg: Annotated[float | None, typer.Option(help="Camera turned to the left. [default: 0]")] = None,
-    tag_family: Annotated[str, typer.Option(help="Family of the tags seen.")] = "tag36h11",
+    camera_x_m: Annotated[float | None, typer.Option(help="Camera ahead of the wheels' midpoint. [default: 0]")] = None,
+    camera_y_m: Annotated[float | None, typer.Option(help="Camera left of the wheels' midpoint. [default: 0]")] = None,
+    camera_yaw_deg: Annotated[float | None, typer.Option(help="Camera yaw, positive to the left. [default: 0]")] = None,
+    tag_family: Annotated[str, typer.Option(help="Family of the tags.")] = "tag36h11",
     tag_size_m: Annotated[
         float | None, typer.Option(help="Bag: side of the tags' black border, outer edge, to place them by corners.")
     ] = None,
-    odometry_topic: Annotated[str | None, typer.Option(help="Bag: of Odometry or JointState.")] = None,
-    tags_topic: Annotated[str | None, typer.Option(help="Bag: of AprilTag detections.")] = None,
-    image_topic: Annotated[str | None, typer.Option(help="Bag: of pictures, to look for tags in.")] = None,
-    camera_info_topic: Annotated[str | None, typer.Option(help="Bag: of the camera's calibration.")] = None,
-    left_joint: Annotated[str | None, typer.Option(help="Bag: the left wheel's, in JointState.")] = None,
-    right_joint: Annotated[str | None, typer.Option(help="Bag: the right wheel's.")] = None,
-    base_frame: Annotated[str | None, typer.Option(help="Bag: of the base. [default: the odometry's child]")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Bag: topic of Odometry or JointState.")] = None,
+    tags_topic: Annotated[str | None, typer.Option(help="Bag: topic of AprilTag detections.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Bag: topic of pictures, to detect tags in.")] = None,
+    camera_info_topic: Annotated[str | None, typer.Option(help="Bag: topic of the camera's calibration.")] = None,
+    left_joint: Annotated[str | None, typer.Option(help="Bag: the left wheel's joint, in JointState.")] = None,
+    right_joint: Annotated[str | None, typer.Option(help="Bag: the right wheel's joint.")] = None,
+    base_frame: Annotated[str | None, typer.Option(help="Bag: base frame. [default: the odometry's child]")] = None,
     camera_frame: Annotated[
-        str | None, typer.Option(help="Bag: the camera's optical one. [default: in headers]")
+        str | None, typer.Option(help="Bag: optical frame of the camera. [default: in headers]")
     ] = None,
     receive_times: Annotated[
-        bool, typer.Option("--receive-times", help="Bag: go by when messages were received, not by their headers.")
+        bool, typer.Option("--receive-times", help="Bag: use times of reception, not those in headers.")
     ] = False,
 ) -> None:
-    """Makes a run log, DIR/RUN_ID/0000.core.mcap, from a folder of CSV files or a ROS bag (docs/formats.md).
+    """Make a run log, DIR/RUN_ID/0000.core.mcap, from a folder of CSV files or a ROS bag (docs/formats.md).
 
     CSV: observations in observations.csv are in the robot's base frame, unless a --camera option is given: then they
     are in the camera's. Those in landmarks.csv always are. Bags, of ROS 1 or ROS 2: topics are found by type.

@@ -1,4 +1,4 @@
-"""The `localize` command: a log and a map in, a folder with the trajectory out; everything is written or nothing."""
+"""The `localize` command: a log and a map in, a folder with the trajectory out; written completely or not at all."""
 
 import csv
 import io
@@ -42,7 +42,7 @@ _ROWS, _COLUMNS = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
 
 @dataclass(frozen=True)
 class LocalizeOptions:
-    """What the command line says."""
+    """Options of the command line."""
 
     log: Path
     map: Path
@@ -54,10 +54,10 @@ class LocalizeOptions:
 
 
 def localize_log(options: LocalizeOptions) -> Localization:
-    """Places one log in a map, and writes where it drove if an output is named.
+    """Localise one log in a map, and write its trajectory if an output is given.
 
     Raises:
-        GroundsbotError: one line that says what stands in the way; nothing is written then.
+        GroundsbotError: one line that says what is wrong; nothing is written then.
     """
     logs = find_logs([options.log])
     if len(logs) != 1:
@@ -91,7 +91,7 @@ def _write(found: Localization, output: Path, *, overwrite: bool) -> None:
 
 
 def trajectory_csv(run: LocatedRun) -> str:
-    """A row for each keyframe."""
+    """Return a row for each keyframe."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(TRAJECTORY_COLUMNS)
@@ -104,7 +104,7 @@ def trajectory_csv(run: LocatedRun) -> str:
 
 
 def as_json(found: Localization) -> dict[str, Any]:
-    """What localization.json holds: plain data."""
+    """Return the content of localization.json: plain data."""
     return {
         "format_version": FORMAT_VERSION,
         "map": str(found.map),
@@ -159,12 +159,12 @@ def _tag_json(tag: TagKey) -> dict[str, Any]:
 
 
 def exit_code(found: Localization) -> int:
-    """Done, or done but for segments whose place is not told or for what is lost of the log."""
+    """Return the exit code: done, or done except for segments that are not located or for losses of the log."""
     return EXIT_WITH_LOSSES if found.not_located or found.losses else EXIT_DONE
 
 
 def summary(found: Localization, output: Path | None) -> list[str]:
-    """What a person wants to know."""
+    """Return lines for the user."""
     lines = [line for run in found.runs for line in _run_lines(run)]
     lines += [line for each in found.not_located for line in _not_located_lines(each)]
     lines += [each.line() for each in found.moved]
@@ -181,7 +181,7 @@ def summary(found: Localization, output: Path | None) -> list[str]:
 def _run_lines(run: LocatedRun) -> list[str]:
     n = plural(len(run.tags), "tag")
     return [
-        f"{run.name}: {plural(len(run.stamps_ns), 'keyframe')}, {run.distance_m:.1f} m, held by {n} of the map",
+        f"{run.name}: {plural(len(run.stamps_ns), 'keyframe')}, {run.distance_m:.1f} m, localised by {n} of the map",
         f"  start {_place(run, 0)}",
         f"  end   {_place(run, -1)}",
     ]

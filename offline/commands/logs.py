@@ -1,4 +1,4 @@
-"""`groundsbot-offline info`, `salvage` and `detect`: their options, for commands that look into logs."""
+"""`groundsbot-offline info`, `salvage` and `detect`: options of the commands that inspect or repair logs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,10 +14,10 @@ def info(
     logs: LogArguments,
     json_output: JsonFlag = False,
 ) -> None:
-    """Tells what logs hold: run, robot, duration, rates, distance, tags, gaps, events, sizes.
+    """Print what logs hold: run, robot, duration, rates, distance, tags, gaps, events, sizes.
 
-    A log that cannot be read is named at the end, with exit 1; the others are described all the same. Exit 3: something
-    of a log is lost, and it is said what.
+    A log that cannot be read is named at the end, with exit 1; the others are described all the same. Exit 3: part of a
+    log is lost; the loss is printed.
     """
     import json
 
@@ -47,9 +47,9 @@ def salvage(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder, damaged or unfinished.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="New log file or run folder.")],
 ) -> None:
-    """Writes what a damaged or unfinished log still holds into a new one, finished and with an index.
+    """Write what a damaged or unfinished log still holds into a new one, complete and with an index.
 
-    The old log is not touched. Exit 3: something of it is lost; it is said what.
+    The old log is not changed. Exit 3: part of it is lost; the loss is printed.
     """
     from groundsbot.offline.logs import salvage as make_salvage
 
@@ -73,13 +73,13 @@ def detect(
         str | None, typer.Option(help="pupil-apriltags or pyapriltags. [default: as in the log's robot.yaml]")
     ] = None,
     drop_others: Annotated[
-        bool, typer.Option("--drop-others", help="Leave out the old detections of pictures that were not kept.")
+        bool, typer.Option("--drop-others", help="Leave out the old detections of pictures that were not recorded.")
     ] = False,
     processes: Annotated[int | None, typer.Option(min=1, help="[default: one for each core]")] = None,
 ) -> None:
-    """Looks for tags again in the pictures of a log; writes a new log that keeps all else.
+    """Detect tags again in the pictures of a log; write a new log with the new detections and all else.
 
-    The old log is not touched. Exit 3: pictures are of no use, or the log is damaged; it is said what.
+    The old log is not changed. Exit 3: pictures cannot be used, or the log is damaged; the reason is printed.
     """
     from groundsbot.offline.commands.progress_bar import progress_bar
     from groundsbot.offline.logs import DetectOptions, detect_again

@@ -1,4 +1,4 @@
-"""The `map` command: logs in, a folder with the map out; everything is written or nothing."""
+"""The `map` command: logs in, a folder with the map out; written completely or not at all."""
 
 import json
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_l
 from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
-# Of --upright-deg: a tag that is told to hang better than that, or worse, is a slip of the unit.
+# Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
 _FINEST_DEG: Final = 0.01
 _COARSEST_DEG: Final = 10.0
 # On one screen.
@@ -46,7 +46,7 @@ _MOST_TO_ACT_ON: Final = 5
 
 @dataclass(frozen=True)
 class MapOptions:
-    """What the command line says."""
+    """Options of the command line."""
 
     logs: Sequence[Path]
     output: Path
@@ -63,13 +63,13 @@ class MapOptions:
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
-    """Maps the logs and writes map.json, map.npz, tags.csv, trajectories, map.mcap, map.png and report.html.
+    """Map the logs and write map.json, map.npz, tags.csv, trajectories, map.mcap, map.png and report.html.
 
     Returns:
-        The map, and what each stage of making it took.
+        The map, and the cost of each stage.
 
     Raises:
-        GroundsbotError: one line that says what stands in the way; the output folder is then as it was before.
+        GroundsbotError: one line that says what is wrong; the output folder is then unchanged.
     """
     upright_sigma_rad = _upright_sigma_rad(options.upright_deg, corners=options.corners)
     logs = find_logs(list(options.logs))
@@ -104,7 +104,7 @@ def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output:
             write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
-        if find_spec("plotly") is not None:  # a map is worth having where only the report's script is missing
+        if find_spec("plotly") is not None:  # without plotly, only the report is missing
             from groundsbot.offline.report import write_report
 
             with stages.stage("writing the report"):
@@ -114,28 +114,28 @@ def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output:
 
 
 def _read_map_to_extend(path: Path, options: MapOptions) -> MapResult:
-    """The map that is kept: its folder, or map.json in it."""
+    """Read the map to extend: its folder, or map.json in it."""
     folder = path.parent if path.name == JSON_FILE else path
     check_output(options.output, [folder], JSON_FILE, overwrite=options.overwrite)
     if options.noise is not None:
-        raise OfflineError("--noise: a map is extended under its own noise; leave it out, or map all logs anew")
+        raise OfflineError("--noise: a map is extended with its own noise; leave it out, or map all logs anew")
     return read_map(folder)
 
 
 def exit_code(result: MapResult) -> int:
-    """Done; or done in several components, of logs with losses, or of drives that contradict the model."""
+    """Return the exit code: done; or done with several components, losses, or drives that contradict the model."""
     contradicts = any(component.misfit for component in result.components)
     return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or contradicts else EXIT_DONE
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
-    """What a terminal shows of a map: the result, what asks for action, and where the files are.
+    """Return lines for the terminal: the result, what asks for action, and the files.
 
     Args:
         result: the map.
         output: its folder.
-        verbose: also alignments, every distance between starts, noise and scale; and all of what asks for action, of
-            which else the first five lines are shown.
+        verbose: also alignments, all distances between starts, noise and scale; and all that asks for action, otherwise
+            its first five lines.
     """
     document = map_as_json(result)
     several = len(result.components) > 1
@@ -150,7 +150,7 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
-    if verbose or result.measurements:  # who measured asks what that does for the scale
+    if verbose or result.measurements:  # shows the effect of measurements on the scale
         lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
     if verbose and result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
@@ -161,7 +161,7 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
 
 
 def _to_act_on(result: MapResult, *, verbose: bool) -> list[str]:
-    """What is lost, suspect or doubtful, and what to drive next; the gravest first."""
+    """Return losses, outliers and warnings, and what to drive next; the gravest first."""
     lines = [f"lost: {loss}" for loss in result.losses]
     lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
     lines += [f"warning: {warning}" for warning in result.warnings]
@@ -178,7 +178,7 @@ def _report_line(output: Path) -> str:
 
 
 def stage_lines(costs: Sequence[StageCost]) -> list[str]:
-    """What each stage took, as a table."""
+    """Return a table of the cost of each stage."""
     lines = [f"{'stage':<28}{'seconds':>8}{'of CPU':>8}{'peak MiB':>10}"]
     for name, seconds, cpu_seconds, peak_mib in costs:
         peak = "" if peak_mib is None else f"{peak_mib:10.0f}"
@@ -187,7 +187,7 @@ def stage_lines(costs: Sequence[StageCost]) -> list[str]:
 
 
 def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
-    """The content of map.json, and what the stages took where that is given."""
+    """Return the content of map.json, with the stages' costs if given."""
     data = map_as_json(result)
     if costs is not None:
         data["stages"] = [cost._asdict() for cost in costs]
@@ -210,64 +210,64 @@ def _component_lines(component: Component, *, several: bool) -> list[str]:
 
 def _alignment_line(alignment: AlignmentResult) -> str:
     x_m, y_m, theta_rad = alignment.T_from_to
-    weak = "; weak: one tag alone says so" if alignment.is_weak else ""
+    weak = "; weak: it rests on one tag" if alignment.is_weak else ""
     return (
         f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
         f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
-        f"x {x_m:.2f} m, y {y_m:.2f} m, turned {degrees(theta_rad):.1f} deg"
-        + (weak if alignment.is_sure else "; not sure, so not used")
+        f"x {x_m:.2f} m, y {y_m:.2f} m, rotated {degrees(theta_rad):.1f} deg"
+        + (weak if alignment.is_sure else "; uncertain, so not used")
     )
 
 
 def _measurement_line(measurement: MeasurementResult) -> str:
-    """What the map makes of it."""
+    """Return an external measurement, and how it agrees with the map."""
     what = f"{measurement.a} to {measurement.b}" if measurement.kind == "distance" else f"start of {measurement.b}"
     values = [] if measurement.in_map is None else measurement.in_map.tolist()
     figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
-    off = "nothing else says" if measurement.off_sigmas is None else f"all else is off by {measurement.off_sigmas:.1f}"
+    off = "nothing else determines it" if measurement.off_sigmas is None else f"off by {measurement.off_sigmas:.1f}"
     unit = "" if measurement.off_sigmas is None else " sigma"
     return f"measured {what}: {figures} in the map ({off}{unit})"
 
 
 def _noise_lines(fit: FittedNoise) -> list[str]:
-    """What was fitted, with its 99 % interval, and what was not."""
+    """Return what was fitted, with its 99 % interval, and what was not."""
     fitted = [
         f"{each.name} {each.value:.3g} ({each.low:.3g} to {each.high:.3g})" for each in fit.parameters if not each.kept
     ]
     lines = []
     if fitted:
-        lines.append(f"noise as {plural(len(fit.runs), 'run')} show it (with 99 %): " + ", ".join(fitted))
+        lines.append(f"noise fitted to {plural(len(fit.runs), 'run')} (99 % interval): " + ", ".join(fitted))
     kept: dict[str, list[str]] = {}
     for each in fit.parameters:
         if each.kept not in ("", NOT_NEEDED):
             kept.setdefault(each.kept, []).append(f"{each.name} {each.value:.3g}")
-    lines += [f"noise left as it was, since {why}: " + ", ".join(names) for why, names in kept.items()]
+    lines += [f"noise not fitted, since {why}: " + ", ".join(names) for why, names in kept.items()]
     return lines
 
 
 def _floor_lines(result: MapResult) -> list[str]:
-    """How uneven the floor is, where corners tell."""
+    """Return how uneven the floor is, if corners were used."""
     several = len(result.components) > 1
     lines = []
     for i, floor in enumerate(component.floor for component in result.components):
         if floor is not None and (floor.sigma_tilt_rad or floor.sigma_height_m):
             lines.append(
-                f"floor{f' of component {i}' if several else ''}: pictures roll and pitch by "
-                f"{degrees(floor.sigma_tilt_rad):.2f} deg and stand off by {1000.0 * floor.sigma_height_m:.1f} mm "
+                f"floor{f' of component {i}' if several else ''}: roll and pitch vary by "
+                f"{degrees(floor.sigma_tilt_rad):.2f} deg and the height by {1000.0 * floor.sigma_height_m:.1f} mm "
                 "(standard deviations)"
             )
     return lines
 
 
 def _advice_lines(result: MapResult) -> list[str]:
-    """The best that could be done for the worst tag; runs that do not hang together need other things first."""
+    """Return the best advice for the worst tag; components must be merged first."""
     several = len({tag.family for component in result.components for tag in component.tags}) > 1
     told = result.advice[:1] if len(result.components) == 1 else ()
     return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]
 
 
 def _upright_sigma_rad(upright_deg: float | None, *, corners: bool) -> float | None:
-    """The sigma in rad of what was given in degrees.
+    """Return the sigma in rad of an option in degrees.
 
     Raises:
         OfflineError: one line that says what is wrong and what to write.
@@ -276,7 +276,7 @@ def _upright_sigma_rad(upright_deg: float | None, *, corners: bool) -> float | N
         return None
     if not corners:
         raise OfflineError(
-            "--upright-deg: tags on the floor have no tilt to hold, and are taken for upright as it is; give "
+            "--upright-deg: only corners determine the tilt of tags, which are assumed upright otherwise; give "
             "--model corners too, or leave it out"
         )
     if not _FINEST_DEG <= upright_deg <= _COARSEST_DEG:

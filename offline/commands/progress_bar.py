@@ -9,7 +9,7 @@ from groundsbot.offline.foundation import Progress
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A bar on a terminal, gone when done; nothing elsewhere."""
+    """Yield a progress function: a bar on a terminal, removed when done; nothing elsewhere."""
     if not sys.stderr.isatty():
         yield lambda _what, _done, _total: None
         return
@@ -28,7 +28,7 @@ def progress_bar() -> Iterator[Progress]:
                 bar.reset(task)
                 current = what
             if total == 1:
-                bar.update(task, description=what, total=None)  # a bar that moves and tells no share
+                bar.update(task, description=what, total=None)  # a moving bar without a fraction
             else:
                 bar.update(task, description=f"{what} {done}/{total}", completed=done, total=total)
 

@@ -1,4 +1,4 @@
-"""What several commands need: the robots' files, the output folder, and lines for the terminal."""
+"""Functions of several commands: the robots' files, the output folder, and lines for the terminal."""
 
 import sys
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from groundsbot.offline.measurements import RobotFile, read_robot_file
 
 
 def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
-    """By robot id, of which each file must have its own."""
+    """Read robot files by robot id, which must be unique."""
     robot_files: dict[str, RobotFile] = {}
     for path in paths:
         given = read_robot_file(path)
@@ -21,26 +21,26 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
 
 
 def echo_line(text: str) -> None:
-    """To a person, beside what the command prints."""
+    """Write a line to stderr."""
     sys.stderr.write(text + "\n")
 
 
 def metre_line(metre: ScaleBudget, *, several: bool) -> str:
-    """What the length of a metre rests on."""
+    """Return what determines the scale."""
     of = f" of component {metre.component}" if several else ""
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)
     held = ", ".join(f"{kind} {100.0 * share:.0f} %" for share, kind in shares)
-    return f"scale{of}: known to {100.0 * metre.sigma:.2f} %, held by {held}"
+    return f"scale{of}: known to {100.0 * metre.sigma:.2f} %, determined by {held}"
 
 
 def check_output(output: Path, inputs: Sequence[Path], own_file: str, *, overwrite: bool) -> None:
-    """Refuses an output folder in which something could be lost.
+    """Refuse an output folder in which something could be lost.
 
     Args:
         output: a folder.
-        inputs: logs and maps, which stay as they are.
-        own_file: what tells a folder that may be replaced.
-        overwrite: whether one may.
+        inputs: logs and maps, which must not be changed.
+        own_file: file that marks a folder as replaceable.
+        overwrite: whether to replace such a folder.
 
     Raises:
         OfflineError: one line that says what is in the way.
@@ -50,7 +50,7 @@ def check_output(output: Path, inputs: Sequence[Path], own_file: str, *, overwri
     for path in inputs:
         if output.resolve() in (path.resolve(), *path.resolve().parents) or path.resolve() in output.resolve().parents:
             raise OfflineError(
-                f"-o {output}: holds {path} or lies in it; name another folder, maps and recordings stay"
+                f"-o {output}: holds {path} or lies in it; name another folder, so that inputs are not changed"
             )
     if not output.is_dir() or not any(output.iterdir()):
         return

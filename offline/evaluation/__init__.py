@@ -1,4 +1,4 @@
-"""A map against ground truth or a survey: errors, and whether covariances are honest.
+"""Comparison of a map with ground truth or a survey: errors, and consistency of the covariances.
 
 In: a map and truth.json or a survey. Out: errors, NEES, and survey points that look wrong. In the paper: its results
 against hand measurements.

@@ -1,7 +1,6 @@
-"""A map against ground truth: how far off it is, and whether it knows.
+"""Comparison of a map with ground truth: its errors, and whether its covariances predict them (`nees`).
 
-Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" are of the map as it
-stands. Whether it knows is told by `nees`.
+Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" need no alignment.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,10 +18,10 @@ from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
 
 
 def evaluate(result: MapResult, truth: Truth) -> MapErrors:
-    """Compares a map with the truth.
+    """Return the errors of a map.
 
     Raises:
-        OfflineError: the truth does not know the run that the largest component's frame is made of.
+        OfflineError: the truth lacks the run that defines the largest component's frame.
     """
     components = []
     for index, component in enumerate(result.components):
@@ -30,14 +29,14 @@ def evaluate(result: MapResult, truth: Truth) -> MapErrors:
         if frame is None and index == 0:
             raise OfflineError(
                 f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
-                f"it has {', '.join(sorted(truth.runs)) or 'no runs'}. Give the truth.json of these drives"
+                f"it has {', '.join(sorted(truth.runs)) or 'no runs'}; give the truth.json of these drives"
             )
         components.append(_unknown(component) if frame is None else _evaluate(component, truth, frame))
     return MapErrors(tuple(components))
 
 
 def _true_frame(component: Component, truth: Truth) -> FloatArray | None:
-    """T_world_map: the true start pose of the component's first run."""
+    """Return T_world_map: the true start pose of the component's first run."""
     first = next(run for run in component.runs if run.name == component.frame_run)
     return _true_start(first, truth)
 
@@ -51,7 +50,7 @@ def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
 
 
 def _unknown(component: Component) -> ComponentErrors:
-    note = f"the truth does not know the start of {component.frame_run}; this component is not judged"
+    note = f"the truth lacks the start of {component.frame_run}; this component is not evaluated"
     runs = tuple(run.name for run in component.runs)
     return ComponentErrors(
         component.frame_run, runs, len(component.tags), (), (), None, None, None, None, None, (note,)
@@ -88,7 +87,7 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
 
 
 def align_points(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
-    """Points (N, 2) turned and moved, not scaled, so that they lie on others (N, 2) with least squares.
+    """Return points (N, 2) rotated and shifted, not scaled, onto others (N, 2) by least squares.
 
     S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991).
     """
@@ -103,7 +102,7 @@ def align_points(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
 def _start_places(
     component: Component, truth: Truth, T_world_map: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Where each run starts, found and true (2,); later segments apart, whose start is no start of a drive."""
+    """Return the estimated and true start (2,) of each run, without later segments, as they do not begin a drive."""
     places = {}
     for run in component.runs:
         T_world_start = _true_start(run, truth) if run.run == run.name else None
@@ -118,7 +117,7 @@ def _nees(
     known: Sequence[int],
     true_tags_m: FloatArray,
 ) -> tuple[float | None, float | None]:
-    """Of all starts jointly as seen from the frame's, and of all tags (indices `known`) jointly."""
+    """Return the NEES of all starts jointly relative to the frame's, and of all tags (indices `known`) jointly."""
     names = [run.name for run in component.runs]
     starts = [name for name in places if name != component.frame_run]
     rows = [3 * names.index(name) + axis for name in starts for axis in (0, 1)]
@@ -149,7 +148,7 @@ def _start_error(a: str, b: str, places: dict[str, tuple[FloatArray, FloatArray]
 
 
 def _trajectory_errors(runs: Iterable[RunResult], truth: Truth, T_world_map: FloatArray) -> FloatArray:
-    """Position errors (K, 2) of all keyframes that the truth covers."""
+    """Return position errors (K, 2) of all keyframes that the truth covers."""
     errors = [np.empty((0, 2))]
     for run in runs:
         true_run = truth.runs.get(run.run)
@@ -161,7 +160,7 @@ def _trajectory_errors(runs: Iterable[RunResult], truth: Truth, T_world_map: Flo
 
 
 def _notes(component: Component, truth: Truth) -> list[str]:
-    """One line each on what the truth does not know."""
+    """Return a line for each part of the map that the truth lacks."""
     notes = []
     unknown_runs = [run.name for run in component.runs if run.run not in truth.runs]
     if unknown_runs:
@@ -198,5 +197,5 @@ def _tag_error(tag: TagResult, error_m: FloatArray) -> TagError:
 
 
 def _rms(errors_m: FloatArray) -> float | None:
-    """Root mean square of the lengths of (N, 2) errors; None of none."""
+    """Return the root mean square length of errors (N, 2); None if there are none."""
     return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else None

@@ -1,4 +1,4 @@
-"""How far a map is off the truth, in figures and in words."""
+"""Errors of a map against the truth, as figures and lines."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class StartError:
-    """From the start of run `a` to the start of run `b`: found and true."""
+    """Error of the vector from the start of run `a` to the start of run `b`."""
 
     a: str
     b: str
@@ -16,18 +16,18 @@ class StartError:
 
     @property
     def distance_error_m(self) -> float:
-        """How wrong the distance is, without sign."""
+        """Absolute error of the distance."""
         return abs(self.distance_m - self.true_distance_m)
 
     @property
     def percent(self) -> float | None:
-        """The distance's error as a share of the true distance; None where that is nothing."""
+        """Error of the distance in percent of the true distance; None if that is zero."""
         return 100.0 * self.distance_error_m / self.true_distance_m if self.true_distance_m > 1e-9 else None
 
 
 @dataclass(frozen=True)
 class TagError:
-    """How far one tag is off, in the frame of its component."""
+    """Position error of one tag in the frame of its component."""
 
     family: str
     tag_id: int
@@ -38,7 +38,7 @@ class TagError:
 
 @dataclass(frozen=True)
 class ComponentErrors:
-    """Figures of one component. None: nothing to measure it by (one run, no tag, no truth)."""
+    """Figures of one component. None: nothing to compare (one run, no tag, no truth)."""
 
     frame_run: str
     runs: tuple[str, ...]
@@ -54,11 +54,11 @@ class ComponentErrors:
 
     @property
     def worst_start(self) -> StartError | None:
-        """The pair of starts whose vector is off most: with two runs, the one pair."""
+        """Pair of starts with the largest vector error."""
         return max(self.starts, key=lambda pair: pair.vector_error_m, default=None)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data; the start figures are those of the worst pair, all pairs stand in `starts`."""
+        """Return plain data; the start figures are those of the worst pair, `starts` has all pairs."""
         worst = self.worst_start
         starts = [
             asdict(pair) | {"distance_error_m": pair.distance_error_m, "percent": pair.percent} for pair in self.starts
@@ -81,7 +81,7 @@ class ComponentErrors:
         }
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         lines = [f"frame: start of {self.frame_run}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
         for pair in self.starts:
             percent = "" if pair.percent is None else f" ({pair.percent:.2f} %)"
@@ -91,13 +91,13 @@ class ComponentErrors:
                 f"vector off by {pair.vector_error_m:.3f} m"
             )
         for what, value, unit in (
-            ("tags RMSE, as the map stands", self.tags_rmse_m, " m"),
+            ("tags RMSE, without alignment", self.tags_rmse_m, " m"),
             ("tags RMSE, aligned", self.tags_rmse_aligned_m, " m"),
-            ("trajectory RMSE, as the map stands", self.trajectory_rmse_m, " m"),
-            ("tags NEES per dimension (1 is honest)", self.nees_tags_per_dim, ""),
-            ("start NEES per dimension (1 is honest)", self.nees_start_per_dim, ""),
+            ("trajectory RMSE, without alignment", self.trajectory_rmse_m, " m"),
+            ("tags NEES per dimension (1 is consistent)", self.nees_tags_per_dim, ""),
+            ("start NEES per dimension (1 is consistent)", self.nees_start_per_dim, ""),
         ):
-            lines.append(f"  {what}: {'nothing to judge by' if value is None else f'{value:.3f}{unit}'}")
+            lines.append(f"  {what}: {'nothing to compare' if value is None else f'{value:.3f}{unit}'}")
         worst = max(self.tags, key=lambda tag: tag.error_m, default=None)
         if worst is not None:
             name = f"{worst.family} {worst.tag_id}{worst.instance}"
@@ -112,13 +112,13 @@ class MapErrors:
     components: tuple[ComponentErrors, ...]
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         lines = [line for component in self.components for line in component.lines()]
         if len(self.components) > 1:
-            lines.insert(0, f"{len(self.components)} components, each judged in its own frame, largest first")
+            lines.insert(0, f"{len(self.components)} components, each evaluated in its own frame, largest first")
         return lines
 
     def as_json(self) -> dict[str, Any]:
-        """The largest component's figures on top, and each component's in `components`."""
+        """Return the largest component's figures at the top, and each component's in `components`."""
         parts = [component.as_json() for component in self.components]
         return parts[0] | {"components": parts}

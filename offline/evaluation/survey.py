@@ -1,8 +1,8 @@
-"""A map against positions that somebody measured, neither of which is beyond doubt.
+"""Comparison of a map with a survey, both of which may be wrong.
 
-The survey is turned and moved onto the map, weighed by the joint covariance of both. Each entry is then tested for a
-shift of its own (Baarda, "A testing procedure for use in geodetic networks", 1968): what the map and all other entries
-say of it against what it says itself. The worst goes first, and the rest is judged anew.
+The survey is aligned with the map by a rigid transform, weighted by the joint covariance of both. Each entry is then
+tested for a shift of its own (Baarda, "A testing procedure for use in geodetic networks", 1968): the prediction from
+the map and all other entries against the entry. The worst is removed, and the rest is tested again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,20 +21,20 @@ from groundsbot.offline.evaluation.survey_errors import ComponentSurvey, JudgedE
 from groundsbot.offline.foundation import CsvTable, read_table
 from groundsbot.offline.maps import Component, MapResult
 
-# What a tape measure and a plumb line leave, where the file does not say.
+# Accuracy of a tape measure and a plumb line, if the file has no sigma.
 DEFAULT_SIGMA_M: Final = 0.02
-# An entry of a good survey is named once in a thousand surveys.
+# Probability that a correct survey has an entry rejected.
 _FALSE_ALARM: Final = 1e-3
 _MAX_STEPS: Final = 20
 _MAX_PLACE_M: Final = 1e8  # no place on the earth is farther from the origin of any grid
-_MAX_SIGMA_M: Final = 1000.0  # as far as a tag is ever read from
+_MAX_SIGMA_M: Final = 1000.0  # beyond the range of any observation
 
 
 @dataclass(frozen=True)
 class SurveyEntry:
-    """One measured place, in the survey's own frame."""
+    """One measured position, in the survey's own frame."""
 
-    family: str  # empty: not said
+    family: str  # empty: not given
     tag_id: int
     instance: str
     position_m: FloatArray  # (2,)
@@ -42,7 +42,7 @@ class SurveyEntry:
 
 
 def read_survey(path: Path) -> list[SurveyEntry]:
-    """Reads `tag_id,x_m,y_m` and, where they are there, `sigma_m,family,instance`; other columns are not looked at.
+    """Read `tag_id,x_m,y_m` and, if present, `sigma_m,family,instance`; other columns are ignored.
 
     Raises:
         OfflineError: not such a file, or a tag twice in it.
@@ -70,15 +70,15 @@ def _check_once(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
     for row, entry in enumerate(entries):
         name = (entry.family, entry.tag_id, entry.instance)
         if name in seen:
-            table.fail(row, "tag_id", "is there twice; leave one row out, or tell them apart by instance")
+            table.fail(row, "tag_id", "is there twice; leave one row out, or give each its instance")
         seen.add(name)
 
 
 def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:
-    """Compares every component that shares three entries or more.
+    """Compare every component that shares three entries or more.
 
     Raises:
-        OfflineError: no component does, two entries mean one tag, or their places tell no direction.
+        OfflineError: no component does, two entries mean one tag, or their positions determine no rotation.
     """
     components, found = [], set()
     for component in result.components:
@@ -93,8 +93,8 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
             components.append(_judge(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
     if not components:
         raise OfflineError(
-            f"the survey shares {len(found)} tags with the map, and three in one component are the least that can be "
-            "judged; measure more tags, or give the survey of this map"
+            f"the survey shares {len(found)} tags with the map, at least three in one component are "
+            "needed; measure more tags, or give the survey of this map"
         )
     lost = [str(entry.tag_id) for k, entry in enumerate(entries) if k not in found]
     notes = [f"not in the map: tags {', '.join(lost)}"] if lost else []
@@ -102,43 +102,43 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
 
 
 def _tags_of(component: Component, entry: SurveyEntry, named: Mapping[tuple[int, str], Sequence[int]]) -> list[int]:
-    """The component's tag that an entry means, `named` by number and instance; none where that is not clear."""
+    """Return the component's tag that an entry means, `named` by id and instance; none if ambiguous."""
     same = named.get((entry.tag_id, entry.instance), ())
     fits = [i for i in same if entry.family in ("", component.tags[i].family)]
     return fits if len(fits) == 1 else []
 
 
 def _check_different(component: Component, tags: Sequence[int]) -> None:
-    """Refuses a tag that two entries mean: once with its family, say, and once without."""
+    """Refuse a tag that two entries mean, e.g. once with its family and once without."""
     for i in tags:
         if tags.count(i) > 1:
             tag = component.tags[i]
             raise OfflineError(
                 f"the survey has tag {tag.tag_id}{tag.instance} of {tag.family} twice, once without its family; leave "
-                "one row out, or say the family of both"
+                "one row out, or give the family of both"
             )
 
 
 def _check_extent(component: Component, entries: Sequence[SurveyEntry]) -> None:
-    """Refuses entries so close together that their turn about their middle is known no better than to a radian."""
+    """Refuse entries so close together that their rotation about their centre is uncertain by a radian."""
     places_m = np.array([entry.position_m for entry in entries])
     weight = np.array([entry.sigma_m for entry in entries]) ** -2.0
     from_middle_m = places_m - weight @ places_m / weight.sum()
     if weight @ (from_middle_m**2).sum(axis=1) <= 1.0:
         raise OfflineError(
-            f"the survey has the tags of {component.frame_run}'s component all in one place (within sigma_m), which "
-            "tells no direction; measure tags farther apart"
+            f"the survey has the tags of {component.frame_run}'s component all in one place (within sigma_m), so "
+            "its rotation is undetermined; measure tags farther apart"
         )
 
 
 @dataclass(frozen=True)
 class _SurveyFit:
-    """What a least-squares fit of the survey onto the map leaves over.
+    """Result of a least-squares fit of the survey to the map.
 
     Attributes:
         T_map_survey: (3,).
         residual: (2n,) map minus survey, in map axes.
-        reliability: (2n, 2n) A with A residual = Q^-1 (what the fit leaves over), A Q A = A.
+        reliability: (2n, 2n) A = Q^-1 R, with R the redundancy matrix of the fit and Q the covariance; A Q A = A.
     """
 
     T_map_survey: FloatArray
@@ -146,7 +146,7 @@ class _SurveyFit:
     reliability: FloatArray
 
     def shift(self, rows: Sequence[int]) -> tuple[FloatArray, float]:
-        """Of the rows of some entries: the shift that would explain them, and its squared length in sigmas."""
+        """Return the estimated shift of the entries with these rows, and its squared Mahalanobis length."""
         at = np.array(rows)
         pulled = (self.reliability @ self.residual)[at]
         shift: FloatArray = np.asarray(np.linalg.pinv(self.reliability[np.ix_(at, at)], rcond=1e-12) @ pulled)
@@ -154,7 +154,7 @@ class _SurveyFit:
 
 
 def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> _SurveyFit:
-    """Generalised least squares for the transform alone."""
+    """Fit the transform by generalised least squares."""
     information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     T_map_survey = fit_transform(map_m, survey_m)
     for _ in range(_MAX_STEPS):
@@ -173,12 +173,12 @@ def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> 
 
 
 def _solve_least_norm(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Of all solutions the shortest: where the entries that are left lie in one place, any turn will do."""
+    """Return the minimum-norm solution: if the remaining entries lie in one place, any rotation will do."""
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
 
 def _by_transform(placed_m: FloatArray) -> FloatArray:
-    """(2n, 3) derivative of places by a shift and a turn of the survey about the map's origin."""
+    """Return the derivative (2n, 3) of positions by a shift and a rotation of the survey about the map's origin."""
     jacobian = np.zeros((len(placed_m), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -placed_m[:, 1], placed_m[:, 0]
@@ -221,13 +221,13 @@ def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEn
 def _with(
     map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, part: list[int]
 ) -> tuple[list[int], _SurveyFit]:
-    """The fit of some entries."""
+    """Return the fit of some entries."""
     rows = np.array([(2 * k, 2 * k + 1) for k in part]).reshape(-1)
     return part, _adjust(map_m[part], survey_m[part], covariance[np.ix_(rows, rows)])
 
 
 def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
-    """Entries left after the worst have gone, one at a time; three at least."""
+    """Return the entries that are left after removing the worst, one at a time; at least three."""
     limit = chdtri(2, _FALSE_ALARM / len(map_m))
     good = list(range(len(map_m)))
     while len(good) > 3:
@@ -241,7 +241,7 @@ def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) ->
 
 
 def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, good: Sequence[int]) -> dict[int, int]:
-    """Among the entries that do not fit, pairs that do once exchanged."""
+    """Return pairs among the rejected entries that fit once exchanged."""
     found: dict[int, int] = {}
     odd = [k for k in range(len(map_m)) if k not in good]
     for a, b in combinations(odd, 2):
@@ -257,7 +257,7 @@ def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray,
 
 
 def _scale(adjusted: _SurveyFit, map_m: FloatArray) -> tuple[float, float]:
-    """How much longer the map is than the survey, as a share, and its sigma."""
+    """Return the relative excess of the map's scale over the survey's, and its sigma."""
     direction = (map_m - map_m.mean(axis=0)).reshape(-1)
     pulled = adjusted.reliability @ direction
     information = float(direction @ pulled)

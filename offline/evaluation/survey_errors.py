@@ -1,4 +1,4 @@
-"""What a survey and a map say of each other, in figures and in words."""
+"""Errors between a survey and a map, as figures and lines."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ class JudgedEntry:
     """One entry against the map.
 
     Attributes:
-        shift_m: from where the entry puts the tag to where the map and the other entries put it, in map axes (2,).
-        sigmas: length of that shift in its own sigmas.
+        shift_m: from the entry to the position by the map and the other entries, in map axes (2,).
+        sigmas: Mahalanobis length of that shift.
         verdict: "fits", "wrong" or "swapped".
         swapped_with: the other tag of a pair that fits once exchanged.
     """
@@ -27,12 +27,12 @@ class JudgedEntry:
     swapped_with: int | None = None
 
     def line(self) -> str:
-        """For a person; of entries that do not fit."""
+        """Return a line for the user about an entry that does not fit."""
         name = f"{self.tag.family} {self.tag.label}"
         off = f"{float(np.linalg.norm(self.shift_m)):.3f} m ({self.sigmas:.0f} sigmas)"
         if self.verdict == "swapped":
-            return f"entry {name} looks swapped with {self.swapped_with}: it fits there, and is off by {off} here"
-        return f"entry {name} looks wrong: the map and the other entries put the tag {off} away from it"
+            return f"entry {name} looks swapped with {self.swapped_with}: it fits there, and deviates by {off} here"
+        return f"entry {name} looks wrong: by the map and the other entries, the tag is {off} away from it"
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class ComponentSurvey:
     """One component against the survey; figures are of the entries that fit.
 
     Attributes:
-        rmse_m, worst_m: after plain least squares, which weighs all alike.
-        T_map_survey: (3,) how the survey lies in the map.
-        scale_error: by what share the map's distances are longer than the survey's, with its sigma.
-        nees_per_dim: of what the alignment leaves over; None where there is nothing over.
+        rmse_m, worst_m: after unweighted least squares.
+        T_map_survey: (3,) pose of the survey's frame in the map.
+        scale_error: relative excess of the map's distances over the survey's, with its sigma.
+        nees_per_dim: of the residuals of the alignment; None without redundancy.
     """
 
     frame_run: str
@@ -61,7 +61,7 @@ class ComponentSurvey:
         return tuple(entry for entry in self.entries if entry.verdict != "fits")
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {
             "frame_run": self.frame_run,
             "n_entries": len(self.entries),
@@ -86,14 +86,14 @@ class ComponentSurvey:
         }
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         n_good = len(self.entries) - len(self.odd)
-        nees = "nothing left over to judge by" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
+        nees = "no redundancy" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
         lines = [
             f"frame: start of {self.frame_run}; {len(self.entries)} surveyed tags, {n_good} fit",
             f"  aligned, those that fit: RMSE {self.rmse_m:.3f} m, worst {self.worst_m:.3f} m",
             f"  scale: {100.0 * self.scale_error:+.2f} % against the survey (sigma {100.0 * self.scale_sigma:.2f} %)",
-            f"  NEES per dimension (1 is honest): {nees}",
+            f"  NEES per dimension (1 is consistent): {nees}",
         ]
         return lines + [f"  {entry.line()}" for entry in self.odd]
 
@@ -106,10 +106,10 @@ class SurveyErrors:
     notes: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data; the largest component's figures on top."""
+        """Return plain data; the largest component's figures at the top."""
         parts = [component.as_json() for component in self.components]
         return parts[0] | {"components": parts, "notes": list(self.notes)}
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         return [line for component in self.components for line in component.lines()] + list(self.notes)

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 
-# A reading's stamp is an estimate too: this far beyond the truth's ends its end stands for it.
+# Stamps of readings are estimates too: up to this far beyond the truth's ends, its end is used.
 _END_TOLERANCE_NS: Final = 100_000_000
 
 TagName = tuple[str, int, str]  # family, id, instance
@@ -20,13 +20,13 @@ TagName = tuple[str, int, str]  # family, id, instance
 
 @dataclass(frozen=True)
 class TrueRun:
-    """Where a robot truly was."""
+    """True trajectory of a robot."""
 
-    stamps_ns: IntArray  # (N,), rising
+    stamps_ns: IntArray  # (N,), ascending
     T_world_base: FloatArray  # (N, 3)
 
     def at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Poses (K, 3) at stamps (K,), on the arc between neighbours; and which stamps (K,) the truth covers."""
+        """Return poses (K, 3) at stamps (K,), on the arc between neighbours, and which stamps (K,) the truth covers."""
         first, last = self.stamps_ns[0], self.stamps_ns[-1]
         covered = (stamps_ns >= first - _END_TOLERANCE_NS) & (stamps_ns <= last + _END_TOLERANCE_NS)
         if len(self.stamps_ns) == 1:
@@ -40,18 +40,18 @@ class TrueRun:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where everything truly was."""
+    """True trajectories and tag positions."""
 
     runs: dict[str, TrueRun]
     tags_m: dict[TagName, FloatArray]  # (2,) in the world frame
-    ambiguous: frozenset[TagName]  # listed more than once, so that a place cannot be told
+    ambiguous: frozenset[TagName]  # listed more than once
 
 
 def read_truth(path: Path) -> Truth:
-    """Reads truth.json.
+    """Read truth.json.
 
     Raises:
-        OfflineError: missing, not JSON, or a key or value that is not as design and docs/formats.md say.
+        OfflineError: missing, not JSON, or a key or value that is not as in docs/formats.md.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -83,8 +83,8 @@ def _true_run(path: Path, name: str, entry: dict[str, Any]) -> TrueRun:
     poses = entry["poses"]
     if not poses or any(len(pose) != 4 for pose in poses):
         raise OfflineError(f"{path}: runs.{name}.poses must hold rows of t_ns, x_m, y_m, theta_rad; correct it")
-    stamps_ns = np.array([pose[0] for pose in poses], dtype=np.int64)  # not by way of floats, which lose nanoseconds
+    stamps_ns = np.array([pose[0] for pose in poses], dtype=np.int64)  # not via floats, which lose nanoseconds
     T_world_base = np.array([pose[1:] for pose in poses], dtype=np.float64)
     if (np.diff(stamps_ns) <= 0).any() or not np.isfinite(T_world_base).all():
-        raise OfflineError(f"{path}: runs.{name}.poses has times that do not rise or numbers not finite; correct it")
+        raise OfflineError(f"{path}: runs.{name}.poses has times not increasing or numbers not finite; correct it")
     return TrueRun(stamps_ns, T_world_base)

@@ -1,6 +1,6 @@
-"""A finished map in the forms of other tools: g2o, TUM, GeoJSON, FRC layouts, Limelight, CSV.
+"""Export of a finished map for other tools: g2o, TUM, GeoJSON, FRC layouts, Limelight, CSV.
 
-In: a map. Out: files; docs/formats.md says units and frames of each. The paper has no such block.
+In: a map. Out: files, with units and frames as in docs/formats.md. The paper has no such block.
 """
 
 from lazy_loader import attach_stub

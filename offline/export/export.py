@@ -1,4 +1,4 @@
-"""A finished map in the form of other tools; docs/formats.md says units and frames of each."""
+"""Export of a finished map for other tools; docs/formats.md gives units and frames of each format."""
 
 import csv
 import io
@@ -22,21 +22,21 @@ Lines = list[str]
 
 
 def export_map(folder: Path, options: ExportOptions) -> Lines:
-    """Writes one component of a map.
+    """Write one component of a map.
 
     Args:
-        folder: what `map -o` wrote.
+        folder: of the map that `map -o` wrote.
         options: format, output and what the format needs besides.
 
     Returns:
-        What a person should know.
+        Lines for the user.
 
     Raises:
         GroundsbotError: the output exists, or the map does not hold what the format needs; nothing is written then.
     """
     options.check()
     if os.path.lexists(options.output):
-        raise OfflineError(f"-o {options.output}: exists already; nothing is written over, give another output")
+        raise OfflineError(f"-o {options.output}: exists already and is not overwritten; give another output")
     result = read_map(folder)
     component = _component(result, options.component)
     try:
@@ -56,7 +56,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
 
 
 def _component(result: MapResult, index: int | None) -> Component:
-    """The one asked for, or the only one."""
+    """Return the one asked for, or the only one."""
     n = len(result.components)
     if index is None and n == 1:
         return result.components[0]
@@ -65,16 +65,14 @@ def _component(result: MapResult, index: int | None) -> Component:
         for i, each in enumerate(result.components)
     )
     if index is None:
-        raise OfflineError(
-            f"the map has {n} components, each with a frame of its own; choose one by --component: {which}"
-        )
+        raise OfflineError(f"the map has {n} components, each in its own frame; choose one with --component: {which}")
     if index >= n:
-        raise OfflineError(f"--component {index}: the map has none of that number; choose among {which}")
+        raise OfflineError(f"--component {index}: the map has no such component; choose among {which}")
     return result.components[index]
 
 
 def _suspects(result: MapResult, component: Component) -> Lines:
-    """Tags that the map itself mistrusts, which other tools have no word for."""
+    """Return a warning for each tag with outliers, as other tools' formats cannot mark them."""
     there = {(tag.family, tag.tag_id) for tag in component.tags}
     return [f"warning: suspect: {each.line()}" for each in result.suspects if (each.family, each.tag_id) in there]
 
@@ -108,7 +106,7 @@ def _g2o(component: Component, result: MapResult, _options: ExportOptions) -> tu
     lines = [_measure(component)]
     used = {each.component for each in result.measurements}
     if any(each is component and i in used for i, each in enumerate(result.components)):
-        lines.append("warning: what --start and --distance measured is not in it; without them its optimum is another")
+        lines.append("warning: --start and --distance measurements are not exported; the graph's optimum differs")
     return g2o_text(component), lines
 
 

@@ -1,6 +1,6 @@
-"""Tags as FRC tools have them: WPILib's AprilTagFieldLayout and Limelight's .fmap.
+"""Tag layouts of FRC tools: WPILib's AprilTagFieldLayout and Limelight's .fmap.
 
-Both want a tag's pose in space. Their tag frame has x out of the printed face and z up.
+Both need a tag's pose in space. Their tag frame has x out of the printed face and z up.
 """
 
 from typing import Any, Final
@@ -17,15 +17,15 @@ _LIMELIGHT_FAMILIES: Final = {"tag36h11": "apriltag3_36h11_classic", "tag16h5": 
 
 
 def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any], list[str]]:
-    """The layout, and what a person should know.
+    """Return the layout, and lines for the user.
 
     Raises:
-        OfflineError: something is missing that a layout needs.
+        OfflineError: something that a layout needs is missing.
     """
     if options.field_m is None:
         raise OfflineError(
-            "--format frc: a layout says how large the field is, about whose middle WPILib turns it for the other "
-            "alliance; give --field-m LENGTH,WIDTH"
+            "--format frc: a layout needs the size of the field, as WPILib rotates it about the field's centre for the "
+            "other alliance; give --field-m LENGTH,WIDTH"
         )
     length_m, width_m = numbers("--field-m", options.field_m, "LENGTH,WIDTH")
     if min(length_m, width_m) <= 0.0:
@@ -35,24 +35,24 @@ def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[st
     chosen = [tag for tag in component.tags if tag.family == family and not tag.instance]
     placed, said = tags_in_space(component, chosen, options)
     if twice:
-        said.append(f"left out, since a layout has one place for an id: {', '.join(map(str, twice))}")
+        said.append(f"left out, since a layout has one pose per id: {', '.join(map(str, twice))}")
     tags = [{"ID": each.tag.tag_id, "pose": _wpilib_pose(each)} for each in placed]
     return {"tags": tags, "field": {"length": length_m, "width": width_m}}, said
 
 
 def fmap_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any], list[str]]:
-    """The .fmap, and what a person should know.
+    """Return the .fmap, and lines for the user.
 
     Raises:
-        OfflineError: something is missing that it needs.
+        OfflineError: something that it needs is missing.
     """
     for tag in component.tags:
         if tag.family not in _LIMELIGHT_FAMILIES:
             known = ", ".join(_LIMELIGHT_FAMILIES)
-            raise OfflineError(f"--format limelight: knows tags of {known}, not of {tag.family}; choose another format")
+            raise OfflineError(f"--format limelight: supports {known}, not {tag.family}; choose another format")
         if tag.size_m is None:
             raise OfflineError(
-                f"--format limelight: wants the size of each tag, and that of {tag.tag_id} is not known to the map "
+                f"--format limelight: needs the size of each tag, and the map has none of tag {tag.tag_id} "
                 "(its positions were imported); import the log with --robot, or choose another format"
             )
     placed, said = tags_in_space(component, component.tags, options)
@@ -76,8 +76,8 @@ def _one_family(component: Component, wanted: str | None) -> str:
     if wanted is None and len(families) == 1:
         return families[0]
     if wanted not in families:
-        asked = "--format frc: a layout tells no families apart" if wanted is None else f"--family {wanted}: not there"
-        raise OfflineError(f"{asked}, and the map has {', '.join(families)}; choose one by --family")
+        asked = "--format frc: a layout holds one family" if wanted is None else f"--family {wanted}: not there"
+        raise OfflineError(f"{asked}, and the map has {', '.join(families)}; choose one with --family")
     return wanted
 
 

@@ -1,6 +1,7 @@
 """A component's graph as g2o text: github.com/RainerKuemmerle/g2o/wiki/File-Format, types of its slam2d.
 
-Keyframes are VERTEX_SE2, tags VERTEX_XY; motions EDGE_SE2, tags seen EDGE_SE2_XY. The first keyframe is the frame: FIX.
+Keyframes are VERTEX_SE2, tags VERTEX_XY; motions EDGE_SE2, observations EDGE_SE2_XY. The first keyframe is the frame:
+FIX.
 """
 
 from collections.abc import Iterator
@@ -13,15 +14,15 @@ from groundsbot.offline.maps import Component, GraphEdges
 
 
 def g2o_text(component: Component) -> str:
-    """Vertices and edges, each a line; at the end what is held, and comments that say what the vertices are.
+    """Return vertices and edges, a line each; then the fixed vertex, and comments that name the vertices.
 
-    The end is where they have to stand: gtsam's reader takes no edges behind a comment or FIX.
+    These must come last: gtsam's reader ignores edges after a comment or FIX.
 
     Raises:
         OfflineError: the map holds no graph.
     """
     if component.edges is None:
-        raise OfflineError("map.npz holds no graph (the map was made before it did); make the map again")
+        raise OfflineError("map.npz holds no graph, as an older version made it; make the map again")
     first_tag = sum(run.n_keyframes for run in component.runs)
     lines = [*_vertices(component), *_edges(component.edges, first_tag), "FIX 0", *_names(component)]
     return "\n".join(lines) + "\n"
@@ -60,7 +61,7 @@ def _edges(edges: GraphEdges, first_tag: int) -> Iterator[str]:
 
 
 def _upper(matrices: FloatArray) -> list[list[float]]:
-    """The upper triangles, row by row."""
+    """Return the upper triangles, row by row."""
     rows, columns = np.triu_indices(matrices.shape[-1])
     found: list[list[float]] = matrices[:, rows, columns].tolist()
     return found

@@ -16,17 +16,17 @@ _FLATTENING: Final = 1.0 / 298.257223563
 _B_M: Final = _A_M * (1.0 - _FLATTENING)
 _E2: Final = _FLATTENING * (2.0 - _FLATTENING)
 _DIGITS: Final = 9  # 0.1 mm
-_MAX_LATITUDE_DEG: Final = 89.9  # at a pole east and north mean nothing
+_MAX_LATITUDE_DEG: Final = 89.9  # at a pole east and north are undefined
 
 
 class TangentPlane:
-    """The map's floor as the plane that touches the ellipsoid in its origin."""
+    """The map's floor as the tangent plane of the ellipsoid at the map's origin."""
 
     def __init__(self, origin: str) -> None:
         """Args: origin: LAT_DEG,LON_DEG,HEADING_DEG.
 
         Raises:
-            OfflineError: it is not on the earth.
+            OfflineError: it is not a valid position.
         """
         self.latitude_deg, self.longitude_deg, heading_deg = numbers("--origin", origin, "LAT_DEG,LON_DEG,HEADING_DEG")
         if abs(self.latitude_deg) > _MAX_LATITUDE_DEG or abs(self.longitude_deg) > 180.0:
@@ -35,11 +35,11 @@ class TangentPlane:
                 "latitude comes first"
             )
         heading = radians(heading_deg)
-        # Columns: where the map's x and y axes point, as (east, north).
+        # Columns: the map's x and y axes as (east, north).
         self.R_east_map: FloatArray = np.array([[sin(heading), -cos(heading)], [cos(heading), sin(heading)]])
 
     def longitude_latitude(self, position_m: FloatArray) -> list[float]:
-        """Degrees, longitude first as RFC 7946 has it, of (2,) in map.
+        """Return degrees, longitude first as in RFC 7946, of a position (2,) in map.
 
         East, north -> earth-centred -> geodetic: Bowring, "Transformation from spatial to geographical coordinates",
         Survey Review 23 (1976), exact to far below a millimetre this near the ground.
@@ -60,14 +60,14 @@ class TangentPlane:
 
 
 def geojson_of(component: Component, options: ExportOptions) -> dict[str, Any]:
-    """A FeatureCollection.
+    """Return a FeatureCollection.
 
     Raises:
-        OfflineError: nobody says where on the earth the map lies.
+        OfflineError: the map's position on the earth is not given.
     """
     if options.origin is None:
         raise OfflineError(
-            "--format geojson: a map does not know where on the earth it lies; give "
+            "--format geojson: a map holds no position on the earth; give "
             "--origin LAT_DEG,LON_DEG,HEADING_DEG of its frame, the start of " + component.frame_run
         )
     place = TangentPlane(options.origin)
@@ -98,7 +98,7 @@ def _runs(component: Component, place: TangentPlane) -> list[dict[str, Any]]:
     for run in component.runs:
         line = [place.longitude_latitude(position_m) for position_m in run.T_map_base[:, :2]]
         said = {"kind": "run", "run": run.name, "robot": run.robot_id, "distance_m": run.distance_m}
-        # A line has two positions or more.
+        # A LineString needs two positions.
         features.append(_feature("LineString", line if len(line) > 1 else line * 2, said))
     return features
 

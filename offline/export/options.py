@@ -1,4 +1,4 @@
-"""What `export` is asked for; light, since the help shows it."""
+"""Options of `export`; imports nothing heavy, since the help shows them."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,7 +9,7 @@ from groundsbot.offline.errors import OfflineError
 
 
 class ExportFormat(StrEnum):
-    """What `export` can write."""
+    """Formats that `export` writes."""
 
     G2O = "g2o"
     TUM = "tum"
@@ -32,7 +32,7 @@ _ONLY_FOR: Final = {
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What the command line says."""
+    """Options of the command line."""
 
     form: ExportFormat
     output: Path
@@ -45,7 +45,7 @@ class ExportOptions:
     family: str | None = None
 
     def check(self) -> None:
-        """Refuses options that the format has no use for.
+        """Refuse options that the format does not use.
 
         Raises:
             OfflineError: one was given.
@@ -53,13 +53,13 @@ class ExportOptions:
         for name, forms in _ONLY_FOR.items():
             if getattr(self, name) not in (None, False) and self.form not in forms:
                 raise OfflineError(
-                    f"--{name.replace('_', '-')}: means nothing to --format {self.form} (only to {', '.join(forms)}); "
+                    f"--{name.replace('_', '-')}: is not used by --format {self.form} (only by {', '.join(forms)}); "
                     "leave it out"
                 )
 
 
 def numbers(option: str, text: str, names: str) -> list[float]:
-    """The finite numbers of an option such as `--field-m 16.5,8.2`, as many as there are names.
+    """Return the finite numbers of an option such as `--field-m 16.5,8.2`, as many as there are names.
 
     Raises:
         OfflineError: they are not numbers, or not as many.
@@ -69,5 +69,5 @@ def numbers(option: str, text: str, names: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != len(names.split(",")) or not all(abs(value) < 1e9 for value in values):
-        raise OfflineError(f"{option} {text}: must be {names}, numbers with commas between")
+        raise OfflineError(f"{option} {text}: must be {names}, numbers separated by commas")
     return values

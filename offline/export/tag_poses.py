@@ -1,4 +1,4 @@
-"""Heights and directions of tags: as measured, as a map of corners holds them, or as somebody assumes.
+"""Heights and directions of tags: as measured, as in a map of corners, or as assumed.
 
 A map of the floor estimates neither.
 """
@@ -19,22 +19,22 @@ from groundsbot.offline.maps import Component, TagResult
 
 _Key = tuple[str, int, str]
 
-# Layouts have x out of the face, y to the viewer's right and z up; the map's tags z out of it, x to the right and y up.
+# Tag axes of layouts: x out of the face, y to the viewer's right, z up; of the map: z out of it, x to the right, y up.
 _TO_LAYOUT: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class PlacedTag:
-    """A tag in space."""
+    """Pose of a tag in space."""
 
     tag: TagResult
     z_m: float  # of its centre above the floor
-    R_map_tag: Rotation  # of a tag frame with x out of the face, and z up where it hangs upright
+    R_map_tag: Rotation  # of a tag frame with x out of the face, and z up if it is upright
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """What a row of --tag-poses says; None where it says nothing."""
+    """Height and yaw in a row of --tag-poses; None for empty cells."""
 
     z_m: float | None
     yaw_rad: float | None
@@ -43,15 +43,15 @@ class _Measured:
 def tags_in_space(
     component: Component, tags: Sequence[TagResult], options: ExportOptions
 ) -> tuple[list[PlacedTag], list[str]]:
-    """Some of a component's tags: as --tag-poses says, else as the map has it, else by --tag-height-m, --face-viewers.
+    """Return poses of some tags: from --tag-poses, else from the map, else by --tag-height-m and --face-viewers.
 
-    Where the map has a tag's tilt, a direction that --tag-poses gives turns it about the vertical only.
+    If the map has a tag's tilt, a yaw from --tag-poses only rotates the tag about the vertical.
 
     Returns:
-        The tags, and what was assumed of how many.
+        The tags, and lines on what was assumed for how many.
 
     Raises:
-        OfflineError: nothing tells a tag's height or direction, or --tag-poses cannot be read.
+        OfflineError: a tag's height or direction is not given, or --tag-poses cannot be read.
     """
     if options.tag_height_m is not None and not isfinite(options.tag_height_m):
         raise OfflineError(f"--tag-height-m {options.tag_height_m}: must be a number of metres")
@@ -70,15 +70,15 @@ def tags_in_space(
         if z_m is None or yaw_rad is None:
             raise OfflineError(_what_is_missing(tag, z_m, options))
         placed.append(PlacedTag(tag, z_m, _rotate(tag, yaw_rad)))
-    said = [] if tags and not n_upright else ["taken for upright, with x out of the face"]
+    said = [] if tags and not n_upright else ["treated as upright, with x out of the face"]
     if 0 < n_upright < len(placed):
-        said = [f"taken for upright, with x out of the face: {n_upright} of {len(placed)} tags"]
+        said = [f"treated as upright, with x out of the face: {n_upright} of {len(placed)} tags"]
     if n_heights:
-        said.append(f"assumed: {n_heights} of {len(placed)} tags hang {options.tag_height_m} m above the floor")
+        said.append(f"assumed: {n_heights} of {len(placed)} tags are {options.tag_height_m} m above the floor")
     if n_directions:
         said.append(
-            f"assumed: {n_directions} of {len(placed)} tags face where they were seen from; such directions are off "
-            "by tens of degrees"
+            f"assumed: {n_directions} of {len(placed)} tags face the mean direction of their observations; errors are "
+            "tens of degrees"
         )
     return placed, said
 
@@ -88,7 +88,7 @@ def _first(value: float | None, otherwise: float | None) -> float | None:
 
 
 def _rotate(tag: TagResult, yaw_rad: float) -> Rotation:
-    """R_map_tag in the axes of layouts, the face to a direction, tilted as the map has it."""
+    """Return R_map_tag in the axes of layouts for a yaw of the face, with the map's tilt."""
     if tag.pose is None:
         return Rotation.from_euler("z", yaw_rad)
     turn = Rotation.from_euler("z", yaw_rad - tag.pose.yaw_rad)
@@ -97,7 +97,7 @@ def _rotate(tag: TagResult, yaw_rad: float) -> Rotation:
 
 def _what_is_missing(tag: TagResult, z_m: float | None, options: ExportOptions) -> str:
     what, column, instead = ("height", "z_m", "--tag-height-m") if z_m is None else ("direction", "yaw_rad", "")
-    instead = instead or "--face-viewers (off by tens of degrees)"
+    instead = instead or "--face-viewers (errors of tens of degrees)"
     return (
         f"--format {options.form}: the map does not hold the {what} of tag {tag.label} ({tag.family}); "
         f"fill in {column} in a copy of tags.csv for --tag-poses, or give {instead}"
@@ -109,14 +109,14 @@ def _key(tag: TagResult) -> _Key:
 
 
 def _towards_viewers(component: Component) -> Mapping[_Key, float]:
-    """The mean direction from each tag to where it was read from.
+    """Return the mean direction from each tag to the poses that observed it.
 
     Raises:
-        OfflineError: the map holds no readings.
+        OfflineError: the map holds no observations.
     """
     edges = component.edges
     if edges is None:
-        raise OfflineError("--face-viewers: map.npz holds no graph (it was made before it did); make the map again")
+        raise OfflineError("--face-viewers: map.npz holds no graph, as an older version made it; make the map again")
     poses = np.concatenate([run.T_map_base for run in component.runs])
     found = {}
     for i, tag in enumerate(component.tags):
@@ -128,7 +128,7 @@ def _towards_viewers(component: Component) -> Mapping[_Key, float]:
 
 
 def _read(path: Path, component: Component) -> Mapping[_Key, _Measured]:
-    """Rows by tag; `family` may be left out where ids are enough, and columns of no use here are passed over."""
+    """Return rows by tag; `family` is optional if ids are unique, other columns are ignored."""
     table = read_table(path)
     for column in ("tag_id", "z_m", "yaw_rad"):
         if column not in table:
@@ -148,7 +148,7 @@ def _read(path: Path, component: Component) -> Mapping[_Key, _Measured]:
 
 
 def _number(table: CsvTable, column: str, row: int) -> float | None:
-    """A cell, which may be empty."""
+    """Return a cell, None if empty."""
     text = table.text(column)[row]
     if not text:
         return None

@@ -1,6 +1,6 @@
-"""Recordings of others made into run logs: CSV folders and ROS bags.
+"""Import of foreign recordings, CSV folders and ROS bags, as run logs.
 
-In: a folder or a bag, and what the user says of the robot. Out: a run log that `map` reads like a recorded one. In the
+In: a folder or a bag, and options that describe the robot. Out: a run log that `map` reads like a recorded one. In the
 paper: its recorded data, which can be imported as CSV.
 """
 

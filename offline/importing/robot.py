@@ -1,4 +1,4 @@
-"""What is known of an imported run's robot: from the command line, from a robot.yaml, or said to be unknown."""
+"""Robot of an imported run: from the command line, from a robot.yaml, or with unknown parameters left open."""
 
 import re
 from dataclasses import dataclass
@@ -14,41 +14,41 @@ from groundsbot.offline.errors import OfflineError
 
 @dataclass(frozen=True)
 class WheelScale:
-    """What turns ticks or speeds into wheel distances; None where the command line did not say."""
+    """Scale from ticks or speeds to wheel distances; None if the command line does not give it."""
 
     track_m: float | None
     metres_per_tick_left: float | None
     metres_per_tick_right: float | None
-    tick_flags: tuple[str, ...] = ()  # options of the command line that tell of ticks
+    tick_flags: tuple[str, ...] = ()  # options of the command line about ticks
 
 
-# What nobody measured of a robot whose recording is imported without its robot.yaml: sigmas wide enough for what the
-# recordings of others show (docs/estimate.md). Its drives tell these numbers.
+# Prior sigmas of unmeasured parameters of a robot without robot.yaml: wide enough for what foreign recordings show
+# (docs/estimate.md). Mapping estimates these parameters.
 UNKNOWN_MOUNT_SIGMA_M: Final = 0.5
 UNKNOWN_MOUNT_SIGMA_YAW_RAD: Final = radians(8.0)
 UNKNOWN_TIME_OFFSET_SIGMA_S: Final = 0.3
 UNKNOWN_RANGE_OFFSET_SIGMA_M: Final = 0.1
-# Who vouches for the metre. Encoders count what wheels of a measured radius roll; a speed of the whole robot may be
-# what was commanded. A range sensor was calibrated by somebody; a detector of tags was told a size, often a wrong one.
+# Relative uncertainty of the scale. Encoders measure the rotation of wheels of known radius; a robot's speed may be the
+# commanded one. A range sensor was calibrated; a tag detector was configured with a tag size, often a wrong one.
 ENCODER_SCALE_SIGMA: Final = 0.01
 SPEED_SCALE_SIGMA: Final = 0.05
 RANGE_SCALE_SIGMA: Final = 0.02
 TOLD_SIZE_SIGMA: Final = 0.15
 UNKNOWN_WHEEL_RATIO_SIGMA: Final = 0.02
-UNKNOWN_TRACK_SIGMA: Final = 0.3  # as a share: wheels skid, and turning speeds were calibrated by somebody or not
-# The log holds metres, so radius and ticks are not used; robot.yaml must name some.
+UNKNOWN_TRACK_SIGMA: Final = 0.3  # relative: wheels skid, and turning speeds may be uncalibrated
+# The log holds metres, so radius and ticks are not used, but robot.yaml requires them.
 _NOMINAL_RADIUS_M: Final = 0.1
 _NOMINAL_TICKS_PER_TURN: Final = 1000
-# Where odometry holds poses or turning speeds, nothing but the look of robot.yaml depends on it.
+# Placeholder in robot.yaml where odometry holds poses or turning speeds, which do not depend on it.
 NOMINAL_TRACK_M: Final = 0.5
-# Fewer states a second tell no path, more no robot has; and stamps are whole nanoseconds that 63 bits hold.
+# A lower rate gives no path, a higher one is implausible; and stamps must fit into 63 bits of nanoseconds.
 _STATE_RATES_HZ: Final = (0.1, 1000.0)
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the command line says of the run; None where it says nothing."""
+    """Options of the command line for the run; None if not given."""
 
     run_id: str | None = None
     robot_id: str | None = None
@@ -76,8 +76,8 @@ class ImportOptions:
             value = getattr(self, option)
             if value is not None and not _SAFE_NAME.fullmatch(value):
                 raise OfflineError(
-                    f"{_flag(option)} is {value!r}; it may hold letters, digits, dot, dash and underscore, "
-                    "begins with a letter or digit and has at most 64 of them"
+                    f"{_flag(option)} is {value!r}; use at most 64 letters, digits, dots, dashes and "
+                    "underscores, the first a letter or digit"
                 )
 
     def _check_number(self, option: str, *, positive: bool) -> None:
@@ -89,26 +89,26 @@ class ImportOptions:
 
     @property
     def has_mount(self) -> bool:
-        """Whether any part of the camera's place was given."""
+        """Whether any part of the camera's pose is given."""
         return any(value is not None for value in (self.camera_x_m, self.camera_y_m, self.camera_yaw_deg))
 
     @property
     def tick_flags(self) -> tuple[str, ...]:
-        """Those given that tell how long a tick is."""
+        """Given options that define the length of a tick."""
         return tuple(_flag(o) for o in ("wheel_radius_m", "ticks_per_turn") if getattr(self, o) is not None)
 
 
 @dataclass(frozen=True)
 class KnownRobot:
-    """What the recording itself tells of its robot.
+    """Parameters of the robot that the recording itself implies.
 
     Attributes:
-        mount: where its camera sits.
+        mount: of its camera.
         family: of its tags.
         tag_size_m: of them.
         needs_track: whether the distance between the wheels matters.
-        wheel_scale_sigma: how well a metre by its odometry is known, as a share.
-        range_scale_sigma: likewise a metre by its positions of tags.
+        wheel_scale_sigma: relative sigma of the odometry's scale.
+        range_scale_sigma: relative sigma of the scale of its tag positions.
     """
 
     mount: Mount | None = None
@@ -120,7 +120,7 @@ class KnownRobot:
 
 
 def safe_name(recording: Path) -> str:
-    """A folder's name, or a file's without its ending; all but letters, digits, dot, dash, underscore become dashes."""
+    """Return a folder's name or file's stem, with all but letters, digits, dots and underscores replaced by dashes."""
     path = recording.resolve()
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem if path.is_file() else path.name).lstrip("._-")[:64]
     if not name:
@@ -129,7 +129,7 @@ def safe_name(recording: Path) -> str:
 
 
 def wheel_scale(options: ImportOptions) -> WheelScale:
-    """Lengths of ticks and track: an option wins over robot.yaml."""
+    """Return lengths of ticks and track; an option overrides robot.yaml."""
     robot = read_robot_yaml(options.robot) if options.robot else None
     if robot is None:
         if options.wheel_radius_m is None or options.ticks_per_turn is None:
@@ -143,13 +143,13 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
 def describe_robot(
     recording: Path, options: ImportOptions, in_camera: bool, known: KnownRobot | None = None
 ) -> tuple[Robot, str, list[str]]:
-    """The run's robot, its robot.yaml as text for the log, and what a person should know of it.
+    """Return the run's robot, its robot.yaml as text for the log, and remarks for the user.
 
     Args:
-        recording: after which the robot is named unless it has a name.
+        recording: names the robot if the options do not.
         options: of the command line.
         in_camera: whether observations are in the camera's frame, so that its mount matters.
-        known: from the recording; robot.yaml and options win over it.
+        known: from the recording; robot.yaml and options override it.
 
     Raises:
         OfflineError: the track width is given nowhere.
@@ -162,8 +162,8 @@ def describe_robot(
     else:
         data = _bare_robot(recording, options, known)
         said = (
-            "robot.yaml made from the options; what nobody measured (clock, mount, track, ratio of the wheels, size "
-            "of tags, offset of ranges) is left open, and map finds it"
+            "robot.yaml made from the options; other parameters (clock, mount, track, ratio of the wheels, size "
+            "of tags, offset of ranges) have wide sigmas, and map estimates them"
         )
     if options.robot_id is not None:
         data["robot_id"] = options.robot_id
@@ -181,8 +181,8 @@ def describe_robot(
 def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> dict[str, Any]:
     if options.track_width_m is None and known.needs_track:
         raise OfflineError(
-            f"{recording}: the distance between the wheels is not known; give --track-width-m (about will do, the "
-            "drives tell it) or --robot"
+            f"{recording}: the distance between the wheels is unknown; give --track-width-m (roughly: map "
+            "estimates it) or --robot"
         )
     bare: dict[str, Any] = {
         "robot_id": options.robot_id or safe_name(recording),
@@ -223,7 +223,7 @@ def _wheels_from_options(options: ImportOptions) -> dict[str, float]:
 
 
 def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
-    """Puts the camera where the options say. What neither they nor anything else tells is 0 with a wide sigma."""
+    """Set the mount that the options give; unknown coordinates become 0 with a wide sigma. Return a remark."""
     yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
     assumed = []
     for field, given, sigma, said in (
@@ -243,7 +243,7 @@ def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
             mount[field], mount[f"{field}_sigma"] = 0.0, sigma
             assumed.append(said)
     place = f"camera at x {mount['x_m']:g} m, y {mount['y_m']:g} m, yaw {degrees(mount['yaw_rad']):g} deg of the base"
-    return f"{place}; not given, so taken as 0 with a wide sigma: {', '.join(assumed)}" if assumed else place
+    return f"{place}; not given, so assumed to be 0 with a wide sigma: {', '.join(assumed)}" if assumed else place
 
 
 def _flag(option: str) -> str:

@@ -1,4 +1,4 @@
-"""What every import writes: one run of one robot, whole or not at all."""
+"""Output of every import: one run of one robot, complete or not at all."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Entry = tuple[int, str, Message]  # stamp in ns, topic, message
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What was imported, and what a person should know of it."""
+    """Summary of an import, with remarks for the user."""
 
     run_folder: Path
     run_id: str
@@ -29,7 +29,7 @@ class ImportReport:
     remarks: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         drive = (
             f"{plural(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
         )
@@ -42,30 +42,30 @@ class ImportReport:
 
 
 def check_output(output: Path, run_folder: Path) -> None:
-    """`output` may hold other runs and what is hidden, nothing else.
+    """Check that `output` holds nothing but other runs and hidden files.
 
     Raises:
         OfflineError: it does, or holds this run already.
     """
     if output.exists() and not output.is_dir():
-        raise OfflineError(f"{output}: is no folder; give a new or empty one")
+        raise OfflineError(f"{output}: is not a folder; give a new or empty one")
     if run_folder.exists():
         raise OfflineError(f"{run_folder}: exists already; give another output, another --run-id, or remove it")
     if not output.exists():
         return
     for entry in sorted(output.iterdir()):
-        if entry.name.startswith("."):  # of another import under way, or of a desktop
+        if entry.name.startswith("."):  # of another running import, or of a desktop
             continue
         if not (entry.is_dir() and any(entry.rglob("*.mcap"))):
-            raise OfflineError(f"{output}: is not empty: {entry.name} is no run's log; give a new or empty folder")
+            raise OfflineError(f"{output}: is not empty: {entry.name} is not a run's log; give a new or empty folder")
 
 
 def write_run(run_folder: Path, head: Mapping[str, Message], entries: Iterable[Entry]) -> None:
-    """Writes `run_folder/0000.core.mcap`.
+    """Write `run_folder/0000.core.mcap`.
 
     Args:
-        run_folder: made, whole or not at all.
-        head: `/run` and what else stands at the head of each file.
+        run_folder: created, complete or not at all.
+        head: `/run` and other messages that begin each file.
         entries: in order of time, at least one.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Looking into logs: what one holds, a damaged one made whole, tags detected again in recorded pictures.
+"""Inspection and repair of logs: summaries, salvaging damaged logs, detecting tags again in recorded pictures.
 
-In: run logs. Out: a summary, or a new log; the old one stays as it is. In the paper: its recorded data.
+In: run logs. Out: a summary, or a new log; the old one is not changed. In the paper: its recorded data.
 """
 
 from lazy_loader import attach_stub

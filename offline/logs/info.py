@@ -1,4 +1,4 @@
-"""What a log holds, for a person or a program."""
+"""Summary of a log, for a person or a program."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
@@ -29,8 +29,8 @@ from groundsbot.onboard.log import (
 
 _NS_PER_S: Final = 1_000_000_000
 _EARLIEST_NS: Final = 946_684_800 * _NS_PER_S  # 2000-01-01: no log is older
-_GAP_S: Final = 0.5  # wheel readings missing for longer leave the motion unknown
-_GAP_INTERVALS: Final = 5  # and in a slow log, as long as this many usual intervals
+_GAP_S: Final = 0.5  # the motion during a longer gap of wheel readings is unknown
+_GAP_INTERVALS: Final = 5  # in a slow log, the limit is this many usual intervals
 _WHEELS: Final = ("/wheels", "/odometry")
 _STREAMS: Final = (*_WHEELS, "/tags/detections", "/camera/image")
 _GAPS_SHOWN: Final = 5
@@ -39,7 +39,7 @@ _PLACES_TOLD: Final = 20
 
 @dataclass(frozen=True)
 class Gap:
-    """A time without messages on a topic that else has a steady rate."""
+    """A time without messages on a topic that otherwise has a steady rate."""
 
     topic: str
     start_s: float  # after the log's first measurement
@@ -48,7 +48,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """How many messages a topic has and how fast they come (None: fewer than two)."""
+    """Number of messages of a topic and their rate (None: fewer than two)."""
 
     topic: str
     count: int
@@ -57,33 +57,33 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class LogInfo:
-    """One run's log."""
+    """Summary of one run's log."""
 
     log: Path
     run_id: str
     robot_id: str
     software_version: str
-    start_utc: str | None  # the first measurement, to the second; None where the log's clock tells no date
+    start_utc: str | None  # the first measurement, to the second; None if the log's clock has no date
     duration_s: float
-    distance_m: float | None  # by the wheels; None where the log has none, or such as are no numbers
+    distance_m: float | None  # by the wheels; None if the log has no readings, or none that are finite
     n_wheel_restarts: int
     n_wheel_lines_lost: int  # by their sequence numbers
     n_pictures: int | None  # None: an imported log
     n_pictures_lost: int
-    tags: dict[str, dict[int, int]]  # family, id: how often seen
+    tags: dict[str, dict[int, int]]  # family, id: number of observations
     topics: tuple[TopicInfo, ...]
     gaps: tuple[Gap, ...]
-    events: dict[str, int]  # kind: how many messages
+    events: dict[str, int]  # number of messages of each kind
     file_bytes: dict[str, int]
-    losses: tuple[str, ...]  # what is amiss with its files, in words
-    lost: str  # what of it cannot be read, in words; empty where all can
+    losses: tuple[str, ...]  # defects of its files, as sentences
+    lost: str  # description of what cannot be read; empty if all can
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`: plain data."""
+        """Return plain data for `--json`."""
         return asdict(self) | {"log": str(self.log)}
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         size = ", ".join(f"{name} {size_bytes / 1e6:.2f} MB" for name, size_bytes in self.file_bytes.items())
         lines = [
             f"{self.log}",
@@ -104,7 +104,7 @@ class LogInfo:
 
     def _distance(self) -> str:
         if self.distance_m is None and any(each.topic in _WHEELS for each in self.topics):
-            return "wheel readings that are no numbers, so no map can use it"
+            return "wheel readings are not finite, so no map can use it"
         if self.distance_m is None:
             return "no wheel readings, so no map can use it"
         return f"{self.distance_m:.2f} m driven"
@@ -113,7 +113,7 @@ class LogInfo:
         if not self.tags:
             return "none seen"
         return "; ".join(
-            f"{len(seen)} of {family} in {plural(sum(seen.values()), 'reading')}: {' '.join(map(str, seen))}"
+            f"{len(seen)} of {family} in {plural(sum(seen.values()), 'observation')}: {' '.join(map(str, seen))}"
             for family, seen in self.tags.items()
         )
 
@@ -137,14 +137,14 @@ class LogInfo:
 
 
 def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
-    """Reads a log once.
+    """Return the summary of a log, reading it once.
 
     Args:
         log: a file or a run folder.
-        allowance: what it shares with other logs in reading; one of its own where None.
+        allowance: reading budget shared with other logs; one of its own if None.
 
     Raises:
-        GroundsbotError: the log is missing, damaged, no log of ours, or its robot.yaml cannot be used.
+        GroundsbotError: the log is missing, damaged, not one of ours, or its robot.yaml cannot be used.
     """
     collected, losses = _LogStatistics(), LogLosses()
     for entry in read_log(log, losses=losses, allowance=allowance):
@@ -183,7 +183,7 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
 
 @dataclass
 class _LogStatistics:
-    """What one pass over a log gathers."""
+    """Statistics collected in one pass over a log."""
 
     run: RunInfo | None = None
     counts: Counter[str] = field(default_factory=Counter)
@@ -197,7 +197,7 @@ class _LogStatistics:
     events: Counter[str] = field(default_factory=Counter)
 
     def add(self, entry: LogMessage) -> None:
-        """Takes one message; what stands at a file's head is no measurement and has no time."""
+        """Add one message; those that begin each file are no measurements and have no time."""
         self.counts[entry.topic] += 1
         if not TOPICS[entry.topic].every_file:
             self.stamps_ns[entry.topic].append(entry.publish_time_ns)
@@ -229,7 +229,7 @@ class _LogStatistics:
 
 
 def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:
-    """Length of the path of the point midway between the wheels; unknown motion at a restart counts as none."""
+    """Return the path length of the point midway between the wheels; unknown motion at a restart counts as none."""
     if collected.ticks:
         left_m, right_m = wheels.metres_per_tick
         return sum(
@@ -245,12 +245,12 @@ def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:
 
 
 def _missing(numbered: list[tuple[int, int]]) -> int:
-    """How many numbers are left out in a rising sequence of (epoch, number), within each epoch."""
+    """Return how many numbers are missing in an ascending sequence of (epoch, number), within each epoch."""
     return sum(max(0, after[1] - before[1] - 1) for before, after in pairwise(numbered) if before[0] == after[0])
 
 
 def _utc(stamp_ns: int) -> str | None:
-    """Date and time of day; none for an imported log whose times begin somewhere near zero."""
+    """Return date and time of day; None for an imported log whose times begin near zero."""
     if stamp_ns < _EARLIEST_NS:
         return None
     return datetime.fromtimestamp(stamp_ns // _NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

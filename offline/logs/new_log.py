@@ -1,4 +1,4 @@
-"""New logs made of old ones: there whole or not at all."""
+"""New logs made from old ones: they appear complete or not at all."""
 
 import os
 import tempfile
@@ -12,7 +12,7 @@ from groundsbot.offline.errors import OfflineError
 
 @contextmanager
 def new_log(output: Path) -> Iterator[Path]:
-    """Yields a hidden folder beside `output`, which becomes `output` if the block ends well, else goes.
+    """Yield a hidden folder beside `output`, which becomes `output` if the block succeeds, and is removed if not.
 
     If `output` ends in `.mcap`, it becomes the file of that name in the folder.
 
@@ -20,7 +20,7 @@ def new_log(output: Path) -> Iterator[Path]:
         GroundsbotError: `output` exists, or it cannot be written.
     """
     if os.path.lexists(output):
-        raise OfflineError(f"{output}: exists already; nothing is written over, give another output")
+        raise OfflineError(f"{output}: exists already and is not overwritten; give another output")
     if output.suffix != ".mcap":
         with folder_written_whole(output) as folder:
             yield folder
@@ -40,7 +40,7 @@ def new_log(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _errors_as_offline_error(output: Path) -> Iterator[None]:
-    """Only of what is done to the output: what fails in the block may be another file's."""
+    """Convert errors of writing the output; the caller's block stays outside, as its errors may concern others."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Looks for tags again in recorded pictures: a new log with the new detections and all else, the old one stays."""
+"""Tag detection in recorded pictures: a new log with the new detections and all else; the old one is not changed."""
 
 import os
 import queue
@@ -48,49 +48,49 @@ _QUEUED: Final = 4  # pictures in memory for each process
 
 @dataclass(frozen=True)
 class DetectOptions:
-    """How to look. None: as robot.yaml in the log says."""
+    """Options of detection. None: as robot.yaml in the log says."""
 
     families: tuple[str, ...] | None = None
     library: str | None = None
-    quad_decimate: float = 1.0  # there is time, so small tags are looked for too
-    drop_others: bool = False  # leave out detections of pictures that were not kept
+    quad_decimate: float = 1.0  # full resolution: offline there is time for small tags
+    drop_others: bool = False  # leave out detections of pictures that were not recorded
     n_processes: int | None = None  # None: one for each core
 
 
 @dataclass
 class DetectReport:
-    """What came of it."""
+    """Result of a detection."""
 
     n_pictures: int = 0
     n_unusable: int = 0
-    n_kept: int = 0  # old detections, of pictures that were not kept
+    n_kept: int = 0  # old detections, of pictures that were not recorded
     tags_before: Counter[tuple[str, int]] = field(default_factory=Counter)
     tags_after: Counter[tuple[str, int]] = field(default_factory=Counter)
     losses: LogLosses = field(default_factory=LogLosses)
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         lines = [
             f"{self.n_pictures} pictures: {_describe(self.tags_before)} before, {_describe(self.tags_after)} now",
-            f"{self.n_kept} older detections kept, whose pictures were not" if self.n_kept else "",
-            f"{self.n_unusable} pictures are of no use; what was found in them before stays" if self.n_unusable else "",
+            f"{self.n_kept} older detections kept, of pictures not recorded" if self.n_kept else "",
+            f"{self.n_unusable} pictures cannot be used; their older detections stay" if self.n_unusable else "",
             *self.losses.lines(),
         ]
         return [line for line in lines if line]
 
 
 def _describe(tags: Counter[tuple[str, int]]) -> str:
-    return f"{len(tags)} tags in {tags.total()} readings"
+    return f"{len(tags)} tags in {tags.total()} observations"
 
 
 def detect_again(log: Path, output: Path, options: DetectOptions, progress: Progress) -> DetectReport:
-    """Detects in every picture of a log and writes a new log, which comes to be whole or not at all.
+    """Detect tags in every picture of a log and write a new log, which appears complete or not at all.
 
     Args:
         log: a file or a run folder with pictures.
         output: a new run folder, or a new file if it ends in `.mcap`.
-        options: how to look.
-        progress: told what is being done, how much of it is, and of how much.
+        options: of the detection.
+        progress: called with the stage, the number done and the total.
 
     Raises:
         GroundsbotError: the log holds no picture or cannot be read, `output` exists, or no detector is installed.
@@ -99,7 +99,7 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
         settings = _settings(log, options)
         old = _OldDetections.read(log)
         if not old.n_pictures:
-            raise OfflineError(f"{log}: holds no pictures to look at; record with recorder.picture_rate_hz above 0")
+            raise OfflineError(f"{log}: holds no pictures; record with recorder.picture_rate_hz above 0")
         report = DetectReport()
         found = _detect_all(log, old, settings, options, report, progress)
         target = folder / output.name if output.suffix == ".mcap" else folder
@@ -111,28 +111,28 @@ def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
     head = read_head(log)
     run, calibration = head.get("/run"), head.get("/camera/calibration")
     if not isinstance(run, RunInfo):
-        raise OfflineError(f"{log}: what says whose run it is, is damaged; salvage it first")
+        raise OfflineError(f"{log}: its /run message is damaged; run `salvage` first")
     recorder = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").recorder
     families = options.families or tuple(recorder.families)
     camera = None
     if isinstance(calibration, CameraCalibration):
-        with suppress(GroundsbotError):  # mapping says what is wrong with it; tags are found without
+        with suppress(GroundsbotError):  # mapping reports what is wrong with it; detection works without
             camera = camera_from_message(calibration)
     return DetectorSettings(families, options.library or recorder.detector, options.quad_decimate, camera=camera)
 
 
 @dataclass
 class _OldDetections:
-    """What a first pass over the log gathers."""
+    """Data collected in a first pass over the log."""
 
     n_pictures: int = 0
-    pictures_ns: set[int] = field(default_factory=set)  # of those that were kept, usable or not
+    pictures_ns: set[int] = field(default_factory=set)  # of all recorded ones, usable or not
     by_stamp_ns: dict[int, TagDetections] = field(default_factory=dict)  # without their tags
     wheels: list[tuple[int, int]] = field(default_factory=list)  # stamp, sequence
 
     @classmethod
     def read(cls, log: Path) -> "_OldDetections":
-        """Reads all but what the pictures show.
+        """Read the log, without decoding pictures.
 
         Raises:
             OfflineError: they are more than a log of this size can hold.
@@ -158,7 +158,7 @@ class _OldDetections:
         return old
 
     def place(self, message: TagDetections) -> None:
-        """Gives a new message what the old one for its picture says beside the tags, or what can be told without."""
+        """Fill in the fields other than tags from the picture's old message; without one, the wheel sequence."""
         old = self.by_stamp_ns.get(message.stamp_ns)
         if old is not None:
             message.frame_sequence = old.frame_sequence
@@ -180,7 +180,7 @@ def _detect_all(
     report: DetectReport,
     progress: Progress,
 ) -> dict[int, bytes]:
-    """New messages, as bytes, by the stamp of their picture."""
+    """Return new messages, serialised, by the stamp of their picture."""
     found: dict[int, bytes] = {}
     n_processes = options.n_processes or os.cpu_count() or 1
     with detectors(settings, n_processes) as (detect, library, described):
@@ -203,7 +203,7 @@ Detect = Callable[[Picture], DetectionResult]
 
 @contextmanager
 def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[Detect, str, str]]:
-    """A function for several threads, each call of which has a process to itself; and what it detects with."""
+    """Yield a function for several threads, each call of which has a process to itself, and the detector's names."""
     with ExitStack() as stack:
         idle: queue.SimpleQueue[ChildDetector] = queue.SimpleQueue()
         children = []
@@ -235,7 +235,7 @@ def _pictures(log: Path) -> Iterator[tuple[int, Picture]]:
 def in_parallel(
     pictures: Iterator[tuple[int, Picture]], detect: Detect, n_threads: int
 ) -> Iterator[tuple[int, DetectionResult]]:
-    """Results as they come, with few pictures in memory."""
+    """Yield results as they are ready, with few pictures in memory."""
     with ThreadPoolExecutor(n_threads) as pool:
         under_way: dict[Future[DetectionResult], int] = {}
         while True:
@@ -272,7 +272,7 @@ def _write(
                 continue
         writer.write(each.topic, each.message, at_ns, each.publish_time_ns)
         if each.topic == PICTURE_TOPIC and each.publish_time_ns not in old.by_stamp_ns:
-            data = found.get(each.publish_time_ns)  # a picture whose tags nobody had looked for
+            data = found.get(each.publish_time_ns)  # a picture without old detections
             if data is not None:
                 writer.write(_DETECTIONS, TagDetections.FromString(data), at_ns, each.publish_time_ns)
     if writer is not None:
@@ -281,8 +281,8 @@ def _write(
 
 
 def _stays(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
-    """Whether detections stay that were not looked for again."""
-    if message.stamp_ns in old.pictures_ns:  # of no use now, and better known when it was taken
+    """Whether to keep detections that have no new ones."""
+    if message.stamp_ns in old.pictures_ns:  # unusable now, so the old detection is better
         return True
     report.n_kept += not options.drop_others
     return not options.drop_others
@@ -290,7 +290,7 @@ def _stays(message: TagDetections, old: _OldDetections, options: DetectOptions, 
 
 def _tell(writer: LogWriter, log: Path, report: DetectReport) -> None:
     now_ns = writer.last_log_time_ns
-    text = f"tags looked for again in the pictures of {log.name}: {'; '.join(report.lines())}"
+    text = f"tags detected again in the pictures of {log.name}: {'; '.join(report.lines())}"
     event = Event(
         stamp_ns=now_ns,
         severity=Severity.SEVERITY_INFO,

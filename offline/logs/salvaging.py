@@ -1,4 +1,4 @@
-"""Makes finished logs of damaged and unfinished ones: new ones that every MCAP tool reads, the old ones stay."""
+"""Complete logs from damaged and unfinished ones: new ones that every MCAP tool reads; the old ones are not changed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from groundsbot.onboard.log import (
 
 @dataclass(frozen=True)
 class SalvagedFile:
-    """What became of one file."""
+    """Result for one file."""
 
     source: Path
     target: Path | None  # None: nothing in it could be used
@@ -38,24 +38,24 @@ class SalvagedFile:
 
     @property
     def is_whole(self) -> bool:
-        """Whether everything that was ever written to it is there."""
+        """Whether everything that was ever written to the file is there."""
         return self.target is not None and not self.losses.n_lost
 
     def with_target(self, target: Path) -> "SalvagedFile":
-        """The same, with the place where its target came to lie."""
+        """Return a copy with the final place of its target."""
         return self if self.target is None else replace(self, target=target)
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         found = f"{self.n_messages} messages -> {self.target}" if self.target else "holds nothing that can be used"
         return [f"{self.source}: {found}", *(f"  {line}" for line in self.losses.lines())]
 
 
 def salvage(log: Path, output: Path) -> list[SalvagedFile]:
-    """Writes what a log still holds into a new one, which comes to be whole or not at all.
+    """Write what a log still holds into a new one, which appears complete or not at all.
 
     Args:
-        log: a file, or a run folder, of which each file is salvaged by itself.
+        log: a file, or a run folder, each file of which is salvaged separately.
         output: the new file or folder.
 
     Raises:
@@ -70,7 +70,7 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     if "/run" not in head:
         allowance = Allowance()
         reasons = "; ".join(line for source in sources for line in _losses_of(source, allowance).lines())
-        raise OfflineError(f"{log}: none of its files says whose run it is, so nothing can be saved: {reasons}")
+        raise OfflineError(f"{log}: none of its files has a /run message, so nothing can be salvaged: {reasons}")
     names = {source: finished_name(source) if log.is_dir() else output.name for source in sources}
     with new_log(output) as folder:
         allowance = Allowance()

@@ -1,7 +1,7 @@
 """The typed map and its files: map.json, map.npz, tags.csv, trajectories, map.mcap.
 
-In: results of the solve, or a folder that `map` wrote. Out: `MapResult` and files; docs/formats.md describes them. In
-the paper: the resulting map.
+In: results of the solve, or a folder that `map` wrote. Out: `MapResult` and files, as in docs/formats.md. In the paper:
+the resulting map.
 """
 
 from lazy_loader import attach_stub

@@ -1,6 +1,6 @@
-"""What a finished map keeps for later runs: to place them in it, and to solve them together with its own.
+"""Measurements and calibration archived in a map, to localise later runs in it or to solve them jointly with its own.
 
-Plain arrays and texts, as map.npz holds them; `local_map.archive` makes local maps of them again.
+Plain arrays and texts, as in map.npz; `local_map.archive` restores local maps from them.
 """
 
 from dataclasses import dataclass, fields
@@ -11,18 +11,18 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 
-# What a calibration number corrects is four numbers at most; the rest of a row is NaN.
+# A calibration parameter corrects at most four numbers; the rest of a row is NaN.
 _NOMINAL: Final = 4
 
 
 @dataclass(frozen=True)
 class ArchivedCalibration:
-    """What a component's solve knows of the calibration, together with its tags.
+    """Estimate of the calibration in a component's solve, with its covariance with the tags.
 
     Attributes:
-        owners: (C,) robot id or printed batch of each number.
+        owners: (C,) robot id or printed batch of each parameter.
         names: (C,) as in `CalibrationResult`.
-        nominal: (C, 4) what it corrects, NaN where that is fewer numbers.
+        nominal: (C, 4) the numbers it corrects, padded with NaN.
         values: (C,) corrections.
         covariance: (C, C).
         with_tags: (C, 2 T) covariance with the component's tags, in order as (x, y), map frame.
@@ -38,7 +38,7 @@ class ArchivedCalibration:
 
 @dataclass(frozen=True)
 class ArchivedSegment:
-    """The measurements of one segment as they entered the joint solve, and where its own solve ended.
+    """Measurements of one segment as they entered the joint solve, and the estimate of its own solve.
 
     Attributes:
         name, run, log, robot_id, run_id: as in `RunResult`.
@@ -47,15 +47,15 @@ class ArchivedSegment:
         lost: what of the log could not be read.
         warnings: of the segment; run_warnings: of its run.
         stamps_ns: (K,) of the keyframes.
-        motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels:
-            (K-1, 3, 3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
-        tag_families, tag_ids, tag_instances: (T,) what was read; an instance where the run alone told places apart.
-        reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance:
-            (M, 2, 2); reading_by_camera: (M, 2, 5) derivative by `readings.CAMERA_PARAMETERS`.
-        reading_polar, reading_in_camera: (M,) its form, and whether about the camera or about base.
+        motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels: (K-1, 3,
+            3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
+        tag_families, tag_ids, tag_instances: (T,) observed tags; an instance if the run alone showed several places.
+        reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance: (M, 2,
+            2); reading_by_camera: (M, 2, 5) derivative by `CAMERA_PARAMETERS`.
+        reading_polar, reading_in_camera: (M,) its form, and whether relative to the camera or to base.
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.
-        goodness: (5,) the fields of `Goodness`.
+        goodness: (5,) the fields of `GoodnessOfFit`.
         gyro_step, gyro_rows, gyro_values, gyro_walk_rows, gyro_owner: as `HeadingDifferences`; None without a gyro.
     """
 
@@ -98,7 +98,7 @@ class ArchivedSegment:
 
 
 def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str, Any]:
-    """Arrays by name, each after the key; texts as unicode arrays."""
+    """Return arrays by name, each prefixed with the key; texts as unicode arrays."""
     arrays: dict[str, Any] = {}
     for each in fields(kept):
         value = getattr(kept, each.name)
@@ -110,19 +110,19 @@ def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str
 
 
 def calibration_from(arrays: Any, key: str) -> ArchivedCalibration | None:  # noqa: ANN401 - numpy's file of arrays
-    """What `arrays_of` wrote; None where there is none."""
+    """Return what `arrays_of` wrote; None if there is none."""
     return ArchivedCalibration(**_values(ArchivedCalibration, arrays, key)) if f"{key}owners" in arrays else None
 
 
 def segment_from(arrays: Any, key: str) -> ArchivedSegment | None:  # noqa: ANN401 - numpy's file of arrays
-    """What `arrays_of` wrote; None where there is none, or one of a program that knew fewer numbers of a camera."""
+    """Return what `arrays_of` wrote; None if there is none, or if written by a program with fewer camera parameters."""
     if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
         return None
     return ArchivedSegment(**_values(ArchivedSegment, arrays, key))
 
 
 def _values(kind: type[ArchivedCalibration | ArchivedSegment], arrays: Any, key: str) -> dict[str, Any]:  # noqa: ANN401
-    """Of a dataclass: texts and counts as Python's own, all else as arrays."""
+    """Return a dataclass's values: texts and counts as Python's own types, all else as arrays."""
     values: dict[str, Any] = {}
     for each in fields(kind):
         if each.default is None and f"{key}{each.name}" not in arrays:
@@ -136,7 +136,7 @@ def _values(kind: type[ArchivedCalibration | ArchivedSegment], arrays: Any, key:
 
 
 def nominal_row(nominal: tuple[float, ...]) -> FloatArray:
-    """(4,) of what a calibration number corrects."""
+    """Return the numbers that a calibration parameter corrects as a row (4,), padded with NaN."""
     row = np.full(_NOMINAL, np.nan)
     row[: len(nominal)] = nominal
     return row

@@ -43,7 +43,7 @@ from groundsbot.offline.maps.tum import read_tum, write_tum
 JSON_FILE: Final = "map.json"
 ARRAYS_FILE: Final = "map.npz"
 TAGS_FILE: Final = "tags.csv"
-# What reading a damaged map.json or map.npz raises.
+# Errors of reading a damaged map.json or map.npz.
 _DAMAGE: Final = (
     AttributeError,
     BadZipFile,
@@ -59,7 +59,7 @@ _DAMAGE: Final = (
 
 
 def write_map(result: MapResult, folder: Path) -> None:
-    """Writes all files of a map into an existing folder; the same bytes for the same result.
+    """Write all files of a map into an existing folder; the same result gives the same bytes.
 
     Raises:
         OSError: the folder is missing or not writable.
@@ -76,7 +76,7 @@ def write_map(result: MapResult, folder: Path) -> None:
 
 
 def read_map(folder: Path) -> MapResult:
-    """Reads what `write_map` wrote, with the full precision of map.npz where it has it.
+    """Read what `write_map` wrote, with the full precision of map.npz where available.
 
     Raises:
         OfflineError: a file is missing, damaged, or of a format that this program does not know.
@@ -122,7 +122,7 @@ def read_map(folder: Path) -> MapResult:
 
 
 def _arrays(result: MapResult) -> dict[str, Any]:
-    """Full precision and the joint covariances: what localising in, extending or judging the map needs."""
+    """Return arrays in full precision and joint covariances, as needed to localise in, extend or judge the map."""
     arrays: dict[str, Any] = {"format_version": np.int64(FORMAT_VERSION)}
     for index, component in enumerate(result.components):
         tags, key = component.tags, f"component{index}_"
@@ -193,7 +193,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
 
 
 def _archived_segments(arrays: Mapping[str, Any]) -> tuple[ArchivedSegment, ...]:
-    """All that there are; none in a map of an older program."""
+    """Return all archived segments; none in a map of an older program."""
     found: list[ArchivedSegment] = []
     while (kept := segment_from(arrays, f"run{len(found)}_")) is not None:
         found.append(kept)

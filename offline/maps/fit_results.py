@@ -1,4 +1,4 @@
-"""What fits together in a map and what does not: local maps, tags, and what somebody measured; typed, in SI units."""
+"""Consistency of a map: alignments of local maps, outlier tags, and external measurements; typed, in SI units."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from groundsbot.calib.foundation import FloatArray
 
 @dataclass(frozen=True)
 class AlternativeResult:
-    """Another transform that explains the shared tags almost as well."""
+    """Alternative transform that explains the shared tags almost as well."""
 
     T_from_to: FloatArray  # (3,)
     tags: tuple[tuple[str, int], ...]  # (family, tag id) of those that fit it
@@ -15,7 +15,7 @@ class AlternativeResult:
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """Transform between two local maps, from the tags they share."""
+    """Transform between two local maps, from their shared tags."""
 
     from_run: str
     to_run: str
@@ -24,22 +24,22 @@ class AlignmentResult:
     n_inliers: int
     inlier_rmse_m: float
     outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
-    is_sure: bool = True  # else the runs are not joined by it: chance or a rival explains the tags almost as well
+    is_sure: bool = True  # else it is not used: chance or an alternative explains the tags almost as well
     rivals: tuple[AlternativeResult, ...] = ()
-    is_weak: bool = False  # one tag alone joins them: if that was moved in between, nothing shows it
-    # (3, 3) of T_from_to as x, y, theta in the first run's frame; None where the transform only begins a solve.
+    is_weak: bool = False  # rests on one tag: if that was moved in between, nothing shows it
+    # (3, 3) of T_from_to as x, y, theta in the first run's frame; None if the transform is only an initial value.
     covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """What of a component the model does not explain.
+    """Lack of fit of a component.
 
     Attributes:
-        kind: joins (drives do not share tags and calibration as they should) or windows (parts of drives do not join).
-        run: what fits worst.
+        kind: joins (drives disagree on shared tags or calibration) or windows (windows of one drive disagree).
+        run: the one that fits worst.
         chi_square: in squared sigmas of the noise that the map was made with.
-        expected: how much of it chance explains.
+        expected: expected value of `chi_square`.
     """
 
     kind: str
@@ -49,20 +49,20 @@ class Misfit:
 
     @property
     def variance_factor(self) -> float:
-        """By how many times covariances must grow to cover it, 1 at least."""
+        """Factor on covariances that covers the misfit, at least 1."""
         return max(1.0, self.chi_square / self.expected)
 
 
 @dataclass(frozen=True)
 class SuspectTag:
-    """A tag that does not belong.
+    """Tag with outlier observations.
 
     Attributes:
         kind: moved (between runs), moving (during one), swapped, duplicated (two tags with one id), phantom (a false
             detection) or inconsistent (its run has most of its tags elsewhere).
-        runs: moved, swapped: in which it is not where it was first; moving: during which it was moved; duplicated:
-            that saw it; phantom: with the false detections; inconsistent: the one that is wrong.
-        evidence: in words, with numbers.
+        runs: moved, swapped: those in which it is not at its first place; moving: during which it was moved;
+            duplicated: that observed it; phantom: with the false detections; inconsistent: the one that is wrong.
+        evidence: as a sentence with numbers.
         swapped_with: the other tag's id.
     """
 
@@ -74,22 +74,22 @@ class SuspectTag:
     swapped_with: int | None = None
 
     def line(self) -> str:
-        """For a terminal."""
+        """Return a line for the terminal."""
         return f"tag {self.tag_id} ({self.family}) {self.kind}: {self.evidence}"
 
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """What a person measured, and what the map makes of it."""
+    """External measurement, and how it agrees with the map."""
 
     kind: str  # start or distance
     a: str  # the run whose start is the frame, or one end: a run, or family:id of a tag
     b: str  # the run, or the other end
     measured: FloatArray  # (3,) x_m, y_m, theta_rad in map, or (1,) metres
     sigma: FloatArray  # likewise
-    component: int | None  # in which it was used; None: its ends are in different components
-    in_map: FloatArray | None = None  # (3,) or (1,) as the map has it in the end
-    residual_sigmas: float | None = None  # length of what is left over, whitened
-    # How far it lies from what all else says, in sigmas of the difference; None where nothing else says anything.
+    component: int | None  # that uses it; None: its ends are in different components
+    in_map: FloatArray | None = None  # (3,) or (1,) value in the finished map
+    residual_sigmas: float | None = None  # norm of the whitened residual
+    # Deviation from the map without it, in sigmas of the difference; None if the map without it leaves it undetermined.
     off_sigmas: float | None = None
     contradicts: bool = False  # by more than chance allows

@@ -1,4 +1,4 @@
-"""A map as JSON, and its entries read back: what map.json holds.
+"""A map as the JSON document map.json, and its entries read back.
 
 docs/formats.md describes every key.
 """
@@ -34,7 +34,7 @@ FORMAT_VERSION: Final = 1
 
 
 def map_as_json(result: MapResult) -> dict[str, Any]:
-    """What map.json holds: plain data, null where a number is not known."""
+    """Return the content of map.json: plain data, null where a number is unknown."""
     shapes = [shape_of(component) for component in result.components]
     return {
         "format_version": FORMAT_VERSION,
@@ -94,18 +94,18 @@ def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:
 
 
 def noise_from(entry: dict[str, Any]) -> NoiseParameters:
-    """Of `noise`; what it holds of the floor is each component's."""
+    """Return the noise parameters of `noise`, without those of the floor, which belong to components."""
     floor = {each.name for each in fields(FloorSigmas)}
     return NoiseParameters.model_validate({name: value for name, value in entry.items() if name not in floor})
 
 
 def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
-    """Of `floor` of a component."""
+    """Return `floor` of a component."""
     return None if entry is None else FloorSigmas(**entry)
 
 
 def misfit_from(entry: dict[str, Any] | None) -> Misfit | None:
-    """Of `misfit` of a component; maps of older programs have none."""
+    """Return `misfit` of a component; maps of older programs have none."""
     return None if entry is None else Misfit(**entry)
 
 
@@ -169,7 +169,7 @@ def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
 
 
 def advice_as_json(advice: AdviceResult) -> dict[str, Any]:
-    """An entry of `advice` in map.json."""
+    """Return an entry of `advice` in map.json."""
     entry = {name: _plain(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
     return entry | {"tags": [_tag_key_json(tag) for tag in advice.tags], "worst_tag": _tag_key_json(advice.worst_tag)}
 
@@ -183,7 +183,7 @@ def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any depth
-    """Numbers, texts, nested lists and mappings for JSON, which has no NaN: null instead."""
+    """Return numbers, texts, nested lists and mappings for JSON, with null for NaN."""
     if isinstance(value, dict):
         return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, tuple | list):
@@ -196,7 +196,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any 
 
 
 def tag_from(entry: dict[str, Any]) -> TagResult:
-    """Of an entry of `tags`."""
+    """Return an entry of `tags`."""
     return TagResult(
         family=entry["family"],
         tag_id=entry["tag_id"],
@@ -219,7 +219,7 @@ def _tag_pose(entry: dict[str, Any]) -> TagPose | None:
 
 
 def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
-    """Of an entry of `alignments`."""
+    """Return an entry of `alignments`."""
     return AlignmentResult(
         from_run=entry["from"],
         to_run=entry["to"],
@@ -238,19 +238,19 @@ def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
 
 
 def measurement_from(entry: dict[str, Any]) -> MeasurementResult:
-    """Of an entry of `measurements`."""
+    """Return an entry of `measurements`."""
     in_map = entry["in_map"]
     arrays = {"measured": array_from(entry["measured"]), "sigma": array_from(entry["sigma"])}
     return MeasurementResult(**entry | arrays | {"in_map": None if in_map is None else array_from(in_map)})
 
 
 def check_from(entry: dict[str, Any]) -> ConsistencyCheck:
-    """Of an entry of `checks`."""
+    """Return an entry of `checks`."""
     return ConsistencyCheck(**{name: value for name, value in entry.items() if name != "sigmas"})
 
 
 def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:
-    """Of `noise_fit`."""
+    """Return `noise_fit`."""
     if entry is None:
         return None
     parameters = tuple(FittedParameter(**parameter) for parameter in entry["parameters"])
@@ -266,7 +266,7 @@ def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:
 
 
 def advice_from(entry: dict[str, Any]) -> AdviceResult:
-    """Of an entry of `advice`."""
+    """Return an entry of `advice`."""
     tags = [(each["family"], each["tag_id"], each["instance"]) for each in (*entry["tags"], entry["worst_tag"])]
     named = {"tags": tuple(tags[:-1]), "worst_tag": tags[-1], "way_m": array_from(entry["way_m"]).reshape(-1, 2)}
     return AdviceResult(**entry | named)
@@ -277,10 +277,10 @@ def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]
 
 
 def number_from(value: float | None) -> float:
-    """Of a number, or of null where it was not known."""
+    """Return a number, NaN for null."""
     return float("nan") if value is None else value
 
 
 def array_from(values: Sequence[Any]) -> FloatArray:
-    """Of nested lists of numbers and nulls."""
+    """Return an array from nested lists of numbers and nulls."""
     return np.array(values, dtype=np.float64)

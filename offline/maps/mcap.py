@@ -1,7 +1,7 @@
-"""The finished map as an MCAP file: Foxglove, Lichtblick and Rerun show it, and play the drives over it.
+"""The finished map as an MCAP file, in which Foxglove, Lichtblick and Rerun show it and replay the drives.
 
-Stamps are those of the run logs, so that a log opened beside it runs on the same time line. Topics are not those of a
-log, since one topic has one schema.
+Stamps are those of the run logs, so a log opened beside it shares the time line. Topics differ from those of a log,
+since one topic has one schema.
 """
 
 import heapq
@@ -45,7 +45,7 @@ _LINE_PX: Final = 2.0
 _TEXT_M: Final = 0.2
 _TAG_COLOR: Final = Color(r=0.9, g=0.6, b=0.0, a=1.0)
 _ELLIPSE_COLOR: Final = Color(r=0.9, g=0.6, b=0.0, a=0.35)
-# Okabe and Ito's, which people with any colour vision tell apart, on light and dark.
+# Okabe and Ito's, distinguishable with any colour vision, on light and dark.
 _RUN_COLORS: Final = tuple(
     Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
     for r, g, b in ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (240, 228, 66))
@@ -53,7 +53,7 @@ _RUN_COLORS: Final = tuple(
 
 
 class _Entry(NamedTuple):
-    """One message; in order of time, then of topic."""
+    """One message; ordered by time, then topic."""
 
     stamp_ns: int
     topic: str
@@ -61,14 +61,14 @@ class _Entry(NamedTuple):
 
 
 def frame_of(component: int) -> str:
-    """`map`; the others, about which it knows nothing, have frames of their own: `map2`, `map3`."""
+    """Return the frame of a component: `map`; others, with no transform to it, have `map2`, `map3`, ..."""
     return "map" if component == 0 else f"map{component + 1}"
 
 
 def write_mcap(result: MapResult, path: Path) -> None:
-    """Writes tags, trajectories and transforms of all components; the same bytes for the same map.
+    """Write tags, trajectories and transforms of all components; the same map gives the same bytes.
 
-    What does not change stands at the first stamp of all runs; each keyframe moves its run's frame at its own stamp.
+    Constant content has the first stamp of all runs; each keyframe moves its run's frame at its own stamp.
 
     Raises:
         OSError: it cannot be written.
@@ -87,7 +87,7 @@ def write_mcap(result: MapResult, path: Path) -> None:
 
 
 def _entries(result: MapResult) -> Iterator[_Entry]:
-    """All messages in order of time."""
+    """Yield all messages in order of time."""
     first_ns = min(int(run.stamps_ns[0]) for run in result.runs)
     colors = itertools.cycle(_RUN_COLORS)
     for index, component in enumerate(result.components):
@@ -105,7 +105,7 @@ def _entries(result: MapResult) -> Iterator[_Entry]:
 
 
 def _transforms(run: RunResult, frame: str) -> Iterator[_Entry]:
-    """The base in the map at each keyframe, and once the camera on the base."""
+    """Yield the base in the map at each keyframe, and once the camera on the base."""
     base = f"{run.name}/{BASE_FRAME}"
     fixed = []
     if run.T_base_camera is not None:
@@ -157,7 +157,7 @@ def _tags_scene(component: Component, frame: str, stamp_ns: int) -> SceneUpdate:
 
 
 def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
-    """A ball, its one-sigma ellipse on the floor plan, and its number; at z = 0 where the map knows no height."""
+    """Return a ball, its one-sigma ellipse on the floor plan, and its id; at z = 0 if the map has no height."""
     x, y = tag.position_m.tolist()
     z_m = 0.0 if tag.pose is None else tag.pose.height_m
     ball = SpherePrimitive(
@@ -193,7 +193,7 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
 
 
 def _orientation(tag: TagResult) -> Quaternion:
-    """R_map_tag, z out of the face; none where the map knows none."""
+    """Return R_map_tag, z out of the face; identity if the map has none."""
     if tag.pose is None:
         return _rotation_about_z(0.0)
     x, y, z, w = tag.pose.quaternion_xyzw.tolist()
@@ -201,7 +201,7 @@ def _orientation(tag: TagResult) -> Quaternion:
 
 
 def _ellipse(tag: TagResult) -> CylinderPrimitive:
-    """One sigma, as a flat cylinder."""
+    """Return the one-sigma ellipse as a flat cylinder."""
     variances, axes = np.linalg.eigh(tag.covariance)
     minor_m, major_m = (2.0 * np.sqrt(np.maximum(variances, 0.0))).tolist()
     x, y = tag.position_m.tolist()
@@ -215,7 +215,7 @@ def _ellipse(tag: TagResult) -> CylinderPrimitive:
 
 
 def _entity(name: str, frame: str, stamp_ns: int, said: dict[str, str]) -> SceneEntity:
-    """Something that stays for good (a lifetime of zero), still to be drawn."""
+    """Return an entity without primitives that never expires (lifetime zero)."""
     metadata = [KeyValuePair(key=key, value=value) for key, value in said.items()]
     return SceneEntity(timestamp=timestamp(stamp_ns), frame_id=frame, id=name, metadata=metadata)
 
@@ -225,6 +225,6 @@ def _pose(x_m: float, y_m: float, theta_rad: float) -> Pose:
 
 
 def _rotation_about_z(theta_rad: float) -> Quaternion:
-    """About z."""
+    """Return a rotation about z."""
     half = 0.5 * theta_rad
     return Quaternion(x=0.0, y=0.0, z=float(np.sin(half)), w=float(np.cos(half)))

@@ -1,10 +1,10 @@
-"""What a map can be solved on. Imports nothing heavy: the command line offers the choice."""
+"""Measurement models of a map. Imports nothing heavy: the command line offers the choice."""
 
 from enum import StrEnum
 
 
 class MapModel(StrEnum):
-    """What a component was solved on last."""
+    """Measurement model of a component's last solve."""
 
-    FLOOR = "2d"  # places of tags on the floor
+    FLOOR = "2d"  # positions of tags on the floor
     CORNERS = "corners"  # corners of tags in pixels

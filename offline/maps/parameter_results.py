@@ -1,4 +1,4 @@
-"""What mapping tells of the numbers that it took from robot.yaml and of the noise: typed, in SI units."""
+"""Results on the parameters from robot.yaml and on the noise: typed, in SI units."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,13 +8,13 @@ import numpy as np
 NOT_NEEDED: Final = "no measurement depends on it"
 
 
-# What is right goes beyond this once in 16,000 times.
+# A correct value exceeds this with a probability of 1 in 16,000.
 MAX_SIGMAS: Final = 4.0
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """One calibration number that the solve carried, as a correction to what robot.yaml says."""
+    """Estimate of one calibration parameter, as a correction to robot.yaml."""
 
     owner: str  # robot id, or the printed batch of tags
     name: str  # wheel_scale, wheel_ratio, track_scale, mount_x_m, mount_y_m, mount_yaw_rad, tag_scale
@@ -26,18 +26,18 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class CalibrationChoice:
-    """Whether self-calibration freed one number of robot.yaml, and why not.
+    """Whether self-calibration freed one parameter of robot.yaml, and why not.
 
     Attributes:
         owner: robot id, or the printed batch of tags.
         name: as in CalibrationResult.
         value: the correction by the drives alone, with its sigma.
-        prior_sigma: what robot.yaml says of it.
-        off_sigmas: how far drives and robot.yaml differ.
-        held_out_gain: log likelihood of each segment by what the other segments tell, over that by robot.yaml; summed.
-            None where no two segments tell anything of it.
-        reason: why it stays as robot.yaml has it; empty where it is freed.
-        is_asked: it was asked for by its name.
+        prior_sigma: of robot.yaml.
+        off_sigmas: deviation of the drives from robot.yaml.
+        held_out_gain: sum over segments of the log likelihood ratio of the estimate from the other segments to
+            robot.yaml. None if fewer than two segments determine it.
+        reason: why it stays as in robot.yaml; empty if it is freed.
+        is_asked: it was requested by name.
     """
 
     owner: str
@@ -54,16 +54,16 @@ class CalibrationChoice:
 
 @dataclass(frozen=True)
 class RobotNumber:
-    """What drives say of one number of a robot's file.
+    """Estimate of one parameter of a robot's file, compared with the file.
 
     Attributes:
         owner: robot id, or the printed batch of tags.
         name: as in CalibrationResult.
-        component: whose solve found it.
-        what: the field of robot.yaml, or what the number is, with its unit.
-        in_file: as the file has it.
-        found: by the map, with its sigma.
-        verdict: what to think of the file.
+        component: whose solve estimated it.
+        what: the field of robot.yaml, or a description of the parameter, with its unit.
+        in_file: the file's value.
+        found: the map's estimate, with its sigma.
+        verdict: assessment of the file's value.
         to_do: what to do about it; empty for nothing.
     """
 
@@ -80,58 +80,58 @@ class RobotNumber:
 
 @dataclass(frozen=True)
 class ConsistencyCheck:
-    """Two ways to know one thing, held against each other: wheels and tags."""
+    """Comparison of two independent estimates of one quantity, by wheels and by tags."""
 
-    name: str  # scale: how much longer a metre by the tags is than one by the wheels; turn: likewise a full turn
+    name: str  # scale: excess of a metre by the tags over one by the wheels; turn: likewise of a full turn
     component: int
     robot_id: str
     batch: str | None  # of tags; None for a turn, which needs no sizes
-    value: float  # as a share, by readings alone: without the priors
+    value: float  # relative, from the observations without priors
     sigma: float
-    prior_sigma: float  # how far the two may differ by what robot.yaml says
+    prior_sigma: float  # of their difference by robot.yaml
 
     @property
     def sigmas(self) -> float:
-        """How far they differ, in sigmas of what readings and robot.yaml allow."""
+        """Difference in sigmas of observations and robot.yaml together."""
         return abs(self.value) / float(np.hypot(self.sigma, self.prior_sigma))
 
     @property
     def contradicts(self) -> bool:
-        """By more than chance allows."""
+        """Whether they differ by more than chance allows."""
         return self.sigmas > MAX_SIGMAS
 
 
 @dataclass(frozen=True)
 class ScaleBudget:
-    """What holds the length of a metre in a component: wheels, tags and all places could be stretched together."""
+    """Contributions to the scale of a component; wheels, tags and positions could be scaled together."""
 
     component: int
     sigma: float  # relative
-    shares: dict[str, float]  # of wheels, track, tags, mount, distances, starts; they add up to 1
+    shares: dict[str, float]  # of wheels, track, tags, mount, distances, starts; their sum is 1
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """One noise parameter, and what the runs told of it."""
+    """One noise parameter, and how the runs determined it."""
 
     name: str  # as in NoiseParameters
     value: float
-    low: float | None  # where it lies with 99 %; None where it was not fitted
+    low: float | None  # 99 % interval; None if it was not fitted
     high: float | None
-    redundancy: float  # of how many squared residuals of its own it is the mean
-    kept: str = ""  # why it stands at its prior; empty where it was fitted
+    redundancy: float  # degrees of freedom of the residuals that it is fitted to
+    kept: str = ""  # why it stays at its prior; empty if it was fitted
 
 
 @dataclass(frozen=True)
 class FittedNoise:
-    """Where the noise comes from when nobody gave it."""
+    """Noise estimated from the runs."""
 
     parameters: tuple[FittedParameter, ...]
-    # Variances of errors that readings of a tag share, as multiples of what the default noise gives: forgotten along
-    # the way, over 0.25 m or 1 rad, and lasting for a pass.
+    # Variances of correlated errors of a tag's observations, relative to those of the default noise: with a correlation
+    # length of 0.25 m or 1 rad, and constant over a pass.
     shared_range: float
     shared_bearing: float
     pass_range: float
     pass_bearing: float
     runs: tuple[str, ...]  # names of those that it was fitted to
-    contradicting: tuple[str, ...]  # of those that contradict themselves: under the prior, or this where it is larger
+    contradicting: tuple[str, ...]  # inconsistent runs: they use the larger of the prior and this noise

@@ -1,7 +1,7 @@
-"""What mapping hands out: typed, in the map frame, in SI units.
+"""Results of mapping: typed, in the map frame, in SI units.
 
-A run with unbroken odometry is one segment; where the odometry broke, a run has several segments (segments), named
-`<run>` and `<run>_stretch2`, ... Each is placed on its own, like another run.
+A run with unbroken odometry is one segment; a run with breaks has several segments, named `<run>` and `<run>_stretch2`,
+... Each has a pose of its own, like another run.
 """
 
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class RunResult:
     """One segment of keyframes in its component's map frame."""
 
     name: str  # unique: robot id and run id, and the segment where there are several
-    run: str  # the run it belongs to: equal to name unless it is a later segment
+    run: str  # the run it belongs to: equal to `name` except for later segments
     log: Path
     robot_id: str
     run_id: str
@@ -37,23 +37,23 @@ class RunResult:
     stamps_ns: IntArray  # (K,)
     T_map_base: FloatArray  # (K, 3)
     distance_m: float  # driven, by the wheels
-    # (7,) x, y, z in m and quaternion x, y, z, w: the camera as the solve corrected its mount; None: it has none.
+    # (7,) x, y, z in m and quaternion x, y, z, w: the camera with its estimated mount; None without a camera.
     T_base_camera: FloatArray | None = None
 
     @property
     def n_keyframes(self) -> int:
-        """How many poses the run has."""
+        """Number of poses."""
         return len(self.stamps_ns)
 
 
 @dataclass(frozen=True)
 class TagPose:
-    """How one tag hangs in space.
+    """Pose of one tag in space.
 
     Attributes:
         height_m: of its centre above the floor.
         quaternion_xyzw: (4,) R_map_tag.
-        covariance: (6, 6) of x, y, height and a small turn about map's axes: m^2, m rad, rad^2.
+        covariance: (6, 6) of x, y, height and a small rotation about the map's axes: m^2, m rad, rad^2.
     """
 
     height_m: float
@@ -62,7 +62,7 @@ class TagPose:
 
     @property
     def yaw_rad(self) -> float:
-        """Where the face looks on the floor."""
+        """Direction of the face's normal on the floor."""
         x, y, z, w = self.quaternion_xyzw.tolist()
         return atan2(2.0 * (y * z - x * w), 2.0 * (x * z + y * w))
 
@@ -73,30 +73,30 @@ class TagResult:
 
     family: str
     tag_id: int
-    instance: str  # empty unless one id hangs in several places: a, b, ...
+    instance: str  # empty unless several tags have the id: a, b, ...
     size_m: float | None  # None: imported positions
     position_m: FloatArray  # (2,)
     covariance: FloatArray  # (2, 2) m^2
     n_observations: int
-    runs: tuple[str, ...]  # names of the runs that saw it
-    pose: TagPose | None = None  # None where it is known on the floor only
-    # By how many times its passes scatter more than chance explains, in sigmas; 1 where it does. The covariance has it.
+    runs: tuple[str, ...]  # names of the runs that observed it
+    pose: TagPose | None = None  # None if only its position on the floor is known
+    # Scatter of its passes relative to its expectation, in sigmas; 1 if consistent. The covariance includes it.
     sigma_factor: float = 1.0
 
     @property
     def label(self) -> str:
-        """Its number as people say it, with the instance."""
+        """Id with the instance."""
         return f"{self.tag_id}{self.instance}"
 
     @property
     def full_label(self) -> str:
-        """The same with its family, for maps of several."""
+        """The label with its family, for maps with several."""
         return f"{self.family}:{self.label}"
 
 
 @dataclass(frozen=True)
 class StartToStart:
-    """From the start of one run to the start of another in one component."""
+    """Vector from the start of one run to the start of another in one component."""
 
     a: str
     b: str
@@ -110,7 +110,7 @@ class StartToStart:
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of the distance, first order; of the longer axis where the distance is nothing."""
+        """Standard deviation of the distance, first order; for a zero distance that of the worse axis."""
         distance_m = self.distance_m
         if distance_m < 1e-9:
             return float(max(self.covariance[0, 0], self.covariance[1, 1]) ** 0.5)
@@ -120,16 +120,16 @@ class StartToStart:
 
 @dataclass(frozen=True)
 class GraphEdges:
-    """What a component's poses and tags were solved from, with the calibration that the solve found put in.
+    """Factors of a component's poses and tags, with the estimated calibration applied.
 
-    With the calibration held at that, the poses and tags of the map are the least squares of these edges. What
-    somebody measured by hand is not among them.
+    With the calibration fixed, the poses and tags of the map are the least-squares solution of these edges. External
+    measurements are not among them.
 
     Attributes:
-        first: (M,) keyframe that a motion starts from, counted through all of the component's runs; the next ends it.
+        first: (M,) keyframe that a motion starts from, numbered through all runs; it ends at the next.
         motion: (M, 3) T_first_next by the wheels.
         motion_information: (M, 3, 3) of its right tangent (x, y, theta).
-        pose: (N,) keyframe that a tag was read from, counted likewise.
+        pose: (N,) keyframe of an observation, numbered likewise.
         tag: (N,) index into the component's tags.
         place_m: (N, 2) of the tag in base.
         place_information: (N, 2, 2).
@@ -146,7 +146,7 @@ class GraphEdges:
 
 @dataclass(frozen=True)
 class FloorSigmas:
-    """How far off level the base stands in each picture, as fitted to its corners; zeros on a level floor."""
+    """Standard deviations of the base's tilt and height in each picture, fitted to corners; zeros on a level floor."""
 
     sigma_tilt_rad: float  # roll and pitch
     sigma_height_m: float
@@ -167,10 +167,10 @@ class Component:
     edges: GraphEdges | None = None
     model: MapModel = MapModel.FLOOR
     calibration: ArchivedCalibration | None = None  # with its covariance, and that with the tags
-    floor: FloorSigmas | None = None  # None where nobody looked at corners
-    # By how many times all sigmas of the component are larger than computed; 1 where the model explains the drives.
+    floor: FloorSigmas | None = None  # None without corners
+    # Factor by which all sigmas of the component were inflated; 1 if the model fits the drives.
     sigma_factor: float = 1.0
-    misfit: Misfit | None = None  # what it does not explain
+    misfit: Misfit | None = None  # lack of fit; None if the model fits
 
     @property
     def tag_covariance(self) -> FloatArray:
@@ -181,17 +181,17 @@ class Component:
 
 @dataclass(frozen=True)
 class AdviceResult:
-    """One more drive or one more tag that would help the worst tag of a component.
+    """One more drive or one more tag that would reduce the sigma of a component's worst tag.
 
     Attributes:
-        kind: pass (drive that part of a run's way once more) or tag (hang one there and drive all as before).
-        run: whose way it is, or beside whose way it hangs.
-        tags: (family, tag id, instance) where the pass begins and ends; of a tag the one that hangs nearest.
+        kind: pass (repeat that part of a run's path) or tag (mount one there and repeat all drives).
+        run: whose path it is, or whose path it is beside.
+        tags: (family, tag id, instance) at which the pass begins and ends; for a tag the nearest one.
         way_m: (N, 2) in map, of a tag (1, 2).
         length_m: of a pass; None for a tag.
-        worst_tag: that has the largest sigma.
-        sigma_m: that one, along its worst direction.
-        sigma_then_m: the largest of any tag that is expected then.
+        worst_tag: the one with the largest sigma.
+        sigma_m: of that one, along its worst direction.
+        sigma_then_m: the largest expected of any tag afterwards.
     """
 
     kind: str
@@ -207,7 +207,7 @@ class AdviceResult:
 
 @dataclass(frozen=True)
 class MapResult:
-    """Everything that one `map` command found."""
+    """Results of one `map` command."""
 
     components: tuple[Component, ...]  # largest first
     alignments: tuple[AlignmentResult, ...]
@@ -217,13 +217,13 @@ class MapResult:
     checks: tuple[ConsistencyCheck, ...] = ()
     metres: tuple[ScaleBudget, ...] = ()
     warnings: tuple[str, ...] = field(default=())
-    losses: tuple[str, ...] = ()  # what of the logs cannot be read, a sentence each
+    losses: tuple[str, ...] = ()  # unreadable parts of the logs, a sentence each
     suspects: tuple[SuspectTag, ...] = ()
     noise_fit: FittedNoise | None = None  # None: the noise was given
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
-    choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none where it was off
-    robot_numbers: tuple[RobotNumber, ...] = ()  # what the drives say of each number of robots' files
-    kept: tuple[ArchivedSegment, ...] = ()  # each run's measurements, to solve them again together with another run's
+    choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none if it was off
+    robot_numbers: tuple[RobotNumber, ...] = ()  # estimates of each number of robots' files
+    kept: tuple[ArchivedSegment, ...] = ()  # each run's measurements, to solve them again jointly with another run's
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

@@ -1,8 +1,8 @@
-"""How well a component's tags are known relative to each other, apart from where the whole lies in its frame.
+"""Covariances of a component's tags relative to each other, without the uncertainty of the frame.
 
 The joint covariance of the tags is transformed to the datum of the tags themselves (S-transformation: Baarda 1973,
-"S-transformations and criterion matrices"): with G the (2T, 3) small shifts and turns of all tags, the shape is what
-S = I - G (G'G)^-1 G' leaves, with covariance S C S'.
+"S-transformations and criterion matrices"). With G (2T, 3) the derivative by a small shift and rotation of all tags, S
+= I - G (G'G)^-1 G' projects onto the shape, whose covariance is S C S'.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ class Shape(NamedTuple):
 
     Attributes:
         tag_covariances: (T, 2, 2) m^2 of the tags, in axes of the map.
-        heading_sigma_rad: by how much the tags as a whole may be turned about the frame.
+        heading_sigma_rad: of the rotation of all tags relative to the frame.
     """
 
     tag_covariances: FloatArray
@@ -26,12 +26,12 @@ class Shape(NamedTuple):
 
     @property
     def tag_sigmas_m(self) -> FloatArray:
-        """(T,) standard deviation of each along its worst direction."""
+        """Standard deviation (T,) of each tag along its worst direction."""
         return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(self.tag_covariances)[:, -1], 0.0)))
 
 
 def shape_of(component: Component) -> Shape | None:
-    """The shape of a component; None with fewer than two tags, or where their covariances are not known."""
+    """Return the shape of a component; None with fewer than two tags, or if their covariances are unknown."""
     n = len(component.tags)
     covariance = component.tag_covariance
     if n < 2 or not np.isfinite(covariance).all():
@@ -43,7 +43,7 @@ def shape_of(component: Component) -> Shape | None:
     if length2 == 0.0:
         return None
     gauge = np.column_stack([np.tile([1.0, 0.0], n), np.tile([0.0, 1.0], n), turned])
-    scaled = gauge / np.sqrt((gauge**2).sum(axis=0))  # the three are at right angles to each other
+    scaled = gauge / np.sqrt((gauge**2).sum(axis=0))  # the three columns are orthogonal
     projection = np.eye(2 * n) - scaled @ scaled.T
     own = (projection @ covariance @ projection).reshape(n, 2, n, 2)
     heading_variance = float(turned @ covariance @ turned) / length2**2

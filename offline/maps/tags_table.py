@@ -26,7 +26,7 @@ TAG_COLUMNS: Final = (
 
 
 def tags_csv(components: Sequence[Component]) -> str:
-    """The table of tags, as tags.csv has it."""
+    """Return the content of tags.csv."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(TAG_COLUMNS)

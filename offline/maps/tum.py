@@ -1,4 +1,4 @@
-"""Trajectories as TUM text, which evo and others read: `t_s x y z qx qy qz qw` a line."""
+"""Trajectories as TUM text, which evo and others read: `t_s x y z qx qy qz qw` per line."""
 
 from decimal import Decimal
 from pathlib import Path
@@ -13,7 +13,7 @@ _NS_PER_S: Final = 1_000_000_000
 
 
 def write_tum(path: Path, stamps_ns: IntArray, T_map_base: FloatArray) -> None:
-    """Writes poses (N, 3) of a robot on the floor, at stamps (N,): seconds with all nine decimals."""
+    """Write poses (N, 3) of a robot on the floor, at stamps (N,): seconds with all nine decimals."""
     half = 0.5 * T_map_base[:, 2]
     lines = [
         f"{stamp // _NS_PER_S}.{stamp % _NS_PER_S:09d} {x:.9f} {y:.9f} 0 0 0 {sin:.12f} {cos:.12f}\n"
@@ -26,10 +26,10 @@ def write_tum(path: Path, stamps_ns: IntArray, T_map_base: FloatArray) -> None:
 
 
 def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
-    """Stamps (N,) in ns and poses (N, 3) as (x_m, y_m, theta_rad).
+    """Return stamps (N,) in ns and poses (N, 3) as (x_m, y_m, theta_rad).
 
     Raises:
-        OfflineError: the file is missing, empty, or a line is no such pose.
+        OfflineError: the file is missing, empty, or a line is not such a pose.
     """
     try:
         lines = path.read_text(encoding="ascii").splitlines()
@@ -44,7 +44,7 @@ def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
             stamps_ns.append(np.int64(int(Decimal(stamp) * _NS_PER_S)))
             poses.append([float(x), float(y), 2.0 * np.arctan2(float(qz), float(qw))])
         except (ValueError, ArithmeticError) as error:
-            raise OfflineError(f"{path} line {number}: {line[:80]!r} is no pose; make the map again") from error
+            raise OfflineError(f"{path} line {number}: {line[:80]!r} is not a pose; make the map again") from error
     if not poses:
         raise OfflineError(f"{path}: holds no pose; make the map again")
     table = np.array(poses)

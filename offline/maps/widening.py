@@ -1,4 +1,4 @@
-"""A component's covariances as large as what contradicts the model asks for: the one place where they grow."""
+"""Inflation of a component's covariances by its lack of fit; no other module does this."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagRe
 
 @dataclass(frozen=True)
 class TagScatter:
-    """How far the passes of each of a component's tags scatter beyond chance.
+    """Scatter of each tag's passes beyond its expectation.
 
     Attributes:
-        factors: (T,) in sigmas of chance; exactly 1 where chance explains it.
-        added_m2: (T, 2, 2) what that adds to the covariance of the tag's place; 0 there.
+        factors: (T,) in sigmas; exactly 1 where the scatter is as expected.
+        added_m2: (T, 2, 2) covariance to add to that of the tag's position; 0 there.
     """
 
     factors: FloatArray
@@ -25,9 +25,9 @@ class TagScatter:
 
 
 def inflate_covariances(component: Component, misfit: Misfit | None, scatter: TagScatter) -> Component:
-    """The component with all covariances times the misfit's factor, and what its passes add to each tag.
+    """Return the component with all covariances times the misfit's factor, plus the scatter of each tag's passes.
 
-    That of a tag is an error of its own, so other tags' covariances and those with them stay.
+    The scatter is an error of the tag alone, so covariances of and with other tags are not changed by it.
     """
     if misfit is None and not scatter.added_m2.any():
         return component

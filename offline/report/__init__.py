@@ -1,4 +1,4 @@
-"""The map to look at: report.html and map.png.
+"""Presentation of the map: report.html and map.png.
 
 In: a map and what it was made from. Out: a page that opens from disk without a network, and a picture. In the paper:
 its figures of maps.

@@ -1,4 +1,4 @@
-"""What a table of the report is, and how its cells say numbers."""
+"""Tables of the report, and how their cells format numbers."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
@@ -8,9 +8,9 @@ UNKNOWN: Final = "\N{EN DASH}"
 
 
 class ReportTable(NamedTuple):
-    """A table and what it is about; `more` rows were left out."""
+    """A table of the report; `more` rows were left out."""
 
-    key: str  # names it in the page
+    key: str  # its id in the page
     title: str
     note: str
     columns: tuple[str, ...]
@@ -19,16 +19,16 @@ class ReportTable(NamedTuple):
 
 
 def table_of(key: str, title: str, note: str, columns: Iterable[str], rows: Sequence[Sequence[str]]) -> ReportTable:
-    """A table of the first rows, as many as a page takes; how many it leaves out it says itself."""
+    """Return a table of the first rows, as many as fit a page, with the number of rows left out."""
     kept = tuple(tuple(row) for row in rows[:_MOST_ROWS])
     return ReportTable(key, title, note, tuple(columns), kept, len(rows) - len(kept))
 
 
 def number(value: float | None, digits: int) -> str:
-    """So many digits after the point; a dash for what is not known."""
+    """Return a number with this many decimals; a dash for None."""
     return UNKNOWN if value is None else f"{value:.{digits}f}"
 
 
 def numbers(values: Sequence[float | None] | None) -> str:
-    """To a thousandth, beside each other."""
+    """Return numbers with three decimals, separated by commas."""
     return UNKNOWN if values is None else ", ".join(number(value, 3) for value in values)

@@ -1,4 +1,4 @@
-"""What the report's figures draw: plain numbers, thinned and rounded, a list for each trace.
+"""Data of the report's figures: plain numbers, thinned and rounded, a list for each trace.
 
 Numbers that map.json has too come from its document, so that the two cannot disagree.
 """
@@ -23,10 +23,10 @@ _DECIMALS: Final = 3  # millimetres
 
 
 def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
-    """Data of all figures, ready for JSON.
+    """Return the data of all figures, ready for JSON.
 
     Args:
-        document: of `map_as_json`.
+        document: from `map_as_json`.
         workings: of the same map.
     """
     colours = run_colours(document)
@@ -49,7 +49,7 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
 
 
 def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
-    """The cost over the time offset of one robot."""
+    """Return the cost over the time offset of one robot."""
     return {
         "robot": f"{robot}: {search.offset_s:+.3f} s (sigma {search.sigma_s:.3f} s)",
         "offset_s": round(search.offset_s, 4),
@@ -59,7 +59,7 @@ def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
 
 
 def run_colours(document: dict[str, Any]) -> dict[str, str]:
-    """Each segment's colour, that of its run in map.png."""
+    """Return each segment's colour, that of its run in map.png."""
     runs = list(dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"]))
     return {
         run["run"]: RUN_COLOURS[runs.index(run["stretch_of"] or run["run"]) % len(RUN_COLOURS)]
@@ -68,18 +68,18 @@ def run_colours(document: dict[str, Any]) -> dict[str, str]:
 
 
 def residual_sigmas(solved: SolvedGroup) -> FloatArray:
-    """(M,) what each reading leaves over: root mean square of its two whitened coordinates."""
+    """Return the residual (M,) of each observation: root mean square of its two whitened coordinates."""
     residual = solved.graph.problem.readings.residual(solved.solution.state)
     return np.asarray(np.sqrt((residual**2).mean(axis=1)))
 
 
 def segment_of_reading(solved: SolvedGroup) -> IntArray:
-    """(M,) index of the segment that each reading belongs to."""
+    """Return the index (M,) of the segment of each observation."""
     return np.searchsorted(solved.graph.first_pose, solved.graph.problem.readings.pose, side="right") - 1
 
 
 def tag_readings(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
-    """For each tag of a component, a record for each segment that read it: how often, and what that leaves over."""
+    """Return for each tag of a component a record per segment with the number and residuals of its observations."""
     n_segments, n_tags = len(solved.graph.segments), len(solved.graph.tags)
     sigmas = residual_sigmas(solved)
     cell = solved.graph.problem.readings.tag * n_segments + segment_of_reading(solved)
@@ -127,7 +127,7 @@ def _component(
 
 
 def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, Any]:
-    """A trajectory and the heading at its start."""
+    """Return a trajectory and the heading at its start."""
     kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // _MOST_POINTS)), len(poses) - 1))
     x, y = _round_points(poses[kept])
     return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
@@ -148,7 +148,7 @@ def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_fam
 def _before(
     solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str], *, several_families: bool
 ) -> list[dict[str, Any]]:
-    """Each local map laid where the alignments put it, with its own tags."""
+    """Return each local map as the alignments place it, with its own tags."""
     layers = []
     for T_frame_start, member in zip(solved.group.T_frame_start, solved.group.members, strict=True):
         local_map = workings.maps[member]
@@ -161,6 +161,6 @@ def _before(
 
 
 def _round_points(points: FloatArray) -> tuple[list[float], list[float]]:
-    """Abscissae and ordinates of (N, 2 or more)."""
+    """Return x and y of points (N, 2 or more)."""
     x, y = np.round(points[:, :2], _DECIMALS).T.tolist() if len(points) else ([], [])
     return x, y

@@ -1,4 +1,4 @@
-"""The report's tables of how runs hang together, from the document that map.json is written from."""
+"""The report's tables of how runs are connected, from the document that map.json is written from."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -8,12 +8,12 @@ from typing import Any, Final
 from groundsbot.offline.report.cells import ReportTable, number, table_of
 from groundsbot.offline.report.sentences import has_several_families, largest_sigma_m, linking_tags, tag_label
 
-# Fewer shared tags tell no transform.
+# Fewer shared tags determine no transform.
 _LEAST_SHARED: Final = 2
 
 
 def alignments(document: dict[str, Any]) -> ReportTable:
-    """Pairs of runs."""
+    """Return the table of aligned pairs of runs."""
     rows = []
     for each in document["alignments"]:
         x_m, y_m, theta_rad = each["transform"]
@@ -29,22 +29,22 @@ def alignments(document: dict[str, Any]) -> ReportTable:
                 _sureness(each),
             )
         )
-    columns = ("run", "joined with", "shared tags that fit", "RMS (m)", "x, y (m)", "turned (deg)", "left out", "sure")
-    note = "How each run's own map lies in another's, by the tags that both hold."
+    columns = ("run", "joined with", "shared tags that fit", "RMS (m)", "x, y (m)", "yaw (deg)", "left out", "accepted")
+    note = "Transform from each run's own map to another's, from the tags that both have."
     return table_of("alignments", "How the runs fit together", note, columns, rows)
 
 
 def _sureness(alignment: dict[str, Any]) -> str:
     if not alignment["is_sure"]:
-        return f"no; {len(alignment['rivals'])} other ways"
+        return f"no; {len(alignment['rivals'])} alternatives"
     if not alignment["is_weak"]:
         return "yes"
     x_m, y_m, theta_rad = (alignment["covariance"][i][i] ** 0.5 for i in range(3))
-    return f"weak: one tag; to {x_m:.2f} m, {y_m:.2f} m, {degrees(theta_rad):.2f} deg"
+    return f"weak: one tag; sigma {x_m:.2f} m, {y_m:.2f} m, {degrees(theta_rad):.2f} deg"
 
 
 def holding(document: dict[str, Any]) -> ReportTable:
-    """Tags that several runs read."""
+    """Return the table of tags that several runs observed."""
     several = has_several_families(document)
     rows = []
     for component in range(len(document["components"])):
@@ -61,13 +61,13 @@ def holding(document: dict[str, Any]) -> ReportTable:
                     "yes" if is_essential else "no",
                 )
             )
-    columns = ("tag", "runs", "read by", "readings", "sigma (m)", "runs fall apart without it")
-    note = "The tags that more than one run read."
-    return table_of("holding", "Tags that hold the runs together", note, columns, rows)
+    columns = ("tag", "runs", "observed by", "observations", "sigma (m)", "runs are disconnected without it")
+    note = "The tags that more than one run observed."
+    return table_of("holding", "Tags that connect the runs", note, columns, rows)
 
 
 def essential_tags(document: dict[str, Any], component: int) -> list[dict[str, Any]]:
-    """Linking tags without any one of which the runs would fall apart, were runs joined by two shared tags each."""
+    """Return linking tags that each disconnect the runs if removed, where two shared tags connect two runs."""
     links = linking_tags(document, component)
     names = document["components"][component]["runs"]
     if not _are_joined(names, links):
@@ -89,7 +89,7 @@ def _are_joined(names: Sequence[str], links: Sequence[dict[str, Any]]) -> bool:
 
 
 def start_to_start(document: dict[str, Any]) -> ReportTable:
-    """From each run's start to each other's."""
+    """Return the table of distances between starts."""
     rows = [
         (each["a"], each["b"], number(each["distance_m"], 3), number(each["sigma_m"], 3))
         for each in document["start_to_start"]

@@ -1,4 +1,4 @@
-"""Where to write beside points so that the writing stays legible."""
+"""Placement of labels beside points so that they stay legible."""
 
 from typing import Final
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 
-_MARKER_PX: Final = 5.0  # half a marker, and a little air
+_MARKER_PX: Final = 5.0  # half a marker, and a gap
 _DIRECTIONS: Final = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [0, 1], [0, -1], [1, 0], [-1, 0]], dtype=np.float64)
 _RINGS: Final = (1.0, 1.8, 2.8)  # the nearest ring of places first
-# What covering costs: another label most, another marker, a trajectory's point least; and what distance costs.
+# Costs of covering another label, another marker and a trajectory's point, and of each further ring.
 _COST_LABEL: Final = 20.0
 _COST_MARKER: Final = 10.0
 _COST_TRAIL: Final = 0.5
@@ -17,12 +17,12 @@ _COST_RING: Final = 1.0
 
 
 def place_labels(points_px: FloatArray, sizes_px: FloatArray, trails_px: FloatArray) -> FloatArray:
-    """Centres (N, 2) of labels of given sizes (N, 2) beside points (N, 2), greedily the least covering place each.
+    """Return centres (N, 2) of labels of given sizes (N, 2) beside points (N, 2), greedily at the least cost.
 
     Args:
-        points_px: what the labels name; none should be covered.
+        points_px: positions to label; none should be covered.
         sizes_px: width and height of each label.
-        trails_px: (M, 2) what is better not covered.
+        trails_px: (M, 2) positions that are better not covered.
     """
     centres = np.empty_like(points_px)
     for index, (point, size) in enumerate(zip(points_px, sizes_px, strict=True)):
@@ -38,7 +38,7 @@ def place_labels(points_px: FloatArray, sizes_px: FloatArray, trails_px: FloatAr
 
 
 def _n_points_inside(candidates: FloatArray, half: FloatArray, points: FloatArray) -> FloatArray:
-    """How many points (M, 2) lie within the half widths (2,) or (M, 2) of each candidate (C, 2)."""
+    """Return how many points (M, 2) lie within the half widths (2,) or (M, 2) of each candidate (C, 2)."""
     half = np.broadcast_to(half, points.shape)
     lowest, highest = candidates.min(axis=0), candidates.max(axis=0)
     # Most points are far from all candidates.

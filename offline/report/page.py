@@ -1,7 +1,7 @@
 """The report as one page: text and tables, style, script, plotly's own script and the data in one file.
 
-Names of runs, families of tags and events come from files that anybody may have written. All text goes through an
-element tree, which escapes it; data lies in a script element that is no script, with no `<` in it that could end it.
+Names of runs, families of tags and events come from files of unknown origin. All text goes through an element tree,
+which escapes it; data is in a script element that is not executed, and contains no `<` that could end it.
 """
 
 import json
@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 from groundsbot.offline.report.cells import ReportTable
 
 _ASSETS: Final = "groundsbot.offline.report.assets"
-# Longer tables are folded away.
+# Longer tables are collapsed.
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)
 _MIDDLE: Final = ("advice", "alignments", "holding", "starts", "robots", "checks", "metres", "measurements")
@@ -28,7 +28,7 @@ def page(
     tables: Sequence[ReportTable],
     figures: dict[str, Any],
 ) -> str:
-    """The whole page as text."""
+    """Return the whole page as text."""
     from plotly.offline import get_plotlyjs
 
     main, by_key = Element("main"), {table.key: table for table in tables}
@@ -60,9 +60,9 @@ def page(
 
 
 def as_script_data(value: object) -> str:
-    """JSON that can stand in a script element, whatever its strings are."""
+    """Return JSON that is safe inside a script element, whatever its strings are."""
     text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    # The only characters that HTML could see there.
+    # The only characters that HTML could interpret there.
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text
@@ -73,8 +73,8 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
         main,
         "map",
         "The map",
-        "Drag to move, turn the wheel to zoom, click twice to see all. Point at a tag to see how well it is known. "
-        "Ellipses hold a tag with 95 %. A click in the legend shows or hides a layer.",
+        "Drag to move, turn the wheel to zoom, click twice to see all. Point at a tag to see its sigmas. "
+        "Ellipses are 95 % confidence regions. A click in the legend shows or hides a layer.",
     )
     for index, component in enumerate(components):
         caption = f"Component {index + 1}, in the frame of {component['frame_run']}" if len(components) > 1 else ""
@@ -88,7 +88,7 @@ def _add_before(main: Element, components: Sequence[dict[str, Any]]) -> None:
         main,
         "before",
         "Before merging",
-        "Each run solved alone, laid where the alignments put it. Lines join the places that runs have for one tag.",
+        "Each run solved alone, placed by the alignments. Lines connect the positions of one tag in different runs.",
     )
     buttons = _text(section, "p", "")
     buttons.set("class", "buttons")
@@ -108,8 +108,8 @@ def _add_searches(main: Element, searches: Sequence[dict[str, Any]]) -> None:
         main,
         "searches",
         "Search for time offsets",
-        "What it costs to take stamps of pictures for late by so much, beyond what robot.yaml says; half a unit is one "
-        "sigma. The line is where the search ended. One deep, narrow valley is a clock that is known.",
+        "Cost of each delay of the pictures' stamps relative to robot.yaml; half a unit above the minimum is one "
+        "sigma. The line marks the estimate. A single, narrow minimum means that the offset is well determined.",
     )
     for index, each in enumerate(searches):
         _figure(section, "search", index, each["robot"])
@@ -120,9 +120,9 @@ def _add_timelines(main: Element, timelines: Sequence[dict[str, Any]], n_timelin
         main,
         "timelines",
         "Drive by drive",
-        "Speed by the wheels; tags in view of a keyframe; what its readings leave over, as root mean square and "
-        "largest (grey), in sigmas: about 1 where the noise is as the map has it. Grey bands: no wheel reading. Marks "
-        "above: what the recorder told, losses in red.",
+        "Speed by the wheels; tags in view of a keyframe; residuals of its observations in sigmas, as root mean square "
+        "and largest (grey): about 1 where the noise model is right. Grey bands: no wheel readings. Marks above: "
+        "events of the recorder, losses in red.",
     )
     for index, each in enumerate(timelines):
         _figure(section, "timeline", index, each["run"])

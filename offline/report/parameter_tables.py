@@ -1,4 +1,4 @@
-"""The report's tables of what numbers the map rests on: robot.yaml, noise, and what was measured by hand."""
+"""The report's tables of parameters: robot.yaml, noise, and external measurements."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from groundsbot.offline.report.sentences import check_contradicts
 
 
 def checks(document: dict[str, Any]) -> ReportTable:
-    """Wheels and tags."""
+    """Return the table that compares wheels and tags."""
     names = {"scale": "length of a metre", "turn": "a full turn"}
     rows = [
         (
@@ -33,12 +33,12 @@ def checks(document: dict[str, Any]) -> ReportTable:
         "wheels and tags",
     )
     return table_of(
-        "checks", "Wheels held against tags", "By the readings alone, without what robot.yaml says.", columns, rows
+        "checks", "Wheels compared with tags", "By the observations alone, without robot.yaml.", columns, rows
     )
 
 
 def scale_table(document: dict[str, Any]) -> ReportTable:
-    """Components, and what each one's metre comes from."""
+    """Return the table of what determines each component's scale."""
     kinds = ("wheels", "track", "tags", "mount", "distances", "starts")
     rows = [
         (
@@ -49,12 +49,12 @@ def scale_table(document: dict[str, Any]) -> ReportTable:
         for each in document["metres"]
     ]
     columns = ("component", "sigma (%)", *(f"{kind} (%)" for kind in kinds))
-    note = "Everything could be stretched together without a reading noticing; this is what resists, and its share."
-    return table_of("metres", "What holds the length of a metre", note, columns, rows)
+    note = "The share of each source of information on the scale; without them, the whole map could be scaled."
+    return table_of("metres", "What determines the scale", note, columns, rows)
 
 
 def measurements(document: dict[str, Any]) -> ReportTable:
-    """What somebody measured."""
+    """Return the table of external measurements."""
     rows = [
         (
             each["kind"],
@@ -74,7 +74,7 @@ def measurements(document: dict[str, Any]) -> ReportTable:
 
 
 def noise(document: dict[str, Any]) -> ReportTable:
-    """Sigmas of wheels and readings."""
+    """Return the table of sigmas of wheels and observations."""
     fit = document.get("noise_fit")
     fitted = {each["name"]: each for each in (fit["parameters"] if fit else [])}
     rows = []
@@ -84,24 +84,24 @@ def noise(document: dict[str, Any]) -> ReportTable:
         if entry is not None and entry["low"] is not None and entry["high"] is not None:
             interval = f"{entry['low']:.3g} to {entry['high']:.3g}"
         if name in ("sigma_tilt_rad", "sigma_height_m"):
-            told = "of the floor, by corners"
+            told = "fitted to corners"
         elif fit is None:
             told = "given"
         else:
             told = "fitted" if interval else (entry or {}).get("kept") or "not needed"
         rows.append((name, f"{value:.4g}", interval, told))
     note = (
-        f"Fitted to what the readings of {', '.join(fit['runs'])} leave over."
+        f"Fitted to the residuals of {', '.join(fit['runs'])}."
         if fit and fit["runs"]
         else "The sigmas that the map was made with."
     )
     return table_of(
-        "noise", "Noise of wheels and readings", note, ("sigma", "value", "99 % within", "where from"), rows
+        "noise", "Noise of wheels and observations", note, ("sigma", "value", "99 % interval", "source"), rows
     )
 
 
 def robots(document: dict[str, Any]) -> ReportTable:
-    """What the drives say of robots' files."""
+    """Return the table of robots' parameters as estimated from the drives."""
     rows = [
         (
             each["owner"],
@@ -114,6 +114,6 @@ def robots(document: dict[str, Any]) -> ReportTable:
         )
         for each in document["robot_numbers"]
     ]
-    columns = ("of", "number", "robot.yaml", "found", "sigma", "verdict", "what to do")
-    note = "Each number of a robot's file, and as the map of these drives has it. Metres, seconds, radians."
-    return table_of("robots", "What these drives say of the robots", note, columns, rows)
+    columns = ("of", "number", "robot.yaml", "estimate", "sigma", "verdict", "what to do")
+    note = "Each number of a robot's file, and its estimate from these drives. Metres, seconds, radians."
+    return table_of("robots", "Robot parameters estimated from these drives", note, columns, rows)

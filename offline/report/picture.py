@@ -22,7 +22,7 @@ from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
 from groundsbot.offline.report.label_places import place_labels
 
 Dashes = Literal["-", "--", "-.", ":"]
-# Okabe and Ito, "Color universal design" (2008), without those too pale for lines; then again with other dashes.
+# Okabe and Ito, "Color universal design" (2008), without those too pale for lines; repeated with other dashes.
 RUN_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES: Final[tuple[Dashes, ...]] = ("-", "--", "-.", ":")
 _SHARED: Final = "#222222"
@@ -30,9 +30,9 @@ _DPI: Final = 100
 _WIDTH_IN: Final = 16.0
 _HEIGHT_LIMITS_IN: Final = (7.0, 16.0)
 _FURNITURE_IN: Final = 1.6  # title, axis labels and legend
-_MARGIN: Final = 0.04  # of the extent, so that ids near the rim fit in
+_MARGIN: Final = 0.04  # relative to the extent, so that ids near the rim fit in
 _MOST_PANELS: Final = 6
-_VISIBLE_SHARE: Final = 0.006  # of the extent: a typical ellipse's half axis below it is drawn larger
+_VISIBLE_SHARE: Final = 0.006  # of the extent: ellipses are enlarged if a typical half axis is smaller
 _FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
 _LABEL_PT: Final = 9.0
@@ -41,14 +41,14 @@ _DART: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65)
 
 
 def write_picture(result: MapResult, path: Path) -> None:
-    """Draws a map as PNG, 1600 px wide: one panel a component, in metres, the same scale along both axes."""
+    """Draw a map as PNG, 1600 px wide: one panel per component, in metres, the same scale along both axes."""
     figure = draw_map(result)
     with atomic_write(path) as partial, partial.open("wb") as stream:
         figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": "groundsbot"})
 
 
 def draw_map(result: MapResult) -> Figure:
-    """The picture as a matplotlib figure."""
+    """Return the picture as a matplotlib figure."""
     components = result.components[:_MOST_PANELS]
     columns = 1 if len(components) == 1 else 2
     rows = ceil(len(components) / columns)
@@ -68,14 +68,14 @@ def draw_map(result: MapResult) -> Figure:
         panels.append(axes)
     handles = _legend_handles(result, styles, factor)
     figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=10, frameon=False)
-    figure.draw_without_rendering()  # settles the layout, so that ids can be placed in pixels
+    figure.draw_without_rendering()  # computes the layout, so that ids can be placed in pixels
     for axes, component in zip(panels, components, strict=True):
         _write_ids(axes, component, styles)
     return figure
 
 
 def _height_in(components: Sequence[Component], columns: int, rows: int) -> float:
-    """So that the widest panel fills its column."""
+    """Return the height at which the widest panel fills its column."""
     panel_in = (_WIDTH_IN - 1.0) / columns
     ratio = max((high / wide for wide, high in map(_extent_m, components)), default=0.5)
     return float(np.clip(rows * (panel_in * ratio + 0.6) + _FURNITURE_IN, *_HEIGHT_LIMITS_IN))
@@ -88,7 +88,7 @@ def _points_m(component: Component) -> FloatArray:
 
 
 def _extent_m(component: Component) -> tuple[float, float]:
-    """Width and height, at least a metre, since a robot may never have moved."""
+    """Return width and height, at least a metre, since a robot may never have moved."""
     wide, high = np.maximum(np.ptp(_points_m(component), axis=0), 1.0)
     return float(wide), float(high)
 
@@ -109,13 +109,13 @@ def _title(result: MapResult) -> str:
 
 
 def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
-    """Colour and dashes of each run; a run's segments look alike."""
+    """Return colour and dashes of each run; a run's segments look alike."""
     looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
     return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
 
 
 def _ellipse_factor(components: Sequence[Component]) -> int:
-    """How much larger than true ellipses are drawn, so that a typical one can be seen."""
+    """Return the factor by which ellipses are enlarged so that a typical one is visible."""
     half_axes = [sqrt(float(np.linalg.eigvalsh(tag.covariance)[-1])) for c in components for tag in c.tags]
     extent_m = max((max(_extent_m(component)) for component in components), default=1.0)
     typical_m = float(np.median(half_axes)) if half_axes else extent_m
@@ -142,7 +142,7 @@ def _draw_component(axes: Axes, component: Component, styles: dict[str, tuple[st
 
 
 def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
-    """A dart that points where the robot looked; an even triangle would not tell where."""
+    """Draw an arrowhead in the direction of the start; an equilateral triangle would not show it."""
     x_m, y_m, theta_rad = run.T_map_start
     marker = MarkerStyle(_DART, transform=Affine2D().rotate(theta_rad))
     (start,) = axes.plot([x_m], [y_m], marker=marker, color=colour, markersize=_START_SIZE, zorder=6, linestyle="")
@@ -155,7 +155,7 @@ def _draw_tags(axes: Axes, component: Component, styles: dict[str, tuple[str, Da
     for tag in component.tags:
         colour = _tag_colour(tag, component, styles)
         places_m.setdefault(colour, []).append(tag.position_m[:2])
-        axes.add_artist(_ellipse(tag, colour, factor))  # add_patch would look for new limits each time
+        axes.add_artist(_ellipse(tag, colour, factor))  # add_patch would update the limits each time
     for colour, places in places_m.items():
         axes.plot(*np.array(places).T, marker="s", color=colour, markersize=4.0, zorder=4, linestyle="")
 
@@ -172,7 +172,7 @@ def _ellipse(tag: TagResult, colour: str, factor: int) -> Ellipse:
 
 
 def _tag_colour(tag: TagResult, component: Component, styles: dict[str, tuple[str, Dashes]]) -> str:
-    """Its run's, or dark if several runs saw it: those tags hold the map together."""
+    """Return the colour of its run, or dark if several runs observed it: those tags connect the runs."""
     run_of = {run.name: run.run for run in component.runs}
     seen_by = {run_of.get(name, name) for name in tag.runs}
     if len(seen_by) != 1:
@@ -191,9 +191,9 @@ def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fa
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
     handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
     shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"
-    handles.append(_marker_handle("s", 4.0, "#777777", f"tag seen by one run (its colour), with {shown}"))
+    handles.append(_marker_handle("s", 4.0, "#777777", f"tag observed by one run (its colour), with {shown}"))
     if any(len(tag.runs) > 1 for component in result.components for tag in component.tags):
-        handles.append(_marker_handle("s", 4.0, _SHARED, "tag seen by several runs"))
+        handles.append(_marker_handle("s", 4.0, _SHARED, "tag observed by several runs"))
     return handles
 
 
@@ -202,7 +202,7 @@ def _marker_handle(marker: Literal["s"] | PolygonPath, size: float, colour: str,
 
 
 def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]]) -> None:
-    """Every tag's id beside it, where it covers no other tag or id if there is such a place."""
+    """Write every tag's id beside it, where it covers no other tag or id if there is such a place."""
     if not component.tags:
         return
     families = {tag.family for tag in component.tags}

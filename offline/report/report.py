@@ -1,4 +1,4 @@
-"""report.html: a map to look at, in one file that opens from disk without a network."""
+"""report.html: the presentation of a map, in one file that opens from disk without a network."""
 
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from groundsbot.offline.report.tables import tables
 
 
 def write_report(result: MapResult, workings: Diagnostics, path: Path) -> None:
-    """Writes the report of a map.
+    """Write the report of a map.
 
     Args:
         result: the map.
-        workings: what it was made from.
+        workings: intermediate results of the same map.
         path: of the file.
 
     Raises:

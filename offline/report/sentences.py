@@ -1,7 +1,6 @@
-"""The sentences at the top of the report: what was joined, how good it is, what to mistrust, what to do next.
+"""The sentences at the top of the report: which runs were merged, accuracy, doubts, and what to do next.
 
-They are made from the document that map.json is written from, and from nothing else, so that report and map cannot
-say different things.
+They are made only from the document that map.json is written from, so report and map cannot disagree.
 """
 
 from collections.abc import Sequence
@@ -13,13 +12,13 @@ import numpy as np
 from groundsbot.calib.foundation import plural
 from groundsbot.offline.maps import MAX_SIGMAS
 
-# A tag read less often has little to contradict it.
+# A tag with fewer observations has little redundancy.
 FEW_READINGS: Final = 3
 _MOST_NAMED: Final = 4
 
 
 def sentences(document: dict[str, Any]) -> list[str]:
-    """Three to seven sentences in plain English, the first what the model does not explain."""
+    """Return three to seven sentences in plain English, beginning with contradictions to the model, if any."""
     told = [
         contradiction_sentence(document),
         _joining_sentence(document),
@@ -32,7 +31,7 @@ def sentences(document: dict[str, Any]) -> list[str]:
 
 
 def contradiction_sentence(document: dict[str, Any]) -> str:
-    """That drives contradict the model, how sure that is, and what to do; empty where they do not."""
+    """Return that drives contradict the model, by how much, and what to do; empty if they do not."""
     components = document["components"]
     worst = max(range(len(components)), key=lambda i: float(components[i]["sigma_factor"]), default=0)
     misfit = components[worst]["misfit"] if components else None
@@ -45,19 +44,19 @@ def contradiction_sentence(document: dict[str, Any]) -> str:
     times, run = components[worst]["sigma_factor"], misfit["run"]
     return (
         f"{where} {'contradicts' if where.startswith('The ') else 'contradict'} {what} by more than chance explains "
-        f"({misfit['chi_square']:.0f} squared sigmas, {misfit['expected']} expected): all sigmas are {times:.1f} times "
-        f"as large as computed. Look at {look}; {run} fits worst: look at its log, or drive it again."
+        f"(chi-square {misfit['chi_square']:.0f}, {misfit['expected']} expected), so all sigmas were multiplied "
+        f"by {times:.1f}. Check {look}; {run} fits worst: check its log, or repeat the drive."
     )
 
 
 _MISFITS: Final = {
-    "joins": ("each other", "suspect tags, wheels held against tags and calibration in the report"),
-    "windows": ("the model", "suspect tags and at the drive's residuals in the report"),
+    "joins": ("each other", "suspect tags, the comparison of wheels with tags and calibration in the report"),
+    "windows": ("the model", "suspect tags and the drive's residuals in the report"),
 }
 
 
 def largest_sigma_m(covariance: Sequence[Sequence[float | None]]) -> float | None:
-    """Standard deviation along the worst direction on the floor; None where it is not known."""
+    """Return the standard deviation along the worst direction on the floor; None if unknown."""
     floor = np.array([row[:2] for row in covariance[:2]], dtype=np.float64)
     if not np.isfinite(floor).all():
         return None
@@ -70,13 +69,13 @@ def check_contradicts(check: dict[str, Any]) -> bool:
 
 
 def linking_tags(document: dict[str, Any], component: int = 0) -> list[dict[str, Any]]:
-    """Tags of a component that more than one run read, most runs first."""
+    """Return the tags of a component that more than one run observed, most runs first."""
     tags = [tag for tag in document["tags"] if tag["component"] == component and len(tag["runs"]) > 1]
     return sorted(tags, key=lambda tag: (-len(tag["runs"]), -tag["n_observations"], tag["family"], tag["tag_id"]))
 
 
 def enumerate_names(names: Sequence[str]) -> str:
-    """`a`, `a and b`, `a, b and c`, and no more than a few of them."""
+    """Return `a`, `a and b` or `a, b and c`, with at most a few names."""
     shown = list(names[:_MOST_NAMED])
     if len(names) > _MOST_NAMED:
         shown.append(f"{len(names) - _MOST_NAMED} more")
@@ -90,17 +89,17 @@ def _joining_sentence(document: dict[str, Any]) -> str:
     if len(components) > 1:
         first = components[0]
         return (
-            f"{plural(n_runs, 'run')} ({driven_m:.1f} m driven, {plural(n_tags, 'tag')}) could not be joined into "
-            f"one map: they fall into {len(components)} components, each in a frame of its own, of which the largest "
-            f"holds {plural(len(first['runs']), 'run')} and {plural(len(first['tags']), 'tag')}."
+            f"{plural(n_runs, 'run')} ({driven_m:.1f} m driven, {plural(n_tags, 'tag')}) could not be merged into "
+            f"one map: there are {len(components)} components, each in its own frame; the largest has "
+            f"{plural(len(first['runs']), 'run')} and {plural(len(first['tags']), 'tag')}."
         )
     names = enumerate_names([*dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"])])
     if len(document["runs"]) == 1:
-        return f"One run, {names}, drove {driven_m:.1f} m and placed {plural(n_tags, 'tag')}; nothing was to be joined."
+        return f"One run, {names}, drove {driven_m:.1f} m and observed {plural(n_tags, 'tag')}; nothing was merged."
     n_links = len(linking_tags(document))
-    by = f"by {plural(n_links, 'tag')} that more than one of them read" if n_links else "by what was measured by hand"
+    by = f"by {plural(n_links, 'tag')} that several of them observed" if n_links else "by measurements by hand"
     runs, tags = plural(n_runs, "run"), plural(n_tags, "tag")
-    return f"{runs} ({names}; {driven_m:.1f} m driven) became one map of {tags}, joined {by}."
+    return f"{runs} ({names}; {driven_m:.1f} m driven) were merged into one map of {tags}, connected {by}."
 
 
 def _n_drives(runs: Sequence[dict[str, Any]]) -> int:
@@ -108,34 +107,34 @@ def _n_drives(runs: Sequence[dict[str, Any]]) -> int:
 
 
 def headline(document: dict[str, Any]) -> str:
-    """How well the map is known, its shape first."""
+    """Return how accurate the map is, its shape first."""
     tags = [tag for tag in document["tags"] if tag["component"] == 0]
     known = [(sigma, tag) for tag in tags if (sigma := largest_sigma_m(tag["covariance"])) is not None]
     if not known:
-        return "It places no tag, so that nothing corrects what the wheels say."
+        return "It has no tags, so nothing corrects the wheels' odometry."
     told = _shape(document, tags, float(np.median([sigma for sigma, _ in known])))
     pairs = document["start_to_start"]
     if len(pairs) == 1:
         pair = pairs[0]
         told += (
-            f"; from the start of {pair['a']} to that of {pair['b']} it is {pair['distance_m']:.2f} m, give or take "
+            f"; from the start of {pair['a']} to that of {pair['b']} it is {pair['distance_m']:.2f} m, sigma "
             f"{_metres(pair['sigma_m'])}"
         )
     return told + "."
 
 
 def _shape(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_start_m: float) -> str:
-    """How well tags are known relative to each other, and seen from the first start."""
+    """Return how accurate tags are relative to each other, and relative to the first start."""
     component = document["components"][0]
     where, the_tags = ("In the largest component ", "tags") if len(document["components"]) > 1 else ("", "Tags")
     start = f"the start of {component['frame_run']}"
     if component["heading_sigma_rad"] is None:
-        return f"{where}{the_tags} are known to {_metres(seen_from_start_m)} (median, one sigma), seen from {start}"
+        return f"{where}{the_tags} are known to {_metres(seen_from_start_m)} (median, one sigma), relative to {start}"
     median_m = float(np.median([tag["shape_sigma_m"] for tag in tags]))
     worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
     return (
         f"{where}{the_tags} are known to {_metres(median_m)} relative to each other (median, one sigma; the worst, tag "
-        f"{worst['tag_id']}{worst['instance']}, to {_metres(worst['shape_sigma_m'])}); seen from {start}, whose "
+        f"{worst['tag_id']}{worst['instance']}, to {_metres(worst['shape_sigma_m'])}); relative to {start}, whose "
         f"heading is uncertain by {degrees(component['heading_sigma_rad']):.1f} degrees, to "
         f"{_metres(seen_from_start_m)}"
     )
@@ -146,15 +145,15 @@ def _scale(document: dict[str, Any]) -> str:
         return ""
     metre = document["metres"][0]
     kind, share = max(metre["shares"].items(), key=lambda each: each[1], default=("", 0.0))
-    told = f"The length of a metre is known to {_percent(metre['sigma'])}"
-    return f"{told}, {100.0 * share:.0f} % of that through {_HOLDS[kind]}." if kind else f"{told}."
+    told = f"The scale is known to {_percent(metre['sigma'])}"
+    return f"{told}, {100.0 * share:.0f} % of that from {_HOLDS[kind]}." if kind else f"{told}."
 
 
 _HOLDS: Final = {
     "wheels": "the wheels' radii",
     "track": "the distance between the wheels",
     "tags": "the size of the tags",
-    "mount": "where the camera sits",
+    "mount": "the position of the camera",
     "distances": "distances measured by hand",
     "starts": "starts measured by hand",
 }
@@ -165,33 +164,31 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
     contradicting = [check for check in document["checks"] if check_contradicts(check)]
     if contradicting:
         check = contradicting[0]
-        about = "a full turn" if check["name"] == "turn" else "the length of a metre"
+        about = "a full turn" if check["name"] == "turn" else "the scale"
         doubts.append(
             f"wheels and tags of {check['robot_id']} contradict each other about {about} by "
             f"{_percent(abs(check['value']))} ({check['sigmas']:.0f} sigma)"
         )
     taped = [each for each in document["measurements"] if each["contradicts"]]
     if taped:
-        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do(taped)} not fit to the rest")
+        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do(taped)} not fit the rest")
     suspects = document["suspect_tags"]
     if suspects:
         names = enumerate_names([f"{each['tag_id']} ({each['kind']})" for each in suspects])
-        doubts.append(f"{_tags_do(suspects)} not belong: {names}")
+        doubts.append(f"{_tags_do(suspects)} not fit the map: {names}")
     unsure = [each for each in document["alignments"] if not each["is_sure"]]
     if unsure:
         names = enumerate_names([f"{each['from']} with {each['to']}" for each in unsure])
-        doubts.append(
-            f"{plural(len(unsure), 'alignment')} could not be told for sure and {_were(unsure)} left out: {names}"
-        )
+        doubts.append(f"{plural(len(unsure), 'alignment')} {_were(unsure)} uncertain and not used: {names}")
     weak = [each for each in document["alignments"] if each["is_sure"] and each["is_weak"]]
     if weak:
         names = enumerate_names([f"{each['from']} with {each['to']}" for each in weak])
-        doubts.append(f"{plural(len(weak), 'join')} {'rests' if len(weak) == 1 else 'rest'} on one tag alone: {names}")
+        doubts.append(f"{plural(len(weak), 'alignment')} {'rests' if len(weak) == 1 else 'rest'} on one tag: {names}")
     few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_READINGS]
     if few:
         names = enumerate_names([str(tag["tag_id"]) for tag in few])
-        doubts.append(f"{plural(len(few), 'tag')} {_were(few)} read less than {FEW_READINGS} times: {names}")
-    told = [f"Mistrust this: {'; '.join(doubts)}."] if doubts else []
+        doubts.append(f"{plural(len(few), 'tag')} {_were(few)} observed fewer than {FEW_READINGS} times: {names}")
+    told = [f"Check this: {'; '.join(doubts)}."] if doubts else []
     n_warnings = len(document["warnings"])
     if n_warnings:
         told.append(f"The map comes with {plural(n_warnings, 'warning')}, below.")
@@ -201,15 +198,15 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
 
 
 def _next(document: dict[str, Any]) -> list[str]:
-    """What would help."""
+    """Return what to do next."""
     if len(document["components"]) > 1:
-        return ["To join the components, drive one more run past two or more tags of each of them."]
+        return ["To merge the components, drive one more run past two or more tags of each of them."]
     several = has_several_families(document)
     return [advice_sentence(each, several_families=several) for each in document["advice"][:1]]
 
 
 def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
-    """What to do, and what that would do to the worst tag; of an entry of `advice` in map.json."""
+    """Return what to do and its effect on the worst tag, from an entry of `advice` in map.json."""
     now, then = _metres(advice["sigma_m"]), _metres(advice["sigma_then_m"])
     worst = f"the largest sigma, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
@@ -217,29 +214,29 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]
     if advice["kind"] == "pass":
         what = (
-            f"One more pass from {first} to {others[0]}, {advice['length_m']:.0f} m along the way of {advice['run']},"
+            f"One more pass from {first} to {others[0]}, {advice['length_m']:.0f} m along the path of {advice['run']},"
         )
     else:
         x_m, y_m = advice["way_m"][0]
         what = (
-            f"One more tag at x {x_m:.1f} m, y {y_m:.1f} m (beside the way of {advice['run']}; nearest is {first}), "
+            f"One more tag at x {x_m:.1f} m, y {y_m:.1f} m (beside the path of {advice['run']}; nearest is {first}), "
             "and the same drives again,"
         )
-    return f"{what} would bring {worst}, from {now} to about {then}."
+    return f"{what} would reduce {worst}, from {now} to about {then}."
 
 
 def would_help(advice: dict[str, Any]) -> bool:
-    """Whether a person would see a difference."""
+    """Whether the effect is visible in the rounded numbers."""
     return _metres(advice["sigma_m"]) != _metres(advice["sigma_then_m"])
 
 
 def has_several_families(document: dict[str, Any]) -> bool:
-    """Whether a tag's number alone does not name it."""
+    """Whether a tag needs its family beside its id."""
     return len({tag["family"] for tag in document["tags"]}) > 1
 
 
 def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
-    """Number and instance, and the family where that is needed to tell tags apart."""
+    """Return id and instance, with the family if the map has several."""
     label = f"{tag['tag_id']}{tag['instance']}"
     return f"{tag['family']}:{label}" if several_families else label
 
@@ -257,7 +254,7 @@ def _tags_do(entries: Sequence[object]) -> str:
 
 
 def _metres(value_m: float) -> str:
-    """Centimetres as long as there are any, else millimetres."""
+    """Return a length in centimetres, above 9.5 cm in metres."""
     return f"{value_m:.2f} m" if value_m >= 0.095 else f"{100.0 * value_m:.1f} cm"
 
 

@@ -10,7 +10,7 @@ from groundsbot.offline.report.sentences import advice_sentence, has_several_fam
 
 
 def tables(document: dict[str, Any]) -> list[ReportTable]:
-    """Those that hold something."""
+    """Return the tables that are not empty."""
     made = [
         _outliers(document),
         _advice(document),
@@ -33,7 +33,7 @@ def _outliers(document: dict[str, Any]) -> ReportTable:
         (str(each["tag_id"]), each["family"], each["kind"], ", ".join(each["runs"]), each["evidence"])
         for each in document["suspect_tags"]
     ]
-    note = "Tags that do not belong, each with what speaks against it."
+    note = "Tags with observations that contradict the map, each with the evidence."
     return table_of("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows)
 
 
@@ -48,8 +48,8 @@ def _advice(document: dict[str, Any]) -> ReportTable:
         )
         for each in document["advice"]
     ]
-    note = "What would lower the largest sigma of a tag most, foretold from the covariances; drawn into the map."
-    columns = ("component", "what", "largest sigma (m)", "and then (m)")
+    note = "What would reduce the largest sigma of a tag most, predicted from the covariances; drawn into the map."
+    columns = ("component", "what", "largest sigma (m)", "predicted (m)")
     return table_of("advice", "What to do next", note, columns, rows)
 
 
@@ -101,10 +101,10 @@ def _tags(document: dict[str, Any]) -> ReportTable:
         "sigma x (m)",
         "sigma y (m)",
         "largest sigma (m)",
-        "readings",
+        "observations",
         "runs",
     )
-    note = "Sigmas are of the place as seen from the frame's start; the largest is along the worst direction."
+    note = "Sigmas are of the position relative to the frame's start; the largest is along the worst direction."
     return table_of("tags", "Tags", note, columns, rows)
 
 

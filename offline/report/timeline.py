@@ -1,4 +1,4 @@
-"""What each drive was like, second by second: speed, tags in view, what its readings leave over, gaps and events."""
+"""Each drive over time: speed, tags in view, residuals of its observations, gaps and events."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -8,18 +8,18 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.measurements import GAP_NS, RunEvent, Segment
 
-# As many points as a screen is wide.
+# About the width of a screen in pixels.
 _MOST_POINTS: Final = 800
 _S: Final = 1e-9
 
 
 def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[RunEvent]) -> dict[str, Any]:
-    """One segment's columns over time, thinned: means of speed, largest of what else there is.
+    """Return one segment's columns over time, thinned: means of speed, maxima of the others.
 
     Args:
-        segment: whose keyframes are the times.
-        residual_sigmas: (M,) what each of its readings leaves over, in sigmas a coordinate.
-        events: of `events_of`.
+        segment: whose keyframes give the times.
+        residual_sigmas: (M,) residual of each of its observations, in sigmas per coordinate.
+        events: from `events_of`.
     """
     n = len(segment.stamps_ns)
     seconds = (segment.stamps_ns - segment.stamps_ns[0]) * _S
@@ -29,7 +29,7 @@ def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[Run
     np.maximum.at(worst, segment.readings.keyframe, residual_sigmas)
     first = np.arange(0, n, -(-n // _MOST_POINTS))
     readings = np.add.reduceat(n_tags, first)
-    # A run may be one keyframe long: then there is no speed.
+    # A run of a single keyframe has no speed.
     step_m = np.append(segment.odometry.distance_m, 0.0)
     step_s = np.append(np.diff(seconds), 0.0)
     driven_m, lasting_s = np.add.reduceat(step_m, first), np.add.reduceat(step_s, first)
@@ -48,14 +48,14 @@ def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[Run
 def _mean_or_none(
     total: FloatArray, count: FloatArray | IntArray, digits: int, *, root: bool = False
 ) -> list[float | None]:
-    """Total by count, None where nothing counts."""
+    """Return total by count, None for a count of zero."""
     mean = total / np.where(count > 0, count, 1)
     values = np.round(np.sqrt(mean) if root else mean, digits).tolist()
     return [value if known else None for value, known in zip(values, (count > 0).tolist(), strict=True)]
 
 
 def events_of(segments: Sequence[Segment]) -> dict[str, list[RunEvent]]:
-    """What recorders told, by the name of the segment that was driven then or, between two of them, nearest then."""
+    """Return recorders' events by the name of the segment at that time or, between two of them, the nearest."""
     told: dict[str, list[RunEvent]] = {segment.name: [] for segment in segments}
     for name in dict.fromkeys(segment.run.name for segment in segments):
         own = [segment for segment in segments if segment.run.name == name]
@@ -67,8 +67,8 @@ def events_of(segments: Sequence[Segment]) -> dict[str, list[RunEvent]]:
 
 
 def _gaps(segment: Segment) -> list[list[float]]:
-    """Begin and end in seconds where no wheel was read for longer than a gap may be."""
-    if not segment.run.wheel_segments:  # of a map that was kept: its log alone knows
+    """Return begin and end in seconds of gaps between wheel readings that are longer than allowed."""
+    if not segment.run.wheel_segments:  # from an archived map: only its log has them
         return []
     stamps_ns = np.concatenate([wheel_segment.stamps_ns for wheel_segment in segment.run.wheel_segments])
     stamps_ns = stamps_ns[(stamps_ns >= segment.stamps_ns[0]) & (stamps_ns <= segment.stamps_ns[-1])]
@@ -79,6 +79,6 @@ def _gaps(segment: Segment) -> list[list[float]]:
 
 
 def _event_entry(event: RunEvent, segment: Segment) -> dict[str, Any]:
-    """An event at its time, or at the rim of the drive."""
+    """Return an event at its time, limited to the drive."""
     at_ns = min(max(event.stamp_ns, int(segment.stamps_ns[0])), int(segment.stamps_ns[-1])) - int(segment.stamps_ns[0])
     return {"t_s": round(at_ns * _S, 2), "loss": event.is_loss, "text": event.text}

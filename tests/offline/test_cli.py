@@ -102,7 +102,7 @@ def test_compare_prints_figures_as_text_and_json(run: Run, truth_file: Path, tmp
     outcome = run("compare", folder, "--truth", truth_file)
     assert outcome.code == 0
     assert "start of red_one to start of blue_two: 10.198 m found, 10.198 m true" in outcome.out
-    assert "tags RMSE, as the map stands: 0.000 m" in outcome.out
+    assert "tags RMSE, without alignment: 0.000 m" in outcome.out
     data = json.loads(run("compare", folder, "--truth", truth_file, "--json").out)
     wanted = {"start_to_start_vector_error_m", "start_to_start_distance_error_m", "start_to_start_percent"}
     wanted |= {"tags_rmse_m", "tags_rmse_aligned_m", "trajectory_rmse_m", "nees_tags_per_dim", "nees_start_per_dim"}

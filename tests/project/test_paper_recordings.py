@@ -76,7 +76,7 @@ def test_sigmas_that_were_widened_are_said_first(merged: dict[str, list[Any]], l
     assert component["sigma_factor"] > 1.0
     done = _run("map", logs, "-o", tmp_path / "map")
     assert done.exit_code == 3
-    assert f"{component['sigma_factor']:.1f} times as large as computed" in done.stdout.splitlines()[0]
+    assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}." in done.stdout.splitlines()[0]
 
 
 def _succeeds(*words: object) -> None:

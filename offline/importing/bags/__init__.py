@@ -1,1 +1,1 @@
-"""ROS 1 and ROS 2 bags, read without ROS, to run logs: odometry, mount, detections or pictures."""
+"""ROS 1 and ROS 2 bags, read without ROS, to run logs: odometry, camera mount, detections or pictures."""

@@ -1,4 +1,4 @@
-"""One pass over a bag: odometry, tags and transforms with their times, all but the pictures."""
+"""One pass over a bag: odometry, tags and transforms with their times; pictures are read later."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -25,16 +25,16 @@ Row = TypeVar("Row")
 
 @dataclass
 class BagContent:
-    """What a bag says.
+    """Messages of a bag.
 
     Attributes:
-        frames: by the fixed transforms.
-        odometry: (stamp in ns, message), rising.
-        looks: of the detections, rising.
-        sent_transforms: (stamp in ns, TransformStamped) that may be tags' places.
+        frames: from the fixed transforms.
+        odometry: (stamp in ns, message), ascending.
+        pictures: with their detections, ascending.
+        sent_transforms: (stamp in ns, TransformStamped) that may be tag poses.
         camera_infos: the first message of each such topic.
-        left_out: detections, counted by why.
-        remarks: what a person should know.
+        left_out: number of excluded detections by reason.
+        remarks: lines for the user.
     """
 
     frames: FixedFrames
@@ -47,17 +47,17 @@ class BagContent:
 
     @property
     def camera_frames(self) -> set[str]:
-        """The frames that detections name."""
+        """Frames that detections are given in."""
         return {look.frame for look in self.pictures if look.tags}
 
     @property
     def base_frame(self) -> str:
-        """The frame that odometry says it is of; empty where it does not say."""
+        """Child frame of the odometry; empty if its messages name none."""
         return str(getattr(self.odometry[0][1], "child_frame_id", ""))
 
 
 def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: str) -> BagContent:
-    """Reads all but the pictures.
+    """Read all messages but pictures.
 
     Args:
         bag: open.
@@ -97,22 +97,22 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
     content.remarks = clock.remarks()
     for n, topic in ((n_odometry, chosen.odometry), (n_looks, chosen.tags)):
         if n:
-            content.remarks.append(f"{topic.name}: {plural(n, 'message')} left out: their times were there already")
+            content.remarks.append(f"{topic.name}: {plural(n, 'message')} left out: other messages have the same times")
     return content
 
 
 class BagClock:
-    """The times of messages: when they were measured, not when the bag received them, unless that is asked for."""
+    """Measurement times of messages, from their headers; times of reception if the options ask for them."""
 
     def __init__(self, path: Path, options: BagOptions) -> None:
-        """Knows no message yet."""
+        """Start without messages."""
         self._path = path
         self._by_receiving = options.receive_times
         self._stamped: Counter[str] = Counter()
         self._without: Counter[str] = Counter()
 
     def stamp_ns(self, message: BagMessage) -> int | None:
-        """Of one message; None where its header says nothing."""
+        """Return the time of a message; None if its header has none."""
         stamp_ns = message.received_ns if self._by_receiving else _header_ns(message.content.header)
         if stamp_ns <= 0:
             self._without[message.topic] += 1
@@ -121,7 +121,7 @@ class BagClock:
         return stamp_ns
 
     def check(self, topics: list[BagTopic]) -> None:
-        """Looks whether these topics have times.
+        """Check that these topics have times.
 
         Raises:
             OfflineError: one has none.
@@ -134,7 +134,7 @@ class BagClock:
                 )
 
     def remarks(self) -> list[str]:
-        """For a person."""
+        """Return lines for the user."""
         said = ["times are those at which the bag received the messages"] if self._by_receiving else []
         return said + [
             f"{topic}: {plural(n, 'message')} left out: their header stamps are 0" for topic, n in self._without.items()
@@ -142,13 +142,13 @@ class BagClock:
 
 
 def _each_time_once(rows: list[Row], keys: list[tuple[Any, ...]]) -> tuple[list[Row], int]:
-    """Rows in order of their keys, which begin with the time; the first of each key, and how many others there were."""
+    """Return the first row of each key in ascending order, keys beginning with the time; and the number dropped."""
     first = dict(zip(reversed(keys), reversed(rows), strict=True))
     return [first[key] for key in sorted(first)], len(rows) - len(first)
 
 
 def _odometry_keys(odometry: list[tuple[int, Any]]) -> list[tuple[Any, ...]]:
-    """Time, and the joints: each may come in messages of its own."""
+    """Return keys of time and joint names, as the joints may come in separate messages."""
     return [(stamp_ns, *getattr(message, "name", ())) for stamp_ns, message in odometry]
 
 

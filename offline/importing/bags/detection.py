@@ -1,4 +1,4 @@
-"""Looks for tags in the pictures of a bag."""
+"""Tag detection in the pictures of a bag."""
 
 import os
 from collections.abc import Iterator
@@ -21,19 +21,19 @@ from groundsbot.onboard.log import Picture, StampSource
 def detect_in_bag(
     bag: Bag, topic: BagTopic, camera: CameraModel, robot: Robot, options: BagOptions, progress: Progress
 ) -> tuple[list[Entry], list[str]]:
-    """Messages for `/tags/detections`, in order of time, and what a person should know.
+    """Return messages for `/tags/detections` from the pictures of a topic, in order of time, and remarks for the user.
 
     Args:
         bag: open.
         topic: of the pictures.
         camera: that took them.
-        robot: its families of tags are looked for.
+        robot: has the families of tags to look for.
         options: of the command line.
-        progress: told how many pictures have been looked at.
+        progress: called with the number of pictures that are done.
 
     Raises:
-        GroundsbotError: the bag is damaged, pictures have no times, are of another size than the camera's or cannot be
-            read, or no detector is installed.
+        GroundsbotError: the bag is damaged, pictures have no times, do not match the camera's size or cannot be read,
+            or no detector is installed.
     """
     clock = BagClock(bag.path, options)
     families = tuple(robot.recorder.families)
@@ -58,8 +58,8 @@ def detect_in_bag(
             found[stamp_ns] = (stamp_ns, "/tags/detections", message)
     clock.check([topic])
     if not found:
-        raise OfflineError(f"{bag.path}: {topic.name}: no picture is of use: {unusable[0]}; name another topic")
-    told = [f"{plural(len(unusable), 'picture')} of no use, the first since: {unusable[0]}"] if unusable else []
+        raise OfflineError(f"{bag.path}: {topic.name}: no picture can be used: {unusable[0]}; name another topic")
+    told = [f"{plural(len(unusable), 'picture')} not usable, the first since: {unusable[0]}"] if unusable else []
     return [found[stamp] for stamp in sorted(found)], [*clock.remarks(), *told]
 
 

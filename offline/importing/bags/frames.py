@@ -1,4 +1,4 @@
-"""Where a camera sits on its robot, by the fixed transforms in a bag."""
+"""Pose of a camera on its robot, from the fixed transforms in a bag."""
 
 from typing import Any, Final
 
@@ -9,24 +9,24 @@ from groundsbot.calib.robot import R_LEVEL_OPTICAL, Mount
 from groundsbot.offline.errors import OfflineError
 
 _Values = tuple[float, float, float, float, float, float, float]  # x, y, z, then quaternion x, y, z, w
-# What rounding does to a transform that is sent again and again; a joint that moves does more.
+# Rounding of a transform that is sent repeatedly; a moving joint changes by more.
 _SAME: Final = 1e-6
-_UNIT_LENGTH: Final = 1e-3  # how far a quaternion's length may be from 1: far beyond rounding, even to floats
-_DEEPEST: Final = 100  # links from a frame to its root; more of them go in circles
+_UNIT_LENGTH: Final = 1e-3  # tolerance of a quaternion's length: far beyond rounding, even to float32
+_DEEPEST: Final = 100  # links from a frame to its root; more mean a cycle
 FARTHEST_MOUNT_M: Final = 10.0  # robot.yaml's limit too
 
 
 class FixedFrames:
-    """The transforms between frames that do not move against each other."""
+    """Transforms between frames that do not move relative to each other."""
 
     def __init__(self, where: str) -> None:
-        """Knows no frame yet; `where` names the bag in errors."""
+        """Start without frames; `where` names the bag in errors."""
         self._where = where
         self._links: dict[str, tuple[str, _Values]] = {}  # child -> parent and T_parent_child
-        self._moving: set[str] = set()  # children whose place on the parent changes
+        self._moving: set[str] = set()  # children whose pose in the parent changes
 
     def add(self, message: Any) -> None:  # noqa: ANN401 - made by rosbags from the bag's definition
-        """Takes a message of `/tf` or `/tf_static`."""
+        """Add a message of `/tf` or `/tf_static`."""
         for each in message.transforms:
             parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
             t, q = each.transform.translation, each.transform.rotation
@@ -36,28 +36,28 @@ class FixedFrames:
                 self._moving.add(child)
 
     def has(self, frame: str) -> bool:
-        """Whether a transform names it."""
+        """Whether any transform names the frame."""
         return frame in self._links or any(parent == frame for parent, _ in self._links.values())
 
     def joins(self, a: str, b: str) -> bool:
-        """Whether fixed transforms lead from one frame to the other."""
+        """Whether fixed transforms connect two frames."""
         return self._path(a)[-1][0] == self._path(b)[-1][0]
 
     def moving_near(self, frame: str) -> str | None:
-        """The frame that moves on its parent, at which the fixed way up from a frame ends; None if none does."""
+        """Return the root that fixed transforms lead to from a frame, if it moves relative to its parent; else None."""
         root = self._path(frame)[-1][0]
         return root if root in self._moving else None
 
     def transform(self, to: str, frame: str) -> RigidTransform:
-        """Points in `frame` to points in `to`, which must be joined.
+        """Return the transform from points in `frame` to points in `to`; the frames must be connected.
 
         Raises:
-            OfflineError: a transform on the way is none.
+            OfflineError: a transform on the way is invalid.
         """
         return self._to_root(to).inv() * self._to_root(frame)
 
     def _path(self, frame: str) -> list[tuple[str, _Values | None]]:
-        """The frames from one up to where the fixed transforms end, each with its place on the next."""
+        """Return the frames from one up to its root, each with its transform to the next."""
         path: list[tuple[str, _Values | None]] = []
         while frame in self._links and frame not in self._moving and len(path) < _DEEPEST:
             parent, values = self._links[frame]
@@ -74,14 +74,14 @@ class FixedFrames:
 
 
 def rigid_transform(values: _Values, where: str) -> RigidTransform:
-    """A transform of ROS.
+    """Return a transform of ROS as a RigidTransform.
 
     Args:
         values: translation x, y, z, then quaternion x, y, z, w.
         where: names it in errors.
 
     Raises:
-        OfflineError: a number is none, or the quaternion is of another length than 1.
+        OfflineError: a number is not finite, or the quaternion is not of length 1.
     """
     length = float(np.linalg.norm(values[3:]))
     if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_LENGTH:
@@ -92,15 +92,15 @@ def rigid_transform(values: _Values, where: str) -> RigidTransform:
 
 
 def frame_name(name: str) -> str:
-    """A frame as tf2 knows it: ROS 1's first tf wrote a slash before it."""
+    """Return a frame name as tf2 has it: without the leading slash of ROS 1's first tf."""
     return name.lstrip("/")
 
 
 def mount_of(T_base_camera: RigidTransform) -> Mount:
-    """The mount of robot.yaml that puts a camera's optical frame there.
+    """Return the mount of robot.yaml for this pose of a camera's optical frame.
 
     Raises:
-        OfflineError: no camera sits so far off.
+        OfflineError: the camera is implausibly far from the base.
     """
     place, rotation = T_base_camera.as_components()
     if float(np.abs(place).max()) > FARTHEST_MOUNT_M:

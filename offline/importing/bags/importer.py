@@ -29,16 +29,16 @@ def import_bag(
     bag_options: BagOptions | None = None,
     progress: Progress = lambda *_: None,
 ) -> ImportReport:
-    """Writes `output/<run_id>/0000.core.mcap` from a bag of ROS 1 or ROS 2; the same bytes for the same bag.
+    """Write `output/<run_id>/0000.core.mcap` from a bag of ROS 1 or ROS 2; the same bag gives the same bytes.
 
-    Nothing is written before all of the bag has been read, and the run folder appears whole or not at all.
+    The whole bag is read before anything is written, and the run folder appears complete or not at all.
 
     Args:
         path: a `.bag` file; a folder, an `.mcap` or a `.db3` file of ROS 2.
         output: folder of runs.
         options: what is known of the run and its robot.
         bag_options: which topics and frames.
-        progress: told how many pictures have been looked at.
+        progress: called with the number of pictures that are done.
 
     Raises:
         GroundsbotError: one line that names bag, topic, value and what to do.
@@ -83,7 +83,7 @@ def _odometry(
     options: ImportOptions,
     bag_options: BagOptions,
 ) -> tuple[list[PlanarOdometry], float]:
-    """Readings, and the metres driven."""
+    """Return odometry readings, and the driven distance in metres."""
     where = f"{path}: {chosen.odometry.name}"
     stamps_ns = np.array([stamp for stamp, _ in content.odometry], dtype=np.int64)
     messages = [message for _, message in content.odometry]
@@ -93,13 +93,13 @@ def _odometry(
         return readings, distance_m
     joints = wheel_joints(path, chosen.odometry.name, messages, bag_options)
     content.remarks.append(f"wheels: joints {joints[0]} and {joints[1]}")
-    # Joints give angles: a tick is a radian.
+    # Joints measure angles, so a tick is a radian.
     scale = wheel_scale(replace(options, ticks_per_turn=2.0 * pi))
     return joint_readings(where, stamps_ns, messages, joints, scale)
 
 
 def _check_times(path: Path, readings: list[PlanarOdometry], tags: list[Entry]) -> list[str]:
-    """Looks whether the tags were seen while the odometry ran; a word where some were not.
+    """Check that tags were observed while odometry was recorded; return a remark if some were not.
 
     Raises:
         OfflineError: none was.
@@ -112,14 +112,14 @@ def _check_times(path: Path, readings: list[PlanarOdometry], tags: list[Entry]) 
             f"{tags[0][0] * 1e-9:.3f} to {tags[-1][0] * 1e-9:.3f} s; were they stamped by different clocks? "
             "--receive-times takes the bag's own"
         )
-    return [f"{plural(n_outside, 'picture')} outside the odometry's time: of no use to a map"] if n_outside else []
+    return [f"{plural(n_outside, 'picture')} outside the odometry's time: a map cannot use them"] if n_outside else []
 
 
 def _check_options_used(path: Path, chosen: ChosenTopics, options: ImportOptions, bag_options: BagOptions) -> None:
-    """Complains of options that would be of no use.
+    """Check that every option given has an effect.
 
     Raises:
-        OfflineError: naming one.
+        OfflineError: naming one that has none.
     """
     if options.state_rate_hz is not None:
         raise OfflineError(f"{path}: --state-rate-hz is for odom.csv; a bag holds its own times, leave it out")
@@ -135,4 +135,4 @@ def _check_options_used(path: Path, chosen: ChosenTopics, options: ImportOptions
     if chosen.tags.msgtype == APRILTAG_ROS and bag_options.tag_size_m is not None:
         raise OfflineError(f"{path}: {chosen.tags.name} holds poses, so --tag-size-m would not be used; leave it out")
     if options.robot is not None and bag_options.tag_size_m is not None:
-        raise OfflineError("--tag-size-m and --robot: sizes stand in the `tags` of robot.yaml; leave one out")
+        raise OfflineError("--tag-size-m and --robot: the `tags` of robot.yaml have the sizes; leave one out")

@@ -1,7 +1,7 @@
-"""What reading somebody's bag may take: small files can be made that unfold to gigabytes, or never end.
+"""Limits on memory and messages while an untrusted bag is read: a small file can expand to gigabytes, or never end.
 
-The library that reads bags unfolds whole chunks, and asks SQLite whatever a file defines. What it may take grows with
-the bag's size, far beyond what drives need: their noise cannot be packed.
+The library that reads bags decompresses whole chunks, and runs whatever queries an SQLite file defines. The limits grow
+with the bag's size and are far above what real drives need, because sensor noise is incompressible.
 """
 
 import resource
@@ -14,27 +14,27 @@ from typing import Final, TypeVar
 from groundsbot.offline.errors import OfflineError
 
 _FREE_BYTES: Final = 112 << 20
-_BYTES_PER_BYTE: Final = 128  # odometry that hardly changes is packed into 60 bytes a message, and takes 3 kB here
+_BYTES_PER_BYTE: Final = 128  # nearly constant odometry compresses to 60 bytes a message, and takes 3 kB in memory
 _FREE_MESSAGES: Final = 100_000
 _BYTES_A_MESSAGE: Final = 8
-_MOST_METADATA_BYTES: Final = 1 << 18  # some 1,000 a topic; a megabyte of YAML takes half a minute
+_MOST_METADATA_BYTES: Final = 1 << 18  # about 1,000 per topic; parsing a megabyte of YAML takes half a minute
 _STATUS: Final = Path("/proc/self/status")
 _SQLITE: Final = ".db3"
 METADATA: Final = "metadata.yaml"
-MOST_DEFINITION_CHARS: Final = 1 << 16  # those of ROS have 10,000 with all that they are made of
+MOST_DEFINITION_CHARS: Final = 1 << 16  # those of ROS have up to 10,000, nested types included
 
 
 _Message = TypeVar("_Message")
 
 
 class BagLimits:
-    """What one bag may take."""
+    """Limits for one bag."""
 
     def __init__(self, path: Path) -> None:
-        """Looks at its size, and whether its tables are tables.
+        """Set the limits from the bag's size, and check its SQLite tables.
 
         Raises:
-            OfflineError: its metadata is far too long, or its SQLite files hold what no recorder puts there.
+            OfflineError: its metadata is far too long, or its SQLite files hold what no recorder writes.
         """
         files = [path] if path.is_file() else [each for each in path.iterdir() if each.is_file()]
         size = sum(each.stat().st_size for each in files)
@@ -53,10 +53,10 @@ class BagLimits:
 
     @contextmanager
     def memory(self) -> Iterator[None]:
-        """While the block runs, this process may not grow beyond what it took at first and what the bag is worth.
+        """Limit this process's memory inside the block to its initial size plus the allowance for the bag.
 
         Raises:
-            OfflineError: it would.
+            OfflineError: the block needs more.
         """
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
         if self._most_bytes != resource.RLIM_INFINITY:
@@ -66,17 +66,17 @@ class BagLimits:
             yield
         except MemoryError as error:
             raise OfflineError(
-                f"{self._path}: unfolds to more than {self._bytes >> 20} MiB, the limit for a bag of its size; is it "
+                f"{self._path}: expands to more than {self._bytes >> 20} MiB, the limit for a bag of its size; is it "
                 "damaged? record it again"
             ) from error
         finally:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
     def count(self, messages: Iterable[_Message]) -> Iterator[_Message]:
-        """The same messages.
+        """Yield the same messages.
 
         Raises:
-            OfflineError: more than a bag of its size can tell of.
+            OfflineError: there are more than a bag of its size can hold.
         """
         iterator = iter(messages)
         while True:
@@ -87,14 +87,13 @@ class BagLimits:
             self._messages_left -= 1
             if self._messages_left < 0:
                 raise OfflineError(
-                    f"{self._path}: holds more messages than a bag of its size can tell of; is it damaged? record it "
-                    "again"
+                    f"{self._path}: holds more messages than a bag of its size can hold; is it damaged? record it again"
                 )
             yield each
 
 
 def _data_bytes() -> int:
-    """What this process takes as the limit counts it; 0 where the system does not tell."""
+    """Return this process's data size as RLIMIT_DATA counts it; 0 if the system does not report it."""
     try:
         lines = _STATUS.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -103,10 +102,10 @@ def _data_bytes() -> int:
 
 
 def _check_sqlite(path: Path) -> None:
-    """Refuses a file whose tables are made up by queries or whose pages are shared: either may go on for ever.
+    """Refuse a file with views, triggers or generated columns, or with shared pages: reading one may never end.
 
     Raises:
-        OfflineError: it is such a file, or none of SQLite.
+        OfflineError: it is such a file, or not SQLite.
     """
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)) as database:
@@ -119,6 +118,6 @@ def _check_sqlite(path: Path) -> None:
     except sqlite3.Error as error:
         raise OfflineError(f"{path}: cannot be read as a bag: {error}; run `ros2 bag reindex`") from error
     if made_up is not None:
-        raise OfflineError(f"{path}: its {made_up[0]} is made up by a query, which no recorder does; record it again")
+        raise OfflineError(f"{path}: its {made_up[0]} is computed by a query, not recorded; record it again")
     if found != "ok":
         raise OfflineError(f"{path}: is damaged ({' '.join(str(found).split())[:200]}); run `ros2 bag reindex`")

@@ -1,4 +1,4 @@
-"""Where the camera of a bag sits: by its fixed transforms, unless the command line or robot.yaml say."""
+"""Camera mount of a bag: from its fixed transforms, unless the command line or robot.yaml define it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from groundsbot.offline.importing.robot import ImportOptions
 
 # ROS's names for the base, in the order of preference, where the odometry names none.
 _BASES: Final = ("base_link", "base_footprint")
-# A camera that looks farther up or down than this is more often a frame that is not the optical one.
+# With a steeper pitch than this, the frame is more likely not the optical one.
 _STEEP_RAD: Final = radians(60.0)
 
 
 @dataclass(frozen=True)
 class FoundMount:
-    """How a camera and its robot hang together.
+    """Pose of the camera on its robot.
 
     Attributes:
-        mount: by tf; None where something else tells.
-        in_camera: whether what the detector says is about the camera; else it is about the base itself.
-        remarks: what a person should know.
+        mount: from tf; None if it comes from elsewhere.
+        in_camera: whether detections are relative to the camera; else to the base.
+        remarks: lines for the user.
     """
 
     mount: Mount | None
@@ -41,37 +41,37 @@ def find_mount(
     options: ImportOptions,
     bag_options: BagOptions,
 ) -> FoundMount:
-    """Finds the way from the camera's frame to the base's.
+    """Return the mount from the transforms between the camera's frame and the base's.
 
     Args:
         path: names the bag in errors.
         frames: of the bag.
-        base_of_odometry: the frame that odometry is of; may be empty.
-        camera_frames: that detections or pictures name.
+        base_of_odometry: child frame of the odometry; may be empty.
+        camera_frames: frames of detections or pictures.
         options: of the command line.
         bag_options: of the command line.
 
     Raises:
-        OfflineError: several cameras, or tf does not join the frames.
+        OfflineError: there are several cameras, or tf does not connect the frames.
     """
     camera = _the_camera(path, set(camera_frames), bag_options)
     base = _the_base(frames, base_of_odometry, bag_options)
     if camera == base:
-        return FoundMount(None, False, (f"tags are seen from {base!r}, so no mount is needed",))
+        return FoundMount(None, False, (f"tags are observed in {base!r}, so no mount is needed",))
     if options.robot is not None:
         return FoundMount(None, True, ())
     if not frames.joins(base, camera):
         if options.has_mount:
-            return FoundMount(None, True, (f"tf does not join {camera!r} to {base!r}; roll and pitch are taken as 0",))
+            return FoundMount(None, True, (f"tf does not connect {camera!r} to {base!r}; roll and pitch are set to 0",))
         moving = [each for each in (frames.moving_near(camera), frames.moving_near(base)) if each is not None]
         why = f", since {moving[0]!r} moves on its parent" if moving else ""
         raise OfflineError(
-            f"{path}: no fixed transforms join the camera's frame {camera!r} to the base {base!r}{why}; record "
+            f"{path}: no fixed transforms connect the camera's frame {camera!r} to the base {base!r}{why}; record "
             "/tf_static, or name frames with --camera-frame and --base-frame, or give --camera-x-m, --camera-y-m and "
             "--camera-yaw-deg, or --robot"
         )
     mount = mount_of(frames.transform(base, camera))
-    remarks = [f"tf from {base!r} to {camera!r} says where the camera sits"]
+    remarks = [f"tf from {base!r} to {camera!r} gives the camera mount"]
     if abs(mount.pitch_rad) > _STEEP_RAD:
         steep = f"the camera's frame {camera!r} looks {abs(degrees(mount.pitch_rad)):.0f} deg"
         remarks.append(f"{steep} {'down' if mount.pitch_rad > 0 else 'up'}; is it the optical one? see --camera-frame")

@@ -1,4 +1,4 @@
-"""Odometry of ROS, or the joints of its wheels -> the readings of an imported log."""
+"""Odometry of ROS, or the angles of its wheel joints -> the odometry readings of an imported log."""
 
 from collections.abc import Sequence
 from math import pi
@@ -16,30 +16,30 @@ from groundsbot.offline.importing.robot import WheelScale
 from groundsbot.offline.measurements import growth, wheel_distances
 from groundsbot.onboard.log import PlanarOdometry
 
-# A jump of the path is told from a fast drive by more than one reading's worth of crowded stamps.
+# Allowance for bunched stamps, so that they do not look like a jump of the path.
 _BURST_M: Final = 0.5
-_PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and the turn about z of ROS's six
+_PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and yaw of ROS's six
 
 
 def odometry_readings(
     where: str, stamps_ns: IntArray, messages: Sequence[Any], track_m: float
 ) -> tuple[list[PlanarOdometry], float, str]:
-    """Readings from nav_msgs/Odometry, the metres driven, and what a person should know.
+    """Return readings from nav_msgs/Odometry, the driven distance in metres, and a remark for the user.
 
     Args:
         where: names bag and topic in errors.
-        stamps_ns: (N,) rising.
+        stamps_ns: (N,) ascending.
         messages: N of them.
-        track_m: distance between the wheels, to judge their speed by.
+        track_m: distance between the wheels, to check their speed.
 
     Raises:
-        OfflineError: a pose is none, or no wheel rolls that fast.
+        OfflineError: a pose is invalid, or a wheel would be impossibly fast.
     """
     poses = np.array([_planar(message.pose.pose) for message in messages])
     wrong = np.flatnonzero(~np.isfinite(poses).all(axis=1))
     if len(wrong):
         raise OfflineError(
-            f"{where}: the pose of message {wrong[0] + 1} is no pose (NaN, or a quaternion of length 0); "
+            f"{where}: the pose of message {wrong[0] + 1} is invalid (NaN, or a quaternion of length 0); "
             "correct what published it"
         )
     left_m, right_m, _ = wheel_distances(poses, track_m)
@@ -53,28 +53,28 @@ def odometry_readings(
     if steps is not None:
         for reading, step in zip(readings, steps, strict=True):
             reading.covariance.extend(step.ravel().tolist())
-    said = f"covariances of the odometry {told}{'' if steps is not None else '; ignored, the noise model tells'}"
+    said = f"covariances of the odometry {told}{'' if steps is not None else '; the noise model is used instead'}"
     return readings, _distance_m(left_m, right_m), said
 
 
 def joint_readings(
     where: str, stamps_ns: IntArray, messages: Sequence[Any], joints: tuple[str, str], scale: WheelScale
 ) -> tuple[list[PlanarOdometry], float]:
-    """Readings from the positions of two joints, and the metres driven.
+    """Return readings from the positions of two joints, and the driven distance in metres.
 
     Args:
         where: names bag and topic in errors.
-        stamps_ns: (N,) not falling.
+        stamps_ns: (N,) not descending.
         messages: N of sensor_msgs/JointState that name both joints, one of them, or none.
         joints: of the left and the right wheel; positive positions roll forward.
         scale: a tick is here a radian.
 
     Raises:
-        OfflineError: the wheels' radius is not known, a position is missing or none, the joints were
-            not published at the same time, or no wheel rolls that fast.
+        OfflineError: the wheels' radius is unknown, a position is missing or not finite, the joints were not published
+            at the same time, or a wheel would be impossibly fast.
     """
     if scale.metres_per_tick_left is None or scale.metres_per_tick_right is None:
-        raise OfflineError(f"{where}: wheels of unknown size; give --wheel-radius-m, or --robot")
+        raise OfflineError(f"{where}: the wheels' radius is unknown; give --wheel-radius-m, or --robot")
     stamps_ns, angles = _together(where, joints, [_angles(where, stamps_ns, messages, joint) for joint in joints])
     left_m, right_m = (angles - angles[:, :1]) * [[scale.metres_per_tick_left], [scale.metres_per_tick_right]]
     check_wheel_speed(where, stamps_ns, left_m, right_m)
@@ -86,7 +86,7 @@ def joint_readings(
 
 
 def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str) -> tuple[IntArray, FloatArray]:
-    """Stamps (K,), rising, and angles (K,) of one joint, through all its turns."""
+    """Return stamps (K,), ascending, and unwrapped angles (K,) of one joint."""
     named = [
         (stamp, message) for stamp, message in zip(stamps_ns.tolist(), messages, strict=True) if joint in message.name
     ]
@@ -100,25 +100,25 @@ def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str
 def _together(
     where: str, joints: tuple[str, str], wheels: Sequence[tuple[IntArray, FloatArray]]
 ) -> tuple[IntArray, FloatArray]:
-    """The left wheel's stamps (K,) and angles (2, K) of both there: each may come in messages of its own."""
+    """Return the left wheel's stamps (K,), and both angles (2, K) at them; each joint may have messages of its own."""
     (stamps_ns, left), (right_ns, right) = wheels
     inside = (stamps_ns >= right_ns[0]) & (stamps_ns <= right_ns[-1])
     if inside.sum() < 2:
         raise OfflineError(
-            f"{where}: {joints[0]} and {joints[1]} were not published at the same time, so how both wheels rolled "
-            "cannot be told; name other joints by --left-joint and --right-joint"
+            f"{where}: {joints[0]} and {joints[1]} were not published at the same time, so they give no path; "
+            "name other joints with --left-joint and --right-joint"
         )
     stamps_ns = stamps_ns[inside]
-    # From the first on, for a float holds no nanoseconds since 1970.
+    # Relative to the first stamp, as a float cannot hold nanoseconds since 1970.
     there = np.interp((stamps_ns - right_ns[0]).astype(np.float64), (right_ns - right_ns[0]).astype(np.float64), right)
     return stamps_ns, np.stack([left[inside], there])
 
 
 def wheel_joints(path: Path, topic: str, messages: Sequence[Any], options: BagOptions) -> tuple[str, str]:
-    """The joints of the left and of the right wheel: as named by the options, or the one that each name points to.
+    """Return the joints of the left and of the right wheel: those of the options, else those recognised by their names.
 
     Raises:
-        OfflineError: they cannot be told.
+        OfflineError: they cannot be determined.
     """
     names = sorted({name for message in messages for name in message.name})
     if options.left_joint is not None and options.right_joint is not None:
@@ -129,7 +129,7 @@ def wheel_joints(path: Path, topic: str, messages: Sequence[Any], options: BagOp
     left, right = ([name for name in names if "wheel" in name.lower() and side in name.lower()] for side in _SIDES)
     if len(left) != 1 or len(right) != 1:
         raise OfflineError(
-            f"{path}: {topic}: which joints are the wheels cannot be told from {', '.join(names) or 'no names'}; "
+            f"{path}: {topic}: the wheels' joints cannot be recognised among {', '.join(names) or 'no names'}; "
             "give --left-joint and --right-joint"
         )
     return left[0], right[0]
@@ -139,7 +139,7 @@ _SIDES: Final = ("left", "right")
 
 
 def check_wheel_speed(where: str, stamps_ns: IntArray, left_m: FloatArray, right_m: FloatArray) -> None:
-    """Looks for steps that no wheel can have rolled.
+    """Check for steps that are too long for a wheel.
 
     Raises:
         OfflineError: naming the first.

@@ -18,7 +18,7 @@ _GREY: Final[dict[str, np.dtype[Any]]] = {
     "mono16": np.dtype(np.uint16),
     "16UC1": np.dtype(np.uint16),
 }
-# Channels, and how OpenCV makes them grey.
+# Channels, and OpenCV's conversion to grey.
 _COLOURED: Final = {
     "bgr8": (3, cv2.COLOR_BGR2GRAY),
     "8UC3": (3, cv2.COLOR_BGR2GRAY),
@@ -37,10 +37,10 @@ _COLOURED: Final = {
 
 
 def picture_of(where: str, msgtype: str, content: Any) -> Picture:  # noqa: ANN401 - made by rosbags
-    """A message's picture: a file's bytes as they stand, or grey [height, width].
+    """Return a message's picture: the bytes of an encoded file, or grey [height, width].
 
     Raises:
-        OfflineError: an encoding that is not read, or fewer bytes than the size needs.
+        OfflineError: an unsupported encoding, or fewer bytes than the size needs.
     """
     if msgtype == COMPRESSED_IMAGE:
         encoded = content.data.tobytes()
@@ -48,7 +48,7 @@ def picture_of(where: str, msgtype: str, content: Any) -> Picture:  # noqa: ANN4
     depth = _GREY.get(content.encoding, np.dtype(np.uint8))
     if content.encoding not in _GREY and content.encoding not in _COLOURED:
         known = ", ".join([*_GREY, *_COLOURED])
-        raise OfflineError(f"{where}: pictures are encoded as {content.encoding!r}, which is not read; use {known}")
+        raise OfflineError(f"{where}: pictures are encoded as {content.encoding!r}, which is unsupported; use {known}")
     channels, to_grey = _COLOURED.get(content.encoding, (1, None))
     used = content.width * channels * depth.itemsize
     if content.step < used or len(content.data) < content.step * content.height or not used:
@@ -67,17 +67,17 @@ def picture_of(where: str, msgtype: str, content: Any) -> Picture:  # noqa: ANN4
 
 
 def camera_of(where: str, content: Any, *, rectified: bool) -> CameraModel:  # noqa: ANN401 - made by rosbags
-    """The camera that a CameraInfo describes.
+    """Return the camera that a CameraInfo describes.
 
     Args:
         where: names bag and topic in errors.
         content: the message, of ROS 1 or 2.
-        rectified: of the rectified pictures, without distortion, else of the raw ones.
+        rectified: return the camera of rectified pictures, without distortion, else that of raw ones.
 
     Raises:
-        OfflineError: it is not calibrated, or its pictures are binned or cut.
+        OfflineError: it is not calibrated, or its pictures are binned or cropped.
     """
-    # ROS 2 writes the names small.
+    # ROS 2 has these names in lower case.
     k, d, p = (np.asarray(getattr(content, name, getattr(content, name.upper(), ()))) for name in ("k", "d", "p"))
     roi = content.roi
     if max(content.binning_x, content.binning_y) > 1 or roi.x_offset or roi.y_offset:

@@ -1,4 +1,4 @@
-"""Tags' poses in a camera's optical frame -> positions on the floor, as an imported log holds them."""
+"""Tag poses in a camera's optical frame -> positions on the floor, as an imported log holds them."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -11,21 +11,21 @@ from groundsbot.offline.importing.bags.tags import BagPicture, BagTag
 from groundsbot.offline.importing.run_writer import Entry
 from groundsbot.onboard.log import TagObservation, TagObservations
 
-# Nobody reads a tag's place to a hundredth of a millimetre: such variances are placeholders.
+# No observation is accurate to a hundredth of a millimetre: smaller variances are placeholders.
 _LEAST_SIGMA_M: Final = 1e-5
-# By how much of the largest entry two entries that should be equal may differ: rounding, even of floats.
+# Tolerance of symmetry, relative to the largest entry: rounding, even to float32.
 _ASYMMETRY: Final = 1e-6
 
 
 def position_entries(
     looks: Sequence[BagPicture], R_planar_frame: Rotation, frame: str
 ) -> tuple[list[Entry], list[str]]:
-    """Messages for `/tags/observations`, and what a person should know of their covariances.
+    """Return messages for `/tags/observations`, and a remark about their covariances.
 
     Args:
-        looks: with positions, in order of time.
-        R_planar_frame: turns vectors from the looks' frame into axes x forward, y left, z up.
-        frame: "camera_planar" or "base", where these positions are.
+        looks: pictures with positions, in order of time.
+        R_planar_frame: rotates vectors from the pictures' frame into axes x forward, y left, z up.
+        frame: "camera_planar" or "base", the frame of the resulting positions.
     """
     entries: list[Entry] = []
     n, n_sane, n_zero = 0, 0, 0
@@ -45,7 +45,7 @@ def position_entries(
 
 
 def planar_covariance(sighting: BagTag, R_planar_frame: Rotation) -> FloatArray | None:
-    """(2, 2) covariance of the position on the floor; None where the message's is none that a reading can have.
+    """Return the covariance (2, 2) of the position on the floor; None if the message's is implausible.
 
     It must be finite, symmetric and positive definite, with sigmas between a hundredth of a millimetre and the tag's
     distance.
@@ -77,10 +77,10 @@ def _observation(
 
 
 def _covariance_sentence(n: int, n_sane: int, n_zero: int) -> list[str]:
-    """Of covariances."""
+    """Return the remark about covariances."""
     if n_sane == n:
         return ["covariances: as in the messages"]
     why = (
-        "are zeros" if n_zero == n - n_sane else "are none (zeros, not symmetric, not positive definite, or too large)"
+        "are zeros" if n_zero == n - n_sane else "are invalid (zeros, not symmetric or positive definite, or too large)"
     )
-    return [f"covariances: those of {plural(n - n_sane, 'reading')} of {n} {why}; the noise model is used instead"]
+    return [f"covariances: those of {plural(n - n_sane, 'observation')} of {n} {why}; the noise model is used instead"]

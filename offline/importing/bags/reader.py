@@ -1,4 +1,4 @@
-"""ROS bags, of ROS 1 and ROS 2, read without ROS: which topics there are, and their messages."""
+"""Reader of ROS 1 and ROS 2 bags without ROS: their topics and messages."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -50,11 +50,11 @@ DEFINITIONS: Final = {
 
 
 _BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
-_IDL_RULE: Final = "=" * 80 + "\n"  # between the files of a definition in IDL
+_IDL_RULE: Final = "=" * 80 + "\n"  # separates the files of an IDL definition
 
 
 class BagTopic(NamedTuple):
-    """One topic of a bag, and how many messages of one type it holds."""
+    """One topic of a bag, and its number of messages of one type."""
 
     name: str
     msgtype: str  # as ROS 2 writes it: nav_msgs/msg/Odometry
@@ -62,12 +62,12 @@ class BagTopic(NamedTuple):
 
     @property
     def short_type(self) -> str:
-        """As people write it: nav_msgs/Odometry."""
+        """Type as ROS 1 writes it: nav_msgs/Odometry."""
         return self.msgtype.replace("/msg/", "/")
 
 
 class BagMessage(NamedTuple):
-    """One message. `content` has the fields of its definition, arrays of numbers as numpy arrays."""
+    """One message. `content` has the fields of its definition, with number arrays as numpy arrays."""
 
     topic: str
     msgtype: str
@@ -76,7 +76,7 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether this looks like a bag: a file by its name, a folder by what lies in it."""
+    """Whether this looks like a bag: a file by its suffix, a folder by its content."""
     if path.is_dir():
         return (path / METADATA).exists() or any(each.suffix in _BAG_SUFFIXES for each in path.iterdir())
     return path.suffix in _BAG_SUFFIXES
@@ -87,11 +87,11 @@ class Bag:
 
     Attributes:
         path: of the file or folder.
-        topics: those that hold messages, by name.
+        topics: those that have messages, sorted by name.
     """
 
     def __init__(self, path: Path, reader: Reader1 | Reader2, limits: BagLimits) -> None:
-        """Takes an open reader."""
+        """Wrap an open reader."""
         self.path = path
         self._limits = limits
         self._reader = reader
@@ -103,10 +103,10 @@ class Bag:
         self.topics = [BagTopic(*key, count) for key, count in sorted(counts.items()) if count]
 
     def messages(self, topics: Sequence[BagTopic]) -> Iterator[BagMessage]:
-        """The messages of some topics, in the order they were received.
+        """Yield the messages of some topics, in the order of reception.
 
         Raises:
-            OfflineError: the bag is damaged, or a type is not known.
+            OfflineError: the bag is damaged, or a type is unknown.
         """
         wanted = {(topic.name, topic.msgtype) for topic in topics}
         connections = [each for each in self._reader.connections if (each.topic, each.msgtype) in wanted]
@@ -123,7 +123,7 @@ class Bag:
                 yield BagMessage(connection.topic, connection.msgtype, received_ns, content)
 
     def _store(self, connection: Connection) -> Typestore:
-        """What is known of one type: the bag's own definition where there is one, else that of ROS, else ours."""
+        """Return the definition of a type: the bag's own if there is one, else that of ROS, else ours."""
         msgtype = connection.msgtype
         if msgtype not in self._stores:
             carries_definition = connection.msgdef.format != MessageDefinitionFormat.NONE
@@ -149,11 +149,11 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Opens a bag: a `.bag` file of ROS 1; a folder, an `.mcap` or a `.db3` file of ROS 2.
+    """Open a bag: a `.bag` file of ROS 1; a folder, an `.mcap` or a `.db3` file of ROS 2.
 
     Raises:
-        OfflineError: it is missing, damaged, not finished, or no bag; or, inside, its messages are not what they
-            should be.
+        OfflineError: it is missing, damaged, not finished, or not a bag; or, inside the block, a message does not match
+            its type.
     """
     if not path.exists():
         raise OfflineError(f"{path}: does not exist; give a .bag file, a folder of ROS 2, or an .mcap or .db3 file")
@@ -186,7 +186,7 @@ def _types_of(definition: MessageDefinition, msgtype: str) -> dict[str, Any]:
 
 @contextmanager
 def _content_errors(path: Path) -> Iterator[None]:
-    """A message is what the bag's own definition makes of it: it may lack what its type should have."""
+    """Convert errors of access to a message's fields: the bag's own definition may lack fields of its type."""
     try:
         yield
     except (AttributeError, TypeError, ValueError, OverflowError, IndexError) as error:
@@ -198,7 +198,7 @@ def _content_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _library_errors(path: Path) -> Iterator[None]:
-    """Whatever the library stumbles over in somebody's bytes (it asserts, too) is one line for a person."""
+    """Convert every exception of the library, assertions included, to an error of one line."""
     try:
         yield
     except GroundsbotError:

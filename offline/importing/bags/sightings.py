@@ -1,4 +1,4 @@
-"""What of a bag's tags goes into the log: corners where camera and tag size are known, else positions."""
+"""Tag messages of an imported log: corners if camera and tag sizes are known, else positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ from groundsbot.onboard.log import TagDetections, TagObservations
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """The camera of a bag, its frame (empty where not said), and where the calibration is from."""
+    """Camera of a bag, its frame (empty if not named), and the source of its calibration."""
 
     model: CameraModel
     frame: str
@@ -48,7 +48,7 @@ class TagEntries:
     Attributes:
         entries: in order of time.
         camera: whose pixels the corners are in; None for positions.
-        remarks: what a person should know.
+        remarks: lines for the user.
     """
 
     entries: list[Entry]
@@ -57,7 +57,7 @@ class TagEntries:
 
     @property
     def tags(self) -> list[tuple[str, int]]:
-        """(family, id) of every reading."""
+        """(family, id) of every observation."""
         seen: list[tuple[str, int]] = []
         for _, _, message in self.entries:
             if isinstance(message, TagDetections):
@@ -68,7 +68,7 @@ class TagEntries:
 
 
 def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_file: Path | None) -> FoundCamera | None:
-    """The camera that took the pictures, by robot.yaml, else by CameraInfo; None where neither tells, nor need be.
+    """Return the camera that took the pictures, from robot.yaml, else from CameraInfo; None if not needed or unknown.
 
     Raises:
         GroundsbotError: there are several, it is not calibrated, or there is none for pictures.
@@ -86,7 +86,7 @@ def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_fil
                 "with its `camera` set"
             )
         return None
-    # The detectors of ROS want rectified pictures; those of pictures tell by their name.
+    # The detectors of ROS use rectified pictures; for pictures the topic's name says which they are.
     is_rectified = not chosen.has_pictures or "rect" in chosen.tags.name.rpartition("/image")[2]
     info = content.camera_infos[topic.name]
     camera = camera_of(f"{path}: {topic.name}", info, rectified=is_rectified)
@@ -104,20 +104,20 @@ def tag_entries(
     options: BagOptions,
     progress: Progress,
 ) -> TagEntries:
-    """Turns detections, or pictures, into messages of our log.
+    """Return detections, or tags detected in pictures, as messages of our log.
 
     Args:
         bag: open.
         chosen: its topics.
-        content: what was read of it.
+        content: messages read from it.
         robot: its mount and tag sizes.
-        in_camera: whether positions are about the camera, else about the base.
+        in_camera: whether positions are relative to the camera, else to the base.
         camera: that took the pictures.
         options: of the command line.
-        progress: told how many pictures have been looked at.
+        progress: called with the number of pictures that are done.
 
     Raises:
-        GroundsbotError: no tag was seen, or what is needed to place tags is not known.
+        GroundsbotError: no tag was detected, or the camera or a tag size is missing.
     """
     where = f"{bag.path}: {chosen.tags.name}"
     if camera is not None and robot.tags:
@@ -128,7 +128,7 @@ def tag_entries(
         found = TagEntries(entries, camera.model, [f"camera: {camera.said}", *remarks])
     elif chosen.has_pictures or options.tag_size_m is not None:
         missing = "their size; give --tag-size-m, or --robot with `tags`" if camera else "a CameraInfo; record it"
-        raise OfflineError(f"{where}: to place tags by their corners needs {missing}")
+        raise OfflineError(f"{where}: placing tags by their corners needs {missing}")
     else:
         found = _positions(where, chosen, content, robot, in_camera)
     if not found.tags:
@@ -166,7 +166,7 @@ def _corner_entries(looks: Sequence[BagPicture], camera: CameraModel, topic: Bag
 
 
 def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Robot, in_camera: bool) -> TagEntries:
-    """Where the detector put the tags itself."""
+    """Return the positions that the detector itself computed."""
     looks: Sequence[BagPicture] = content.pictures
     if chosen.tags.msgtype == APRILTAG_MSGS:
         looks = with_tf_positions(looks, content.sent_transforms)
@@ -185,15 +185,13 @@ def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Rob
         )
     entries, remarks = position_entries(looks, turned, frame)
     if n_placed < n:
-        remarks.append(f"{plural(n - n_placed, 'detection')} left out: tf does not place them")
-    hint = (
-        "" if chosen.tags.msgtype == APRILTAG_ROS else "; their corners would do better: give --tag-size-m or --robot"
-    )
+        remarks.append(f"{plural(n - n_placed, 'detection')} left out: tf has no position of them")
+    hint = "" if chosen.tags.msgtype == APRILTAG_ROS else "; corners are more accurate: give --tag-size-m or --robot"
     return TagEntries(entries, None, [f"positions: as the detector computed them{hint}", *remarks])
 
 
 def _check_sizes(where: str, robot: Robot, found: TagEntries) -> None:
-    """Looks whether the size of each tag is known where corners are to place it.
+    """Check that the size of each tag with corners is known.
 
     Raises:
         OfflineError: naming a tag.

@@ -1,14 +1,14 @@
-"""Detections of tags by three ROS packages, each in its own form -> one form with our corners.
+"""Tag detections of three ROS packages, converted to one form with our order of corners.
 
-- apriltag_ros (ROS 1): no corners; poses, x to the face's right, y to its top, z out of it, as ours.
-- apriltag_msgs (ROS 2): corners as the AprilTag library gives them: from the bottom left against the clock, the first
-  pixel's corner being (0, 0). Poses, if any, in tf.
-- isaac_ros_apriltag: corners from the top left with the clock; pixels are taken to be the AprilTag library's too.
+- apriltag_ros (ROS 1): no corners; poses with x to the face's right, y to its top, z out of it, as ours.
+- apriltag_msgs (ROS 2): corners as the AprilTag library gives them: counter-clockwise from the bottom left, the outer
+  corner of the first pixel being (0, 0). Poses, if any, in tf.
+- isaac_ros_apriltag: corners clockwise from the top left; pixel coordinates are assumed to be the AprilTag library's.
   Poses, whose axes are not used.
 
-After the sources of AprilRobotics/apriltag_ros (common_functions.cpp), christianrauch/apriltag_ros (AprilTagNode.cpp)
-and NVIDIA-ISAAC-ROS/isaac_ros_apriltag (apriltag_node.cpp, which turns VPI's corners, those of the AprilTag library,
-round). All three look for tags in rectified pictures.
+From the sources of AprilRobotics/apriltag_ros (common_functions.cpp), christianrauch/apriltag_ros (AprilTagNode.cpp)
+and NVIDIA-ISAAC-ROS/isaac_ros_apriltag (apriltag_node.cpp, which reverses VPI's corners, those of the AprilTag
+library). All three detect tags in rectified pictures.
 """
 
 import re
@@ -24,19 +24,19 @@ from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, APRILTAG_ROS
 
-# OpenCV's pixels, ours, have their centres at whole numbers.
+# Our pixel coordinates, those of OpenCV, have integers at pixel centres.
 _PIXEL_CENTRE_PX: Final = 0.5
 
 
 @dataclass(frozen=True)
 class BagTag:
-    """One tag in one picture, by its corners, its place, or both.
+    """One tag in one picture, with its corners, its position, or both.
 
     Attributes:
         corners_px: (4, 2) in the order of groundsbot.proto.
-        position_m: (3,) of its centre in `Look.frame`.
-        quaternion_xyzw: of the tag as groundsbot.proto has it, in `Look.frame`.
-        covariance: (3, 3) of the position, as the message says, sane or not.
+        position_m: (3,) of its centre in `BagPicture.frame`.
+        quaternion_xyzw: of the tag as groundsbot.proto has it, in `BagPicture.frame`.
+        covariance: (3, 3) of the position, unchecked, as in the message.
     """
 
     family: str
@@ -51,7 +51,7 @@ class BagTag:
 
 @dataclass(frozen=True)
 class BagPicture:
-    """One picture's tags. `frame` is the camera's optical frame."""
+    """Tags of one picture. `frame` is the camera's optical frame."""
 
     stamp_ns: int
     frame: str
@@ -59,16 +59,16 @@ class BagPicture:
 
 
 def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tuple[BagPicture, Counter[str]]:  # noqa: ANN401 - made by rosbags
-    """One message of detections.
+    """Read one message of detections.
 
     Args:
         msgtype: one of `bags.topics.TAGS`.
         content: the message.
         stamp_ns: its time.
-        family: of the tags, where the message does not say.
+        family: of the tags, if the message does not say.
 
     Returns:
-        The look, and what had to be left out of it, counted by why.
+        The picture's tags, and the number of excluded detections by reason.
     """
     frame, found, left_out = frame_name(content.header.frame_id), [], Counter[str]()
     for detection in content.detections:
@@ -100,12 +100,12 @@ def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tupl
 
 
 def exclusion_lines(left_out: Mapping[str, int]) -> list[str]:
-    """For a person."""
+    """Return one line for the user per reason of exclusion."""
     return [f"{plural(number, 'detection')} left out: {why}" for why, number in sorted(left_out.items())]
 
 
 def with_tf_positions(looks: Sequence[BagPicture], transforms: Iterable[tuple[int, Any]]) -> list[BagPicture]:
-    """Looks whose tags have the places that the detector sent as tf: same stamp, same camera, a name with their number.
+    """Return the pictures with tag positions from tf: same stamp, same camera, a child frame that ends in the tag's id.
 
     Args:
         looks: without positions.
@@ -146,16 +146,16 @@ def _corners(corners: Any) -> FloatArray:  # noqa: ANN401 - eight numbers in old
 
 
 def _family(name: str) -> str:
-    """As AprilTag spells it; some leave `tag` away."""
+    """Return a family as AprilTag spells it; some packages omit `tag`."""
     return name if name.startswith("tag") else f"tag{name}"
 
 
 def _why_not(sighting: BagTag) -> str | None:
     if sighting.family not in families():
-        return f"family {sighting.family!r} is not known"
+        return f"family {sighting.family!r} is unknown"
     if not 0 <= sighting.tag_id < family_size(sighting.family):
         return f"{sighting.family} has no tag {sighting.tag_id}"
     numbers = [each for each in (sighting.corners_px, sighting.position_m) if each is not None]
     if not all(np.isfinite(each).all() for each in numbers):
-        return "its numbers are none"
+        return "its corners or position are not finite"
     return None

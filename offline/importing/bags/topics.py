@@ -1,4 +1,4 @@
-"""Which topics of a bag to import: found by type, or named on the command line."""
+"""Choice of a bag's topics to import: by type, or as named on the command line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _MOST_NAMED: Final = 8
 
 @dataclass(frozen=True)
 class BagOptions:
-    """What the command line says of a bag; None where it says nothing."""
+    """Options of the command line for bags; None if not given."""
 
     odometry_topic: str | None = None
     tags_topic: str | None = None
@@ -48,33 +48,33 @@ class BagOptions:
             raise OfflineError("--left-joint and --right-joint belong together; give both")
 
     def refuse_any(self, folder: Path) -> None:
-        """Complains of options where there is no bag.
+        """Refuse these options for a recording that is not a bag.
 
         Raises:
-            OfflineError: naming them.
+            OfflineError: naming those that were given.
         """
         given = [f"--{name.replace('_', '-')}" for name, value in vars(self).items() if value not in (None, False)]
         if given:
-            raise OfflineError(f"{folder}: is no bag, so {' and '.join(given)} would not be used; leave that out")
+            raise OfflineError(f"{folder}: is not a bag, so {' and '.join(given)} would not be used; leave that out")
 
 
 @dataclass(frozen=True)
 class ChosenTopics:
-    """Where odometry comes from, and tags: detections or pictures."""
+    """Topics of odometry and of tags: detections or pictures."""
 
     odometry: BagTopic
     tags: BagTopic
     transforms: tuple[BagTopic, ...]
-    camera_infos: tuple[BagTopic, ...]  # several, if it cannot be told which is that of the tags
+    camera_infos: tuple[BagTopic, ...]  # several if that of the tags is ambiguous
 
     @property
     def has_pictures(self) -> bool:
-        """Whether tags are yet to be looked for."""
+        """Whether tags must be detected in pictures."""
         return self.tags.msgtype in IMAGES
 
 
 def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -> ChosenTopics:
-    """Chooses by type; Odometry goes before JointState, detections before pictures.
+    """Choose topics by type; Odometry is preferred to JointState, detections to pictures.
 
     Raises:
         OfflineError: nothing fits, several do, or what was named does not.
@@ -101,7 +101,7 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
 
 
 def _camera_infos(path: Path, topics: Sequence[BagTopic], options: BagOptions, tags: BagTopic) -> tuple[BagTopic, ...]:
-    """The camera_info named; else, of several, those that share most of their name with the pictures or detections."""
+    """Return the camera_info named; else those that share most leading parts of their name with the topic of tags."""
     named = _topic_of_flag(path, topics, "--camera-info-topic", options.camera_info_topic, (CAMERA_INFO,))
     if named is not None:
         return (named,)
@@ -111,7 +111,7 @@ def _camera_infos(path: Path, topics: Sequence[BagTopic], options: BagOptions, t
 
 
 def the_camera_info(path: Path, chosen: ChosenTopics) -> BagTopic | None:
-    """The one camera_info; None where there is none.
+    """Return the only camera_info; None if there is none.
 
     Raises:
         OfflineError: there are several.

@@ -1,1 +1,1 @@
-"""CSV folders, the paper's headerless pair included, to run logs."""
+"""CSV folders, including the paper's headerless pair of files, to run logs."""

@@ -1,7 +1,7 @@
-"""The forms of CSV that `import` knows, each turned into wheel distances and tag positions.
+"""The CSV forms that `import` reads, converted to wheel distances and tag positions.
 
-Every form ends as the same two things: cumulative distances of both wheels, and observations of tags with y to the
-LEFT. docs/formats.md describes the forms for people.
+Every form is converted to cumulative distances of both wheels, and to observations of tags with y to the LEFT.
+docs/formats.md describes the forms for users.
 """
 
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ from groundsbot.offline.foundation import CsvTable, read_table
 from groundsbot.offline.importing.robot import NOMINAL_TRACK_M, WheelScale
 from groundsbot.offline.measurements import MAX_RANGE_M
 
-MAX_WHEEL_SPEED_M_S: Final = 20.0  # beyond it the unit is wrong, a counter was reset, or a time is
+MAX_WHEEL_SPEED_M_S: Final = 20.0  # above it a unit or time is wrong, or a counter was reset
 MAX_YAW_RATE_RAD_S: Final = 50.0  # no robot turns faster; degrees taken for radians would
 _NS_PER_S: Final = 1_000_000_000
 _TIMES: Final = ("t_s", "t_ns")
 _ODOMETRY: Final = (("left_m_s", "right_m_s"), ("left_ticks", "right_ticks"), ("v_m_s", "omega_rad_s"))
 _POSITIONS: Final = (("x_m", "y_m"), ("range_m", "bearing_rad"))
 _SIGMAS: Final = (("sigma_x_m", "sigma_y_m"), ("sigma_range_m", "sigma_bearing_rad"))
-_MAX_SIGMA: Final = MAX_RANGE_M  # a map leaves out a position that is known no better than to where it might be at all
+_MAX_SIGMA: Final = MAX_RANGE_M  # a map ignores a position that is less certain than the range itself
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class WheelPath:
     """Cumulative distances of both wheels: the first entry is the run's start, at zero.
 
     Attributes:
-        needs_track: whether turns follow from the distance between the wheels; the file may hold them itself.
+        needs_track: whether headings depend on the distance between the wheels; the file may contain them itself.
     """
 
     stamps_ns: list[int]
@@ -40,7 +40,7 @@ class WheelPath:
 
     @property
     def distance_m(self) -> float:
-        """Length of the path of the point midway between the wheels."""
+        """Path length of the point midway between the wheels."""
         middle = [(left + right) / 2 for left, right in zip(self.left_m, self.right_m, strict=True)]
         return sum(abs(after - before) for before, after in pairwise(middle))
 
@@ -58,14 +58,14 @@ class Observation:
 
 
 def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
-    """Reads `odometry.csv`. Returns the wheels' path and the form found, as a person would say it.
+    """Read `odometry.csv`. Return the wheels' path, and a description of the file's form.
 
-    A speed is the mean since the row before, so the first row's speed is not used; turning speeds become wheel
-    distances exactly, for a constant speed between two rows is an arc.
+    A speed is the mean since the row before, so the first row's speed is not used. Turning speeds are converted to
+    wheel distances exactly, as a constant speed between two rows gives an arc.
 
     Raises:
-        OfflineError: A wrong column or value, time not advancing, a scale that the form needs and is not known, or
-            options that it has no use for.
+        OfflineError: a wrong column or value, time not advancing, an unknown scale that the form needs, or options that
+            the form does not use.
     """
     table = read_table(path)
     form = _columns_of(table, _ODOMETRY)
@@ -106,7 +106,7 @@ def read_gyro(path: Path) -> list[tuple[int, float]]:
 
 
 def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:
-    """Complains of options that would be of no use.
+    """Refuse options about ticks where there are none.
 
     Raises:
         OfflineError: `flags` names some.
@@ -116,10 +116,10 @@ def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:
 
 
 def read_observations(path: Path, max_tag_id: int) -> list[Observation]:
-    """Reads `observations.csv`; an empty list where it has a header only.
+    """Read `observations.csv`; an empty list if it has a header only.
 
     Raises:
-        OfflineError: A wrong column or value, or time running backwards.
+        OfflineError: a wrong column or value, or time running backwards.
     """
     table = read_table(path)
     form = _columns_of(table, _POSITIONS, required=("tag_id",), optional=_SIGMAS)
@@ -144,15 +144,15 @@ def read_observations(path: Path, max_tag_id: int) -> list[Observation]:
 
 
 def read_paper_odometry(path: Path, state_rate_hz: float) -> WheelPath:
-    """Reads the paper's `odom.csv`: rows `state, v_left, v_right`, m/s; state k ends k steps after the start.
+    """Read the paper's `odom.csv`: rows `state, v_left, v_right`, m/s; state k ends k steps after the start.
 
     Raises:
-        OfflineError: A wrong value, or a state missing: the steps have no other time.
+        OfflineError: a wrong value, or a missing state, since states are the only times.
     """
     table = read_table(path, ("state", "v_left_m_s", "v_right_m_s"))
     for row, state in enumerate(table.integers("state", 0)):
         if state != row + 1:
-            table.fail(row, "state", f"comes where {row + 1} belongs; states count 1, 2, 3 without a hole")
+            table.fail(row, "state", f"comes where {row + 1} belongs; states count 1, 2, 3 without a gap")
     stamps = [state_stamp_ns(state, state_rate_hz) for state in range(len(table) + 1)]
     left, right = table.numbers("v_left_m_s"), table.numbers("v_right_m_s")
     wheels = _from_speeds(stamps, [0.0, *left], [0.0, *right])
@@ -161,12 +161,12 @@ def read_paper_odometry(path: Path, state_rate_hz: float) -> WheelPath:
 
 
 def read_paper_landmarks(path: Path, n_states: int, state_rate_hz: float, max_tag_id: int) -> list[Observation]:
-    """Reads the paper's `landmarks.csv`: rows `state, tag_id, forward_m, RIGHT_m, 0`, turned here to y LEFT.
+    """Read the paper's `landmarks.csv`: rows `state, tag_id, forward_m, RIGHT_m, 0`, converted to y LEFT.
 
-    The state says after how many odometry readings the tag was seen.
+    The state is the number of odometry readings before the observation.
 
     Raises:
-        OfflineError: A wrong value, a state that `odom.csv` does not have, or states running backwards.
+        OfflineError: a wrong value, a state that `odom.csv` does not have, or states running backwards.
     """
     table = read_table(path, ("state", "tag_id", "forward_m", "right_m", "zero"))
     states = table.integers("state", 0)
@@ -188,7 +188,7 @@ def read_paper_landmarks(path: Path, n_states: int, state_rate_hz: float, max_ta
 
 
 def state_stamp_ns(state: int, state_rate_hz: float) -> int:
-    """When state `state` ends, the start of the run being 0."""
+    """Return the time at which a state ends, from the start of the run."""
     return round(state * _NS_PER_S / state_rate_hz)
 
 
@@ -198,7 +198,7 @@ def _columns_of(
     required: tuple[str, ...] = (),
     optional: tuple[tuple[str, str], ...] = (),
 ) -> tuple[str, str]:
-    """The one alternative that the header names; complains of everything that is missing, double or unknown."""
+    """Return the alternative that the header names; refuse missing, duplicate or unknown columns."""
     choice = " or ".join(",".join(pair) for pair in alternatives)
     wanted = ",".join(("t_s", *required))
     known = {*_TIMES, *required, *(name for pair in (*alternatives, *optional) for name in pair)}
@@ -232,7 +232,7 @@ def _columns_of(
 def _from_ticks(table: CsvTable, stamps_ns: list[int], scale: WheelScale) -> WheelPath:
     if scale.metres_per_tick_left is None or scale.metres_per_tick_right is None:
         raise OfflineError(
-            f"{table.path}: holds ticks of unknown length; give --wheel-radius-m and --ticks-per-turn, or --robot"
+            f"{table.path}: the length of a tick is unknown; give --wheel-radius-m and --ticks-per-turn, or --robot"
         )
     left, right = table.integers("left_ticks"), table.integers("right_ticks")
     return WheelPath(
@@ -282,4 +282,4 @@ def _check_positions(table: CsvTable, polar: bool, first: list[float], second: l
             table.fail(row, "bearing_rad", "is more than a whole turn in radians; are these degrees?")
         if not polar and hypot(a, b) == 0.0:
             column = "x_m" if "x_m" in columns else "forward_m"
-            table.fail(row, column, "puts the tag inside the robot's own origin; leave the row out")
+            table.fail(row, column, "puts the tag at the robot's origin; leave the row out")

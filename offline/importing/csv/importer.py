@@ -42,7 +42,7 @@ _GYRO: Final = "gyro.csv"  # beside either pair
 
 @dataclass(frozen=True)
 class _Drive:
-    """One folder's content, whatever its form."""
+    """Content of one folder in any form."""
 
     wheels: WheelPath
     n_odometry: int
@@ -54,15 +54,15 @@ class _Drive:
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportReport:
-    """Writes `output/<run_id>/0000.core.mcap` from a folder of CSV files; the same bytes for the same input.
+    """Write `output/<run_id>/0000.core.mcap` from a folder of CSV files; the same input gives the same bytes.
 
-    Nothing is written before all of the input has been checked, and the run folder appears whole or not at all.
+    All input is checked before anything is written, and the run folder appears complete or not at all.
 
     Raises:
         GroundsbotError: one line that names file, line, column, value and what to do.
     """
     if not folder.is_dir():
-        raise OfflineError(f"{folder}: is no folder; give one with {_pairs()}")
+        raise OfflineError(f"{folder}: is not a folder; give one with {_pairs()}")
     run_id = options.run_id or safe_name(folder)
     run_folder = output / run_id
     check_output(output, run_folder)
@@ -124,8 +124,8 @@ def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
     wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options))
     observations = read_observations(folder / _HEADER_PAIR[1], family_size(options.tag_family) - 1)
     in_camera = options.has_mount or options.robot is None
-    where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot, and no --camera option)"
-    remarks = [f"odometry.csv: {form}", f"observations.csv: taken to be in {where}, y to the left"]
+    where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot without --camera options)"
+    remarks = [f"odometry.csv: {form}", f"observations.csv: assumed to be in {where}, y to the left"]
     return _Drive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks, [])
 
 
@@ -133,7 +133,7 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
     rate_hz = options.state_rate_hz
     if rate_hz is None:
         raise OfflineError(
-            f"{folder / _PAPER_PAIR[0]}: holds no times; give --state-rate-hz (the paper's authors took 4.2)"
+            f"{folder / _PAPER_PAIR[0]}: holds no times; give --state-rate-hz (the paper's authors used 4.2)"
         )
     refuse_tick_options(folder / _PAPER_PAIR[0], options.tick_flags)
     wheels = read_paper_odometry(folder / _PAPER_PAIR[0], rate_hz)
@@ -141,7 +141,7 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
     observations = read_paper_landmarks(folder / _PAPER_PAIR[1], n_states, rate_hz, family_size(options.tag_family) - 1)
     remarks = [
         f"odom.csv: the paper's form, {rate_hz:g} states a second",
-        "landmarks.csv: the paper's form, in the camera's frame, y turned from right to left",
+        "landmarks.csv: the paper's form, in the camera's frame, y converted from right to left",
     ]
     return _Drive(wheels, n_states, observations, True, TOLD_SIZE_SIGMA, remarks, [])
 
@@ -152,7 +152,7 @@ def _n_outside(drive: _Drive) -> int:
 
 
 def _messages(drive: _Drive, family: str) -> Iterator[Entry]:
-    """(stamp, topic, message) in order of time; at one time the odometry first."""
+    """Yield (stamp, topic, message) in order of time, odometry first at equal times."""
     frame = "camera_planar" if drive.in_camera else "base"
     gyro = ((at, "/gyro", Gyro(stamp_ns=at, yaw_rate_rad_s=rate)) for at, rate in drive.gyro)
     observations = _observations(drive.observations, frame, family)

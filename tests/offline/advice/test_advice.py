@@ -161,13 +161,13 @@ def test_the_advice_in_words() -> None:
         "sigma_then_m": 0.181,
     }
     assert advice_sentence(advice, several_families=False) == (
-        "One more pass from tag 3 to tag 7b, 14 m along the way of blue_two, would bring the largest sigma, tag 12's, "
-        "from 0.31 m to about 0.18 m."
+        "One more pass from tag 3 to tag 7b, 14 m along the path of blue_two, would reduce the largest sigma, "
+        "tag 12's, from 0.31 m to about 0.18 m."
     )
     tag = advice | {"kind": "tag", "way_m": [[4.04, -1.0]], "tags": advice["tags"][:1]}  # type: ignore[index]
     assert advice_sentence(tag, several_families=True) == (
-        "One more tag at x 4.0 m, y -1.0 m (beside the way of blue_two; nearest is tag f:3), and the same drives "
-        "again, would bring the largest sigma, tag f:12's, from 0.31 m to about 0.18 m."
+        "One more tag at x 4.0 m, y -1.0 m (beside the path of blue_two; nearest is tag f:3), and the same drives "
+        "again, would reduce the largest sigma, tag f:12's, from 0.31 m to about 0.18 m."
     )
     assert "hardly help" in advice_sentence(advice | {"sigma_then_m": 0.312}, several_families=False)
 

@@ -94,7 +94,7 @@ def test_an_output_folder_that_is_not_empty(
     assert (out / "thesis.tex").read_text() == "years of work"
     text = refused(logs["a"], output=out / "thesis.tex")
     assert "is a file" in text
-    assert "recordings stay" in refused(logs["a"], output=logs["a"])
+    assert "inputs are not changed" in refused(logs["a"], output=logs["a"])
 
 
 def test_a_disk_that_is_full_leaves_everything_as_it_was(

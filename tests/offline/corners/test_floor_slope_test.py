@@ -72,7 +72,7 @@ def test_a_ramp_is_said_with_time_place_and_size(tilt_deg: float, tmp_path: Path
         name: told["noise"][name] for name in ("sigma_tilt_rad", "sigma_height_m")
     }
     assert told["noise"]["sigma_tilt_rad"] == floor.sigma_tilt_rad > 0.0
-    assert any(line.startswith("floor: pictures roll and pitch by") for line in summary(result, tmp_path))
+    assert any(line.startswith("floor: roll and pitch vary by") for line in summary(result, tmp_path))
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.3])

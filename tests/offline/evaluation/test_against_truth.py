@@ -147,10 +147,10 @@ def test_each_component_is_judged_in_its_own_frame() -> None:
     assert data["frame_run"] == "red_one"
     assert data["tags_rmse_m"] == data["components"][0]["tags_rmse_m"]
     assert data["tags_rmse_m"] > 10
-    assert "2 components, each judged in its own frame, largest first" in errors.lines()[0]
+    assert "2 components, each evaluated in its own frame, largest first" in errors.lines()[0]
     unknown = evaluate(make_map(large, small), truth).components[1]
     assert unknown.tags_rmse_m is None
-    assert "does not know the start of green_one" in unknown.notes[0]
+    assert "lacks the start of green_one" in unknown.notes[0]
 
 
 def test_a_covariance_that_is_none_gives_no_figure_but_a_reason() -> None:
@@ -198,7 +198,7 @@ def test_truth_json_is_read_without_losing_nanoseconds(tmp_path: Path) -> None:
         ('{"runs": {}}', "lacks or misspells a key"),
         ('{"runs": {"a": {"poses": []}}, "tags": []}', "runs.a.poses must hold rows"),
         ('{"runs": {"a": {"poses": [[1, 2, 3]]}}, "tags": []}', "runs.a.poses must hold rows"),
-        ('{"runs": {"a": {"poses": [[2, 0, 0, 0], [1, 0, 0, 0]]}}, "tags": []}', "times that do not rise"),
+        ('{"runs": {"a": {"poses": [[2, 0, 0, 0], [1, 0, 0, 0]]}}, "tags": []}', "times not increasing"),
         ('{"runs": {"a": {"poses": [[2, NaN, 0, 0]]}}, "tags": []}', "not finite"),
         ('{"runs": {"a": {"poses": [[1%s, 0, 0, 0]]}}, "tags": []}' % ("0" * 30), "lacks or misspells a key"),
         ('{"runs": {}, "tags": [{"family": "a", "tag_id": Infinity, "position_m": [0, 0]}]}', "lacks or misspells"),

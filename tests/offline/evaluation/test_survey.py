@@ -108,7 +108,7 @@ def test_a_tag_that_two_families_share_needs_its_family() -> None:
 
 def test_two_shared_tags_are_too_few() -> None:
     result, survey = _map_and_survey(5)
-    with pytest.raises(OfflineError, match="shares 2 tags with the map, and three"):
+    with pytest.raises(OfflineError, match="shares 2 tags with the map, at least three"):
         judge_survey(result, survey[:2])
 
 

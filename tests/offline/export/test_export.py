@@ -227,8 +227,8 @@ def test_cameras_sit_where_the_solve_found_them(folder: Path) -> None:
         (("--format", "geojson"), "--origin LAT_DEG,LON_DEG,HEADING_DEG"),
         (("--format", "geojson", "--origin", "48.2,11.6"), "must be LAT_DEG,LON_DEG,HEADING_DEG"),
         (("--format", "geojson", "--origin", "111.6,48.2,0"), "latitude comes first"),
-        (("--format", "g2o", "--origin", "48.2,11.6,0"), "means nothing to --format g2o"),
-        (("--format", "tum", "--component", "1"), "has none of that number"),
+        (("--format", "g2o", "--origin", "48.2,11.6,0"), "is not used by --format g2o"),
+        (("--format", "tum", "--component", "1"), "has no such component"),
     ],
 )
 def test_what_is_not_known_is_not_made_up(
@@ -280,4 +280,4 @@ def test_what_was_measured_by_hand_is_said_to_be_missing(run: Run, folder: Path,
     result = replace(read_map(folder), measurements=make_map().measurements)
     write_map(result, tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")
-    assert "warning: what --start and --distance measured is not in it" in outcome.out
+    assert "warning: --start and --distance measurements are not exported" in outcome.out

@@ -127,15 +127,15 @@ def test_assumptions_are_those_asked_for_and_said(component: Component, export: 
         x, y = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).sum(axis=0)
         q = entry["pose"]["rotation"]["quaternion"]
         assert se2.wrap_angle(2.0 * np.arctan2(q["Z"], q["W"]) - np.arctan2(y, x)) == pytest.approx(0.0, abs=1e-12)
-    assert "assumed: 3 of 3 tags hang 1.25 m above the floor" in said
-    assert any(line.startswith("assumed: 3 of 3 tags face where they were seen from") for line in said)
+    assert "assumed: 3 of 3 tags are 1.25 m above the floor" in said
+    assert any(line.startswith("assumed: 3 of 3 tags face the mean direction of their obs") for line in said)
 
 
 def test_what_was_measured_wins_over_what_is_assumed(component: Component, export: Export, tmp_path: Path) -> None:
     poses = fill_in(tmp_path / "map", [("0.7", "0.3"), ("", "0.3"), ("", "")])
     layout, said = export("frc", *FIELD, "--tag-poses", poses, *ASSUMED)
     assert [entry["pose"]["translation"]["z"] for entry in layout["tags"]] == [0.7, 1.25, 1.25]
-    assert "assumed: 2 of 3 tags hang 1.25 m above the floor" in said
+    assert "assumed: 2 of 3 tags are 1.25 m above the floor" in said
     assert any(line.startswith("assumed: 1 of 3 tags face") for line in said)
 
 
@@ -167,13 +167,13 @@ def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
         q = entry["pose"]["rotation"]["quaternion"]
         turn = Rotation.from_quat([q["X"], q["Y"], q["Z"], q["W"]])
         assert (turn.inv() * rotation).magnitude() == pytest.approx(0.0, abs=1e-9)
-    assert "taken for upright, with x out of the face: 1 of 3 tags" in said
+    assert "treated as upright, with x out of the face: 1 of 3 tags" in said
     (tmp_path / "out.json").unlink()
     fmap, said = export("limelight", *ASSUMED)
     matrix = np.reshape(fmap["fiducials"][0]["transform"], (4, 4))
     np.testing.assert_allclose(matrix[:3, :3], R_TILTED.as_matrix(), atol=1e-9)
     assert matrix[2, 3] == pytest.approx(1.7)
-    assert "assumed: 1 of 3 tags hang 1.25 m above the floor" in said
+    assert "assumed: 1 of 3 tags are 1.25 m above the floor" in said
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
         (("frc", *FIELD), "does not hold the height of tag 1 (tag36h11)"),
         (("limelight", "--tag-height-m", "1"), "does not hold the direction of tag 1 (tag36h11)"),
         (("frc", *FIELD, "--family", "tag16h5", *ASSUMED), "the map has tag36h11"),
-        (("limelight", "--field-m", "1,2", *ASSUMED), "means nothing to --format limelight"),
+        (("limelight", "--field-m", "1,2", *ASSUMED), "is not used by --format limelight"),
     ],
 )
 def test_what_is_not_known_is_not_made_up(
@@ -207,7 +207,7 @@ def test_an_id_in_two_places(component: Component, export: Export, tmp_path: Pat
     write_map(make_map(replace(component, tags=twice)), tmp_path / "map")
     layout, said = export("frc", *FIELD, *ASSUMED)
     assert [entry["ID"] for entry in layout["tags"]] == [3]
-    assert "left out, since a layout has one place for an id: 5" in said
+    assert "left out, since a layout has one pose per id: 5" in said
     (tmp_path / "out.json").unlink()
     fmap, _ = export("limelight", *ASSUMED)
     assert [(entry["id"], entry["unique"]) for entry in fmap["fiducials"]] == [(5, 0), (5, 0), (3, 1)]
@@ -217,13 +217,13 @@ def test_families_and_sizes(component: Component, export: Export, refused: Refus
     first, second, third = component.tags
     mixed = replace(component, tags=(first, second, replace(third, family="tag25h9")))
     write_map(make_map(mixed), tmp_path / "map")
-    assert "tells no families apart, and the map has tag25h9, tag36h11" in refused("frc", *FIELD, *ASSUMED)
-    assert "knows tags of tag36h11, tag16h5, not of tag25h9" in refused("limelight", *ASSUMED)
+    assert "holds one family, and the map has tag25h9, tag36h11" in refused("frc", *FIELD, *ASSUMED)
+    assert "supports tag36h11, tag16h5, not tag25h9" in refused("limelight", *ASSUMED)
     layout, _ = export("frc", *FIELD, *ASSUMED, "--family", "tag36h11")
     assert [entry["ID"] for entry in layout["tags"]] == [1, 2]
     (tmp_path / "out.json").unlink()
     write_map(make_map(replace(component, tags=(first, replace(second, size_m=None), third))), tmp_path / "map")
-    assert "that of 2 is not known to the map" in refused("limelight", *ASSUMED)
+    assert "the map has none of tag 2" in refused("limelight", *ASSUMED)
 
 
 def test_the_made_map_is_read_as_it_was_written(component: Component, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_a_weak_join_is_written_read_and_shown(joined: MapResult, tmp_path: Path
     assert again.is_weak
     assert again.covariance is not None
     np.testing.assert_allclose(again.covariance, np.array(entry["covariance"]))
-    shown = [row for table in tables(map_as_json(joined)) for row in table.rows if "weak: one tag; to" in row[-1]]
+    shown = [row for table in tables(map_as_json(joined)) for row in table.rows if "weak: one tag; sigma" in row[-1]]
     assert len(shown) == 1
 
 

@@ -82,7 +82,7 @@ def test_messages_out_of_order_twice_or_without_a_time_do_no_harm(tmp_path: Path
     report, run = import_run(messages, tmp_path)
     np.testing.assert_array_equal(run.wheel_segments[0].stamps_ns, made.track.stamps_ns)
     np.testing.assert_array_equal(run.detections.stamps_ns, made.run.detections.stamps_ns)
-    assert "/odom: 1 message left out: their times were there already" in report.remarks
+    assert "/odom: 1 message left out: other messages have the same times" in report.remarks
     assert "/odom: 1 message left out: their header stamps are 0" in report.remarks
 
 
@@ -239,7 +239,7 @@ def test_corners_of_the_older_definition_are_eight_numbers() -> None:
     assert seen.corners_px is not None
     assert (look.stamp_ns, look.frame, seen.tag_id, seen.hamming) == (5, "cam", 3, 1)
     np.testing.assert_allclose(seen.corners_px, [[10.5, 9.5], [40.5, 10.5], [39.5, 40.5], [9.5, 39.5]])
-    assert left_out == {"family 'tagStandard41h12' is not known": 1, "tag36h11 has no tag 587": 2}
+    assert left_out == {"family 'tagStandard41h12' is unknown": 1, "tag36h11 has no tag 587": 2}
 
 
 def fixed_frames(*links: tuple[str, str, Sequence[float]]) -> FixedFrames:
@@ -339,4 +339,4 @@ def test_options_of_bags_are_refused_for_csv(tmp_path: Path, run: Program) -> No
         "import", tmp_path, "-o", tmp_path / "logs", "--track-width-m", 0.5, "--tag-size-m", 0.1, "--receive-times"
     )
     assert outcome.code == 1
-    assert "is no bag, so --tag-size-m and --receive-times would not be used" in outcome.err
+    assert "is not a bag, so --tag-size-m and --receive-times would not be used" in outcome.err

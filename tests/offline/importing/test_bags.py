@@ -155,7 +155,9 @@ def test_a_bag_of_poses_gives_the_map_of_its_log(
     report = import_run(bag, tmp_path, bag_options=BagOptions())
     assert_same_map(position_map, map_of(report.run_folder, position_log))
     n_without = sum(not each.covariance for message in made.observations for each in message.observations)
-    assert any(f"those of {n_without} readings of {report.n_observations} are zeros" in each for each in report.remarks)
+    assert any(
+        f"those of {n_without} observations of {report.n_observations} are zeros" in each for each in report.remarks
+    )
 
 
 def test_a_bag_with_tags_in_tf_gives_the_map_of_its_log(tmp_path: Path, bare_position_log: Path) -> None:

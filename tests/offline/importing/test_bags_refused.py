@@ -163,7 +163,7 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
     "frames not joined": (
         lambda made, folder: made.without("/tf_static").write(folder / "drive"),
         SIZE,
-        r"no fixed transforms join the camera's frame 'camera_optical' to the base 'base_link'; record /tf_static",
+        r"no fixed transforms connect the camera's frame 'camera_optical' to the base 'base_link'; record /tf_static",
     ),
     "a moving mount": (moving_mount, SIZE, r"to the base 'base_link', since 'camera_link' moves on its parent; record"),
     "a quaternion of zero": (spoilt_quaternion, SIZE, r"tf to camera_link: .* quaternion has length 0, must be 1"),
@@ -175,7 +175,7 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
     "no calibration": (
         lambda made, folder: made.without("/camera/camera_info").write(folder / "drive"),
         SIZE,
-        r"/detections: to place tags by their corners needs a CameraInfo",
+        r"/detections: placing tags by their corners needs a CameraInfo",
     ),
     "not calibrated": (
         lambda made, folder: alter(
@@ -192,17 +192,17 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
     "a pose that is none": (
         lambda made, folder: alter(made, folder, "/odom", lambda _: {"pose": {"pose": {"orientation": {}}}}, first=6),
         SIZE,
-        r"/odom: the pose of message 7 is no pose",
+        r"/odom: the pose of message 7 is invalid",
     ),
     "wheels without names": (
         lambda made, folder: made.without("/odom").joints(names=("a", "b")).write(folder / "drive"),
         (*SIZE, "--wheel-radius-m", "0.1", "--track-width-m", "0.5"),
-        r"/joint_states: which joints are the wheels cannot be told from a, b; give --left-joint and --right-joint",
+        r"/joint_states: the wheels' joints cannot be recognised among a, b; give --left-joint and --right-joint",
     ),
     "wheels of unknown size": (
         lambda made, folder: made.without("/odom").joints().write(folder / "drive"),
         (*SIZE, "--track-width-m", "0.5"),
-        r"/joint_states: wheels of unknown size; give --wheel-radius-m, or --robot",
+        r"/joint_states: the wheels' radius is unknown; give --wheel-radius-m, or --robot",
     ),
     "pictures of another size": (
         lambda made, folder: with_picture(made, "mono8", (480, 640)).write(folder / "drive"),
@@ -212,7 +212,7 @@ BAD: dict[str, tuple[Spoil, tuple[str, ...], str]] = {
     "pictures that cannot be read": (
         picture_of_other_encoding,
         SIZE,
-        r"encoded as '32FC1', which is not read; use mono8",
+        r"encoded as '32FC1', which is unsupported; use mono8",
     ),
     "our own log": (lambda made, folder: next(made.run.log.glob("*.mcap")), SIZE, r"cannot be read as a bag"),
     "no such bag": (lambda made, folder: folder / "none.bag", SIZE, r"none\.bag: does not exist"),

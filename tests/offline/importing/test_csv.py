@@ -190,7 +190,7 @@ def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> 
     files = {"odom.csv": "1,0,0\n", "landmarks.csv": "1,5,1,0.5,0\n"}
     folder = folder_with(tmp_path, files)
     unknown = import_folder(folder, tmp_path / "a", PAPER)
-    said = "not given, so taken as 0 with a wide sigma: x (sigma 0.5 m), y (sigma 0.5 m), yaw (sigma 8 deg)"
+    said = "not given, so assumed to be 0 with a wide sigma: x (sigma 0.5 m), y (sigma 0.5 m), yaw (sigma 8 deg)"
     assert any(said in line for line in unknown.lines())
     mount = parse_robot_yaml(run_of(unknown.run_folder).robot_yaml, "log").mount
     assert (mount.x_m, mount.y_m, mount.yaw_rad) == (0, 0, 0)
@@ -214,7 +214,7 @@ FRAMES = [
     ({}, False, "camera_planar", "the frame of the camera (or other sensor)"),
     ({"camera_x_m": 0.2}, False, "camera_planar", "the frame of the camera (or other sensor)"),
     ({"camera_x_m": 0.2}, True, "camera_planar", "the frame of the camera (or other sensor)"),
-    ({}, True, "base", "base (--robot, and no --camera option)"),
+    ({}, True, "base", "base (--robot without --camera options)"),
 ]
 
 
@@ -225,7 +225,7 @@ def test_observations_are_in_base_only_where_a_robot_yaml_is_given_and_no_camera
     robot = robot_yaml_in(tmp_path) if with_robot else None
     report = import_run(tmp_path, options=ImportOptions(robot=robot, track_width_m=0.5, **options))
     assert {message.frame for message in observations_of(report.run_folder)} == {frame}
-    assert any(f"observations.csv: taken to be in {said}" in line for line in report.lines())
+    assert any(f"observations.csv: assumed to be in {said}" in line for line in report.lines())
 
 
 def robot_yaml_in(folder: Path) -> Path:

@@ -35,7 +35,7 @@ BAD_ODOMETRY = [
     ("t_s,left_m_s,right_m_s\n1e999999,0,0\n", "column t_s: '1e999999' is not finite or far too large"),
     ("t_ns,left_m_s,right_m_s\n1.5,0,0\n", "column t_ns: '1.5' is not a whole number"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,250,250\n", "means a wheel at 250 m/s, above 20 m/s"),
-    ("t_s,left_ticks,right_ticks\n0,0,0\n1,5,5\n", "holds ticks of unknown length; give --wheel-radius-m"),
+    ("t_s,left_ticks,right_ticks\n0,0,0\n1,5,5\n", "the length of a tick is unknown; give --wheel-radius-m"),
     ("t_s,left_m_s,right_m_s\n0,\x000,0\n", "is not a number"),
 ]
 
@@ -93,7 +93,7 @@ BAD_OBSERVATIONS = [
     ("t_s,tag_id,x_m,y_m\n0,587,1,1\n", "column tag_id: '587' is outside 0 to 586"),
     ("t_s,tag_id,x_m,y_m\n0,1.5,1,1\n", "column tag_id: '1.5' is not a whole number"),
     ("t_s,tag_id,x_m,y_m\n1,1,1,1\n0,1,1,1\n", "line 3, column t_s: '0' runs backwards after '1'"),
-    ("t_s,tag_id,x_m,y_m\n1,1,0,0\n", "puts the tag inside the robot's own origin"),
+    ("t_s,tag_id,x_m,y_m\n1,1,0,0\n", "puts the tag at the robot's origin"),
     ("t_s,tag_id,range_m,bearing_rad\n1,1,-2,0\n", "column range_m: '-2' must be above 0"),
     ("t_s,tag_id,range_m,bearing_rad\n1,1,2,30\n", "column bearing_rad: '30' is more than a whole turn"),
     ("t_s,tag_id,x_m,y_m\n1000,1,1,1\n", "none of 1 observation lies within the odometry's time"),
@@ -175,7 +175,7 @@ def test_an_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> No
         import_folder(folder, tmp_path / "logs", TRACK)
     assert (tmp_path / "logs" / "drive" / "0000.core.mcap").read_bytes() == before
     (tmp_path / "logs" / "letter.txt").write_text("dear")
-    with pytest.raises(GroundsbotError, match=r"is not empty: letter\.txt is no run's log"):
+    with pytest.raises(GroundsbotError, match=r"is not empty: letter\.txt is not a run's log"):
         import_folder(folder, tmp_path / "logs", ImportOptions(track_width_m=0.5, run_id="other"))
     assert sorted(entry.name for entry in (tmp_path / "logs").iterdir()) == ["drive", "letter.txt"]
 

@@ -85,7 +85,7 @@ def test_json_and_text_tell_the_same(drive: Path) -> None:
     for wanted in (
         "robot carl, run monday",
         "2027-01-15 08:00:00 UTC, 2.3 s",
-        "2 of tag36h11 in 4 readings: 3 7",
+        "2 of tag36h11 in 4 observations: 3 7",
         "gap in /wheels: 0.70 s",
     ):
         assert wanted in text
@@ -121,7 +121,7 @@ def test_a_log_whose_wheels_are_no_numbers_is_described_too(tmp_path: Path) -> N
             writer.write("/odometry", PlanarOdometry(stamp_ns=k, wheels=distances), k * MS, k * MS)
     info = describe_log(tmp_path / "spoilt")
     assert json.loads(json.dumps(info.as_json(), allow_nan=False))["distance_m"] is None
-    assert any("wheel readings that are no numbers, so no map can use it" in line for line in info.lines())
+    assert any("wheel readings are not finite, so no map can use it" in line for line in info.lines())
 
 
 def test_a_log_of_nothing_is_described_too(tmp_path: Path) -> None:

@@ -63,8 +63,8 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
     before = {path.name: path.read_bytes() for path in recorded.iterdir()}
     outcome = run("detect", recorded, "-o", tmp_path / "again", "--processes", 2)
     assert outcome.code == 3
-    assert "1 pictures are of no use" in outcome.out
-    assert "4 older detections kept, whose pictures were not" in outcome.out
+    assert "1 pictures cannot be used" in outcome.out
+    assert "4 older detections kept, of pictures not recorded" in outcome.out
     assert "4 pictures" in outcome.out
     assert tags_by_picture(tmp_path / "again") == {0: [0], 1: [99], 2: [2], 3: [99], 4: [4], 5: [99], 6: [99], 7: [99]}
     assert {path.name: path.read_bytes() for path in recorded.iterdir()} == before

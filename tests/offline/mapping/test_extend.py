@@ -106,8 +106,8 @@ def test_the_command_writes_elsewhere(run: Program, folder: Path, tmp_path: Path
     result: MapResult = read_map(tmp_path / "out")
     assert len(result.kept) == 4
     for options, words in (
-        (["-o", folder / "map", "--overwrite"], "maps and recordings stay"),
-        (["-o", tmp_path / "new", "--noise", folder / "map" / "map.json"], "--noise: a map is extended under its own"),
+        (["-o", folder / "map", "--overwrite"], "inputs are not changed"),
+        (["-o", tmp_path / "new", "--noise", folder / "map" / "map.json"], "--noise: a map is extended with its own"),
     ):
         refused = run("map", log, "--extend", known, *options)
         assert (refused.code, refused.err.count("\n")) == (1, 1)

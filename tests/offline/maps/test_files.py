@@ -155,7 +155,7 @@ def _of_another_frame(path: Path) -> None:
         (lambda d: _change(d / "map.json", metres=[7]), "damaged"),
         (lambda d: _of_another_frame(d / "map.json"), "frame_run 'nobody' is none of its runs"),
         (lambda d: (d / "red_one.tum").unlink(), "red_one.tum: cannot be read"),
-        (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is no pose"),
+        (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is not a pose"),
         (lambda d: (d / "red_one.tum").write_text(""), "holds no pose"),
         (lambda d: (d / "red_one.tum").write_text("Infinity 0 0 0 0 0 0 1\n"), "line 1: 'Infinity"),
         (lambda d: (d / "red_one.tum").write_text("1e30 0 0 0 0 0 0 1\n"), "line 1: '1e30"),

@@ -100,8 +100,8 @@ def test_files_keep_the_factor_and_old_ones_have_none(tmp_path: Path) -> None:
 def test_terminal_and_report_say_it_first(kind: str, said: str) -> None:
     result = make_map(inflate_covariances(make_component(), replace(MISFIT, kind=kind), QUIET))
     first = summary(result, Path("out"))[0]
-    assert first.startswith(f"These drives contradict {said} by more than chance explains (90 squared sigmas, 40 expec")
-    assert "all sigmas are 1.5 times as large as computed" in first
+    assert first.startswith(f"These drives contradict {said} by more than chance explains (chi-square 90, 40 expec")
+    assert "all sigmas were multiplied by 1.5." in first
     assert "blue_two fits worst" in first
     document = map_as_json(result)
     assert sentences(document)[0] == first

@@ -79,7 +79,7 @@ def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
         facts += zip((row["x (m)"], row["y (m)"]), tag["position_m"], strict=True)
         facts += zip((row["sigma x (m)"], row["sigma y (m)"]), np.sqrt(np.diag(covariance)), strict=True)
         facts += [(row["largest sigma (m)"], np.linalg.eigvalsh(covariance)[-1] ** 0.5)]
-        facts += [(row["readings"], tag["n_observations"])]
+        facts += [(row["observations"], tag["n_observations"])]
     for row, run in zip(read.rows("runs"), document["runs"], strict=True):
         assert (row["run"], row["robot"], row["log"]) == (run["run"], run["robot"], run["log"])
         facts += [(row["keyframes"], run["n_keyframes"]), (row["driven (m)"], run["distance_m"])]
@@ -88,7 +88,7 @@ def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
     for row, each in zip(read.rows("alignments"), document["alignments"], strict=True):
         fit, _, shared = row["shared tags that fit"].partition(" of ")
         facts += [(fit, each["n_inliers"]), (shared, each["n_shared"]), (row["RMS (m)"], each["inlier_rmse_m"])]
-        facts += [(row["turned (deg)"], np.degrees(each["transform"][2]))]
+        facts += [(row["yaw (deg)"], np.degrees(each["transform"][2]))]
     for row, each in zip(read.rows("starts"), document["start_to_start"], strict=True):
         facts += [(row["distance (m)"], each["distance_m"]), (row["sigma (m)"], each["sigma_m"])]
     for row, each in zip(read.rows("checks"), document["checks"], strict=True):
@@ -97,7 +97,7 @@ def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
         facts += [(row["sigma (%)"], 100.0 * each["sigma"]), (row["wheels (%)"], 100.0 * each["shares"]["wheels"])]
     for row, each in zip(read.rows("robots"), document["robot_numbers"], strict=True):
         assert (row["of"], row["number"], row["verdict"]) == (each["owner"], each["what"], each["verdict"])
-        facts += [(row["found"], each["found"]), (row["sigma"], each["sigma"])]
+        facts += [(row["estimate"], each["found"]), (row["sigma"], each["sigma"])]
     assert [row["sigma"] for row in read.rows("noise")] == list(document["noise"])
     assert len(facts) >= 30
     assert [fact for fact in facts if not close(*fact)] == []
@@ -110,8 +110,8 @@ def test_the_sentences_are_those_of_the_map(made: Path) -> None:
     assert words == sentences(document)
     driven_m = sum(run["distance_m"] for run in document["runs"])
     assert words[0] == (
-        f"2 runs (a_one and b_one; {driven_m:.1f} m driven) became one map of 4 tags, joined by 4 tags that more than "
-        "one of them read."
+        f"2 runs (a_one and b_one; {driven_m:.1f} m driven) were merged into one map of 4 tags, connected by 4 tags "
+        "that several of them observed."
     )
     sigmas = [np.linalg.eigvalsh(tag["covariance"])[-1] ** 0.5 for tag in document["tags"]]
     shape = [tag["shape_sigma_m"] for tag in document["tags"]]
@@ -122,7 +122,7 @@ def test_the_sentences_are_those_of_the_map(made: Path) -> None:
         f"Tags are known to {_metres(np.median(shape))} relative to each other",
         f"the worst, tag {worst['tag_id']}, to {_metres(max(shape))})",
         f"whose heading is uncertain by {heading_deg:.1f} degrees, to {_metres(np.median(sigmas))}",
-        f"it is {pair['distance_m']:.2f} m, give or take {100.0 * pair['sigma_m']:.1f} cm",
+        f"it is {pair['distance_m']:.2f} m, sigma {100.0 * pair['sigma_m']:.1f} cm",
     ):
         assert part in words[1]
     assert f"known to {100.0 * document['metres'][0]['sigma']:.2f} %" in words[2]
@@ -211,7 +211,7 @@ def test_a_single_run(logs: list[Path], tmp_path: Path) -> None:
     workings = Diagnostics()
     read = write_file((build_map(read_runs(logs[:1]), workings=workings), workings), tmp_path)
     assert read.words[0].startswith("One run, a_one, drove ")
-    assert read.words[0].endswith("nothing was to be joined.")
+    assert read.words[0].endswith("nothing was merged.")
     assert "before" not in {attributes.get("id") for _, attributes in read.elements}
     assert "holding" not in read.tables
     assert len(read.rows("tags")) == 4
@@ -221,7 +221,7 @@ def test_a_run_without_tags(tmp_path: Path) -> None:
     log = write_drive(tmp_path / "logs", DRIVES["a"], [], make_robot("a"))
     workings = Diagnostics()
     read = write_file((build_map(read_runs([log]), workings=workings), workings), tmp_path)
-    assert "It places no tag, so that nothing corrects what the wheels say." in read.words
+    assert "It has no tags, so nothing corrects the wheels' odometry." in read.words
     assert data_of(tmp_path / "report.html")["components"][0]["tags"] == []
 
 
@@ -231,9 +231,9 @@ def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     workings = Diagnostics()
     read = write_file((build_map(read_runs([*logs, alone]), workings=workings), workings), tmp_path)
     assert "3 runs" in read.words[0]
-    assert "fall into 2 components" in read.words[0]
-    assert "the largest holds 2 runs and 4 tags" in read.words[0]
-    assert read.words[-1].startswith("To join the components, drive one more run past two or more tags of each")
+    assert "there are 2 components" in read.words[0]
+    assert "the largest has 2 runs and 4 tags" in read.words[0]
+    assert read.words[-1].startswith("To merge the components, drive one more run past two or more tags of each")
     assert [row["component"] for row in read.rows("runs")] == ["1", "1", "2"]
     plots = [attributes["class"] for _, attributes in read.elements if "plot" in (attributes.get("class") or "")]
     assert plots == ["plot map"] * 2 + ["plot before"] + ["plot timeline"] * 3
@@ -338,7 +338,7 @@ def test_it_prints(window: Page, made: Path) -> None:
     printed = pypdfium2.PdfDocument(window.pdf())
     text = "".join(printed[i].get_textpage().get_text_range() for i in range(len(printed)))
     assert 2 <= len(printed) <= 8
-    for part in ("became one map of 4 tags", "Before merging", "What these drives say of the robots"):
+    for part in ("one map of 4 tags", "Before merging", "Robot parameters estimated"):
         assert part in " ".join(text.split())
 
 

@@ -25,14 +25,14 @@ def test_doubts_are_said() -> None:
     told = words_of(checks=[check | {"sigmas": 7.2}])
     assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
     suspect = {"tag_id": 3, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
-    assert "1 tag does not belong: 3 (moved)" in words_of(suspect_tags=[suspect])
+    assert "1 tag does not fit the map: 3 (moved)" in words_of(suspect_tags=[suspect])
     (alignment,) = document["alignments"]
     told = words_of(alignments=[alignment | {"is_sure": False}])
-    assert "1 alignment could not be told for sure and was left out: red_one with blue_two" in told
+    assert "1 alignment was uncertain and not used: red_one with blue_two" in told
     tags = [tag | {"n_observations": 2} for tag in document["tags"]]
-    assert "3 tags were read less than 3 times: 3, 7 and 3" in words_of(tags=tags)
+    assert "3 tags were observed fewer than 3 times: 3, 7 and 3" in words_of(tags=tags)
     taped = document["measurements"][0] | {"contradicts": True}
-    assert "1 measurement by hand does not fit to the rest" in words_of(measurements=[taped])
+    assert "1 measurement by hand does not fit the rest" in words_of(measurements=[taped])
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:

@@ -325,7 +325,7 @@ def test_the_command_writes_files_that_the_next_drive_is_mapped_with(log: Path, 
     assert read_robot_yaml(output).wheels.track_m == pytest.approx(0.5, rel=1e-2)
     refused = run("calibrate", log, "-o", output)
     assert refused.code == 1
-    assert "is there already" in refused.err
+    assert "exists already" in refused.err
 
 
 def test_robots_get_a_file_each_in_a_folder(log: Path, tmp_path: Path, run: Program) -> None:
@@ -360,7 +360,7 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
     assert row["found"] == pytest.approx(0.5, abs=0.002)
     assert "groundsbot-offline calibrate" in row["to_do"]
     report = (tmp_path / "map" / "report.html").read_text()
-    assert "What these drives say of the robots" in report
+    assert "Robot parameters estimated from these drives" in report
     assert "Search for time offsets" in report
     off = run("map", log, "--calibrate", "none", "-o", tmp_path / "off")
     assert (off.code, off.err.startswith("error: --calibrate: 'none'")) == (1, True)
