@@ -18,13 +18,20 @@ from groundsbot.offline.advice.information_gain import InformationGain, JointCov
 from groundsbot.offline.advice.new_tags import (
     DrivePaths,
     TagSite,
-    TagViews,
-    drives_of,
-    gain_of_place,
-    places_of,
-    view_of,
+    ViewStatistics,
+    drive_paths,
+    new_tag_gain,
+    tag_sites,
+    view_statistics,
 )
-from groundsbot.offline.advice.passes import Pass, TagPassage, gain_of_pass, passages_of, passes_of, ways_m
+from groundsbot.offline.advice.passes import (
+    RepeatDrive,
+    TagTrack,
+    driven_distances_m,
+    repeat_drive_gain,
+    repeat_drives,
+    tag_tracks,
+)
 from groundsbot.offline.advice.visibility import expected_sigmas_m
 from groundsbot.offline.maps import AdviceResult
 from groundsbot.offline.measurements import TagKey
@@ -37,20 +44,20 @@ _MOST_POINTS: Final = 40
 class Candidates(NamedTuple):
     """Candidates, and the statistics that they are judged by."""
 
-    passages: list[TagPassage]
-    drives: DrivePaths
-    view: TagViews
-    passes: list[Pass]
-    places: list[TagSite]
+    tracks: list[TagTrack]
+    paths: DrivePaths
+    view_statistics: ViewStatistics
+    repeat_drives: list[RepeatDrive]
+    tag_sites: list[TagSite]
 
 
 class RatedCandidate(NamedTuple):
     """A candidate with the tags' sigmas (T,), now and predicted."""
 
     kind: str
-    candidate: Pass | TagSite
-    now_m: FloatArray
-    then_m: FloatArray
+    candidate: RepeatDrive | TagSite
+    sigmas_m: FloatArray
+    predicted_sigmas_m: FloatArray
 
 
 def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResult]:
@@ -64,40 +71,40 @@ def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResul
     is_sound = solution.converged and not solution.unobservable.n_directions
     if not graph.tags or not is_sound or solution.relative_error() > MAX_RELATIVE_ERROR:
         return []
-    return [_result(graph, solution, each, component) for each in best_candidates(graph, solution)]
+    return [_advice_result(graph, solution, each, component) for each in best_candidates(graph, solution)]
 
 
 def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
     """Return the best drive to repeat and the best new tag, as far as there are candidates, the better one first."""
-    _, drives, view, passes, places = candidates_of(graph, solution.state)
-    gains: list[tuple[str, Pass | TagSite, InformationGain]] = []
+    _, drives, view, passes, places = find_candidates(graph, solution.state)
+    gains: list[tuple[str, RepeatDrive | TagSite, InformationGain]] = []
     for each in passes:
         with suppress(LinAlgError):  # rounding left its poses unobservable
-            gains.append(("pass", each, gain_of_pass(graph, solution.state, each)))
-    gains += [("tag", each, gain_of_place(drives, view, each)) for each in places]
-    known = joint_covariance_of(solution, [gain for _, _, gain in gains])
+            gains.append(("pass", each, repeat_drive_gain(graph, solution.state, each)))
+    gains += [("tag", each, new_tag_gain(drives, view, each)) for each in places]
+    known = tag_joint_covariance(solution, [gain for _, _, gain in gains])
     now_m = known.sigmas_m()
     then = []
     for kind, candidate, gain in gains:
         if isinstance(candidate, TagSite):
             then_m = expected_sigmas_m(drives, view, candidate, known)
         else:
-            then_m = known.sigmas_with_m(gain)
+            then_m = known.predicted_sigmas_m(gain)
         then.append(RatedCandidate(kind, candidate, now_m, then_m))
-    then.sort(key=lambda each: float(each.then_m.max()))
+    then.sort(key=lambda each: float(each.predicted_sigmas_m.max()))
     return [next(each for each in then if each.kind == kind) for kind in dict.fromkeys(each.kind for each in then)]
 
 
-def candidates_of(graph: Graph, state: State) -> Candidates:
+def find_candidates(graph: Graph, state: State) -> Candidates:
     """Return all candidates for a component; it must have observations."""
-    ways = ways_m(graph)
-    sightings = passages_of(graph, ways)
-    drives = drives_of(graph, state, ways)
-    view = view_of(drives, len(sightings))
-    return Candidates(sightings, drives, view, passes_of(ways, sightings), places_of(drives, view))
+    ways = driven_distances_m(graph)
+    sightings = tag_tracks(graph, ways)
+    drives = drive_paths(graph, state, ways)
+    view = view_statistics(drives, len(sightings))
+    return Candidates(sightings, drives, view, repeat_drives(ways, sightings), tag_sites(drives, view))
 
 
-def joint_covariance_of(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:
+def tag_joint_covariance(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:
     """Return the joint covariance of all tags and of the other columns that the gains refer to."""
     tags = solution.problem.columns.tags.reshape(-1)
     others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
@@ -105,10 +112,10 @@ def joint_covariance_of(solution: Solution, gains: Sequence[InformationGain]) ->
     return JointCovariance(columns, solution.covariance(columns), len(tags) // 2)
 
 
-def _result(graph: Graph, solution: Solution, best: RatedCandidate, component: int) -> AdviceResult:
+def _advice_result(graph: Graph, solution: Solution, best: RatedCandidate, component: int) -> AdviceResult:
     wanted, tags = best.candidate, solution.state.tags
     length_m: float | None = None
-    if isinstance(wanted, Pass):
+    if isinstance(wanted, RepeatDrive):
         ends = [wanted.from_tag, wanted.to_tag]
         length_m = float(graph.segments[wanted.segment].odometry.distance_m[wanted.first : wanted.last].sum())
         way = np.unique(np.linspace(wanted.first, wanted.last, _MOST_POINTS).round().astype(int))
@@ -119,14 +126,14 @@ def _result(graph: Graph, solution: Solution, best: RatedCandidate, component: i
         kind=best.kind,
         component=component,
         run=graph.segments[wanted.segment].name,
-        tags=tuple(_name(graph.tags[i]) for i in ends),
+        tags=tuple(_tag_name(graph.tags[i]) for i in ends),
         way_m=way_m,
         length_m=length_m,
-        worst_tag=_name(graph.tags[int(np.argmax(best.now_m))]),
-        sigma_m=float(best.now_m.max()),
-        sigma_then_m=float(best.then_m.max()),
+        worst_tag=_tag_name(graph.tags[int(np.argmax(best.sigmas_m))]),
+        sigma_m=float(best.sigmas_m.max()),
+        sigma_then_m=float(best.predicted_sigmas_m.max()),
     )
 
 
-def _name(tag: TagKey) -> tuple[str, int, str]:
+def _tag_name(tag: TagKey) -> tuple[str, int, str]:
     return tag.family, tag.tag_id, tag.instance

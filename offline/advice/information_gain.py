@@ -21,7 +21,7 @@ from groundsbot.offline.sam import Linearised, stack
 # Eigenvalues of an information matrix below this share of the largest are rounding errors.
 _LEAST_SHARE: Final = 1e-10
 # Half bandwidth: each new pose has factors with the one before it and the one after, of three parameters each.
-_BAND: Final = 5
+_HALF_BANDWIDTH: Final = 5
 
 
 class InformationGain(NamedTuple):
@@ -38,7 +38,7 @@ class JointCovariance(NamedTuple):
     covariance: FloatArray  # (n, n)
     n_tags: int
 
-    def of(self, columns: IntArray) -> FloatArray:
+    def marginal(self, columns: IntArray) -> FloatArray:
         """Return the covariance (k, k) of some of the columns; 0 for fixed ones (-1)."""
         own = self._rows(columns)
         joint = self.covariance[np.ix_(own, own)]
@@ -51,7 +51,7 @@ class JointCovariance(NamedTuple):
         diagonal = self._blocks(np.zeros((0, 2 * self.n_tags)))
         return _largest_sigmas(*diagonal)
 
-    def sigmas_with_m(self, gain: InformationGain) -> FloatArray:
+    def predicted_sigmas_m(self, gain: InformationGain) -> FloatArray:
         """Return `sigmas_m` as predicted with these measurements added, (T,)."""
         own = self._rows(gain.columns)
         told = self.covariance[:, own] @ gain.root
@@ -90,7 +90,7 @@ def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: Int
     jacobian, _ = stack(kinds, n_own + len(columns))
     normal = sparse.coo_array(jacobian.T @ jacobian)
     row, column = normal.coords
-    band, rest = np.zeros((min(_BAND, n_own - 1) + 1, n_own)), np.zeros((len(columns), n_own + len(columns)))
+    band, rest = np.zeros((min(_HALF_BANDWIDTH, n_own - 1) + 1, n_own)), np.zeros((len(columns), n_own + len(columns)))
     inner, outer = (row >= column) & (row < n_own), row >= n_own
     band[(row - column)[inner], column[inner]] = normal.data[inner]
     rest[row[outer] - n_own, column[outer]] = normal.data[outer]

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.advice.information_gain import InformationGain, marginal_information
-from groundsbot.offline.advice.passes import SIGHTING_GAP_M
+from groundsbot.offline.advice.passes import TRACK_GAP_M
 from groundsbot.offline.sam import Columns, Graph, ReadingFactors, State
 
 MOST_TAGS: Final = 18
@@ -24,14 +24,14 @@ _MOST_PLACES: Final = 160
 _MOST_VIEWERS: Final = 20_000
 _LEAST_SPACING_M: Final = 1.0
 # A tag on a wall is not detected at a larger angle to its normal.
-MOST_SLANT_RAD: Final = np.radians(65.0)
+MAX_INCIDENCE_RAD: Final = np.radians(65.0)
 # Observations of one track share most of their information: those at these fractions of it stand for all.
-_WITHIN_SIGHTING: Final = np.array([0.25, 0.75])
-_MOST_SIGHTINGS: Final = 3
+_WITHIN_TRACK: Final = np.array([0.25, 0.75])
+_MOST_TRACKS: Final = 3
 _NEAREST_IN_RANGE: Final = 9
 
 
-class TagViews(NamedTuple):
+class ViewStatistics(NamedTuple):
     """Where the tags of a map were observed, relative to the sensor, and with which variance."""
 
     near_m: float
@@ -39,7 +39,7 @@ class TagViews(NamedTuple):
     half_angle_rad: float
     typical_m: float
     typical_rad: float
-    n_a_passage: float  # observations
+    observations_per_track: float  # observations
     range_m: FloatArray  # (M,) of all observations, ascending
     variance: FloatArray  # (M, 2) of range and bearing
 
@@ -51,7 +51,7 @@ class TagSite(NamedTuple):
     keyframe: int  # the one that it lies beside
     position_m: FloatArray  # (2,)
     viewers: IntArray  # (k,) poses
-    n_passages: int
+    n_tracks: int
 
 
 class DrivePaths(NamedTuple):
@@ -59,12 +59,12 @@ class DrivePaths(NamedTuple):
 
     graph: Graph
     state: State
-    ways: list[FloatArray]
+    along_m: list[FloatArray]
     sensors: FloatArray  # (P, 3) pose of the tag sensor at each keyframe, in map
-    example: IntArray  # (P,) index of an observation of the same segment; -1 if it has none
+    example_observation: IntArray  # (P,) index of an observation of the same segment; -1 if it has none
 
 
-def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
+def drive_paths(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
     """Return the driven paths of a solved component."""
     mounts = [segment.T_base_camera if segment.readings.in_camera.any() else np.zeros(3) for segment in graph.segments]
     lengths = [len(segment.stamps_ns) for segment in graph.segments]
@@ -74,7 +74,7 @@ def drives_of(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
     return DrivePaths(graph, state, ways, sensors, np.repeat(example, lengths))
 
 
-def view_of(drives: DrivePaths, n_sightings: int) -> TagViews:
+def view_statistics(drives: DrivePaths, n_sightings: int) -> ViewStatistics:
     """Return statistics of the observations of a map; there must be some."""
     readings = drives.graph.problem.readings
     sight = se2.apply(se2.inverse(drives.sensors[readings.pose]), drives.state.tags[readings.tag])
@@ -89,76 +89,78 @@ def view_of(drives: DrivePaths, n_sightings: int) -> TagViews:
     near_m, typical_m, far_m = np.quantile(range_m, [0.05, 0.5, 0.95]).tolist()
     typical_rad, widest_rad = np.quantile(np.abs(bearing_rad), [0.5, 0.95]).tolist()
     n = len(range_m) / max(n_sightings, 1)
-    return TagViews(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
+    return ViewStatistics(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
 
 
-def places_of(drives: DrivePaths, view: TagViews, most: int = MOST_TAGS) -> list[TagSite]:
+def tag_sites(drives: DrivePaths, view: ViewStatistics, most: int = MOST_TAGS) -> list[TagSite]:
     """Return at most `most` sites beside the paths, a third near the first start and the others far from tags.
 
     All positions are relative to the first start, so an uncertain heading there rotates the whole map about it. Of the
     others, sites that are passed more than once come first: a tag there adds a loop closure.
     """
-    spacing_m = max(_LEAST_SPACING_M, 2.0 * sum(float(way[-1]) for way in drives.ways) / _MOST_PLACES)
+    spacing_m = max(_LEAST_SPACING_M, 2.0 * sum(float(way[-1]) for way in drives.along_m) / _MOST_PLACES)
     beside = {
         (segment, int(keyframe))
-        for segment, way in enumerate(drives.ways)
+        for segment, way in enumerate(drives.along_m)
         for keyframe in np.searchsorted(way, np.arange(0.0, float(way[-1]), spacing_m))
     }
     start_m = np.arange(0.0, view.far_m, _LEAST_SPACING_M)
-    at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.ways[0][:-1], start_m)}
-    first = list(islice(_places_with_two_views(drives, view, at_start), most // 3))
-    others = list(_places_with_two_views(drives, view, beside - at_start))
-    again = [place for place in others if place.n_passages > 1]
-    return first + _spread_over(again or others, drives.state.tags, most - len(first))
+    at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.along_m[0][:-1], start_m)}
+    first = list(islice(_sites_with_two_views(drives, view, at_start), most // 3))
+    others = list(_sites_with_two_views(drives, view, beside - at_start))
+    again = [place for place in others if place.n_tracks > 1]
+    return first + _farthest_points(again or others, drives.state.tags, most - len(first))
 
 
-def _places_with_two_views(drives: DrivePaths, view: TagViews, where: set[tuple[int, int]]) -> Iterator[TagSite]:
+def _sites_with_two_views(drives: DrivePaths, view: ViewStatistics, where: set[tuple[int, int]]) -> Iterator[TagSite]:
     """Yield the sites beside given (segment, keyframe) pairs that more than one pose would observe."""
     for segment, keyframe in sorted(where):
         for side in (1.0, -1.0):
-            place = place_beside(drives, view, segment, keyframe, side)
+            place = site_beside(drives, view, segment, keyframe, side)
             if len(place.viewers) > 1:
                 yield place
 
 
-def place_beside(drives: DrivePaths, view: TagViews, segment: int, keyframe: int, side: float) -> TagSite:
+def site_beside(drives: DrivePaths, view: ViewStatistics, segment: int, keyframe: int, side: float) -> TagSite:
     """Return the site ahead of a keyframe, to its left (+1) or right (-1).
 
     It has no viewers if the keyframe's segment has no observations, as nothing is known of its sensor then.
     """
     pose = int(drives.graph.first_pose[segment]) + keyframe
     sensor = drives.sensors[pose]
-    if drives.example[pose] < 0:
+    if drives.example_observation[pose] < 0:
         return TagSite(segment, keyframe, sensor[:2], np.zeros(0, dtype=np.int64), 0)
     angle = side * view.typical_rad
     position_m = se2.apply(sensor, view.typical_m * np.array([np.cos(angle), np.sin(angle)]))
     step = -(-len(drives.sensors) // _MOST_VIEWERS)
     away_m = np.abs(drives.sensors[::step, :2] - position_m).max(axis=1)
-    near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example[::step] >= 0))
+    near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example_observation[::step] >= 0))
     seen = near[is_in_view(drives.sensors[near], position_m, sensor[:2] - position_m, view)]
-    sightings = _passages(drives, seen, least=view.n_a_passage / step)
+    sightings = _viewing_tracks(drives, seen, least=view.observations_per_track / step)
     beside = np.array([pose], dtype=np.int64)
-    viewers = [part[(_WITHIN_SIGHTING * (len(part) - 1)).round().astype(int)] for part in sightings]
+    viewers = [part[(_WITHIN_TRACK * (len(part) - 1)).round().astype(int)] for part in sightings]
     return TagSite(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
 
 
-def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: TagViews) -> BoolArray:
+def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: ViewStatistics) -> BoolArray:
     """Return which sensors (P,) have a tag in view that is at a position and faces along a vector."""
     sight = se2.apply(se2.inverse(sensors), position_m)
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
     towards = sensors[:, :2] - position_m
     slant = (towards @ face) / np.maximum(range_m * np.hypot(*face), 1e-9)
     near_enough = (range_m >= view.near_m) & (range_m <= view.far_m)
-    return np.asarray(near_enough & (np.abs(bearing_rad) <= view.half_angle_rad) & (slant >= np.cos(MOST_SLANT_RAD)))
+    return np.asarray(near_enough & (np.abs(bearing_rad) <= view.half_angle_rad) & (slant >= np.cos(MAX_INCIDENCE_RAD)))
 
 
-def gain_of_place(drives: DrivePaths, view: TagViews, place: TagSite, seen: BoolArray | None = None) -> InformationGain:
+def new_tag_gain(
+    drives: DrivePaths, view: ViewStatistics, place: TagSite, seen: BoolArray | None = None
+) -> InformationGain:
     """Return the information of a tag at a site on the poses that would observe it, and on the calibration.
 
     Args:
-        drives: from `drives_of`.
-        view: from `view_of`.
-        place: from `places_of`.
+        drives: from `drive_paths`.
+        view: from `view_statistics`.
+        place: from `tag_sites`.
         seen: (k,) which of its viewers have it in view; all if None.
     """
     of_map = drives.graph.problem.columns
@@ -184,15 +186,15 @@ def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
     return Columns(by_pose, by_tag, by_calibration, 2 + len(columns)), columns
 
 
-def _readings(drives: DrivePaths, view: TagViews, place: TagSite, poses: IntArray) -> ReadingFactors:
+def _readings(drives: DrivePaths, view: ViewStatistics, place: TagSite, poses: IntArray) -> ReadingFactors:
     """Return hypothetical observations, as many per track as usual, with the variances of others at that range."""
-    readings, like = drives.graph.problem.readings, drives.example[poses]
+    readings, like = drives.graph.problem.readings, drives.example_observation[poses]
     sight = se2.apply(se2.inverse(drives.sensors[poses]), place.position_m)
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
     at = np.searchsorted(view.range_m, value[:, 0])
     first = np.clip(at - _NEAREST_IN_RANGE // 2, 0, max(len(view.range_m) - _NEAREST_IN_RANGE, 0))
     variance = np.array([view.variance[i : i + _NEAREST_IN_RANGE].mean(axis=0) for i in first])
-    n_each = view.n_a_passage * place.n_passages / len(place.viewers)
+    n_each = view.observations_per_track * place.n_tracks / len(place.viewers)
     tag = np.full(len(poses), len(drives.state.tags))
     return ReadingFactors(
         pose=poses,
@@ -208,23 +210,23 @@ def _readings(drives: DrivePaths, view: TagViews, place: TagSite, poses: IntArra
     )
 
 
-def _passages(drives: DrivePaths, poses: IntArray, least: float) -> list[IntArray]:
+def _viewing_tracks(drives: DrivePaths, poses: IntArray, least: float) -> list[IntArray]:
     """Split ascending poses into tracks where a segment ends or the robot drives on before it returns; keep a few.
 
     Tracks with fewer poses than a tag is observed from on average are dropped.
     """
     if not len(poses):
         return []
-    along_m = np.concatenate(drives.ways)[poses]
+    along_m = np.concatenate(drives.along_m)[poses]
     segment = np.searchsorted(drives.graph.first_pose, poses, side="right")
-    parts = np.split(poses, np.flatnonzero((np.diff(segment) != 0) | (np.diff(along_m) > SIGHTING_GAP_M)) + 1)
+    parts = np.split(poses, np.flatnonzero((np.diff(segment) != 0) | (np.diff(along_m) > TRACK_GAP_M)) + 1)
     parts = [part for part in parts if len(part) >= least]
-    if len(parts) <= _MOST_SIGHTINGS:
+    if len(parts) <= _MOST_TRACKS:
         return parts
-    return [parts[i] for i in np.linspace(0, len(parts) - 1, _MOST_SIGHTINGS).round().astype(int)]
+    return [parts[i] for i in np.linspace(0, len(parts) - 1, _MOST_TRACKS).round().astype(int)]
 
 
-def _spread_over(places: list[TagSite], tags_m: FloatArray, most: int) -> list[TagSite]:
+def _farthest_points(places: list[TagSite], tags_m: FloatArray, most: int) -> list[TagSite]:
     """Choose sites by farthest-point sampling: each as far as possible from the tags and from those already chosen."""
     if len(places) <= most:
         return places

@@ -17,17 +17,17 @@ from groundsbot.offline.sam import Columns, Graph, State
 _LENGTH_SHARE: Final = 0.25
 _MOST_LENGTH_M: Final = 50.0
 # The advice must not take longer than the map: limits on the candidates, and on all their keyframes together.
-MOST_PASSES: Final = 40
+MOST_REPEAT_DRIVES: Final = 40
 _MOST_KEYFRAMES: Final = 20_000
 # A few seconds; work is the sum over candidates of (2 tags)^3.
 _MOST_WORK: Final = 2e9
 # The cost of a candidate is cubic in the tags that it passes.
-_MOST_SIGHTINGS: Final = 60
+_MOST_TRACKS: Final = 60
 # A tag that is observed again after so much driven distance begins a new track.
-SIGHTING_GAP_M: Final = 2.5
+TRACK_GAP_M: Final = 2.5
 
 
-class TagPassage(NamedTuple):
+class TagTrack(NamedTuple):
     """Track of one tag in one segment: the keyframes from which a passing robot observed it."""
 
     segment: int
@@ -36,7 +36,7 @@ class TagPassage(NamedTuple):
     last: int
 
 
-class Pass(NamedTuple):
+class RepeatDrive(NamedTuple):
     """Keyframes first to last of a segment, from the tag observed first to the one observed last."""
 
     segment: int
@@ -46,68 +46,70 @@ class Pass(NamedTuple):
     to_tag: int
 
 
-def ways_m(graph: Graph) -> list[FloatArray]:
+def driven_distances_m(graph: Graph) -> list[FloatArray]:
     """Return the driven distance (K,) at the keyframes of each segment."""
     return [segment.along_m for segment in graph.segments]
 
 
-def passages_of(graph: Graph, ways: list[FloatArray]) -> list[TagPassage]:
+def tag_tracks(graph: Graph, ways: list[FloatArray]) -> list[TagTrack]:
     """Return all tracks, segment by segment in the order in which they begin."""
-    found: list[TagPassage] = []
+    found: list[TagTrack] = []
     number = {tag: i for i, tag in enumerate(graph.tags)}
     for c, segment in enumerate(graph.segments):
         order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
         keyframe, tag = segment.readings.keyframe[order], segment.readings.tag[order]
         if not len(order):
             continue
-        begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > SIGHTING_GAP_M)) + 1
+        begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > TRACK_GAP_M)) + 1
         own = [
-            TagPassage(c, number[segment.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
+            TagTrack(c, number[segment.tags[tag[part[0]]]], int(keyframe[part[0]]), int(keyframe[part[-1]]))
             for part in np.split(np.arange(len(order)), begins)
         ]
         found += sorted(own, key=lambda each: (each.first, each.last, each.tag))
     return found
 
 
-def most_length_m(ways: list[FloatArray]) -> float:
+def max_repeat_length_m(ways: list[FloatArray]) -> float:
     """Return the maximum length of a repeated drive."""
     return min(_LENGTH_SHARE * max(float(way[-1]) for way in ways), _MOST_LENGTH_M)
 
 
-def passes_of(ways: list[FloatArray], sightings: list[TagPassage], most: int = MOST_PASSES) -> list[Pass]:
+def repeat_drives(
+    ways: list[FloatArray], sightings: list[TagTrack], most: int = MOST_REPEAT_DRIVES
+) -> list[RepeatDrive]:
     """Return one candidate per track, as long as allowed, thinned evenly to the limits on number and work.
 
     Args:
-        ways: from `ways_m`.
-        sightings: from `passages_of`.
+        ways: from `driven_distances_m`.
+        sightings: from `tag_tracks`.
         most: maximum number of candidates.
     """
-    length_m = most_length_m(ways)
-    found: list[Pass] = []
+    length_m = max_repeat_length_m(ways)
+    found: list[RepeatDrive] = []
     for c, way in enumerate(ways):
         own = [each for each in sightings if each.segment == c]
         ends_m = way[[each.last for each in own]]
         for i, begin in enumerate(own):
-            reached = i + 1 + np.flatnonzero(ends_m[i + 1 : i + 1 + _MOST_SIGHTINGS] <= way[begin.first] + length_m)
+            reached = i + 1 + np.flatnonzero(ends_m[i + 1 : i + 1 + _MOST_TRACKS] <= way[begin.first] + length_m)
             ends = [own[k] for k in reached.tolist() if own[k].tag != begin.tag]
             if ends:
                 end = max(ends, key=lambda each: each.last)
-                found.append(Pass(c, begin.first, end.last, begin.tag, end.tag))
+                found.append(RepeatDrive(c, begin.first, end.last, begin.tag, end.tag))
     n_keyframes = sum(each.last - each.first + 1 for each in found)
     most = min(most, max(1, len(found) * _MOST_KEYFRAMES // max(n_keyframes, 1)))
-    found = _evenly(found, most)
+    found = _thin(found, most)
     work = sum((2.0 * len(_tags_along(each, sightings))) ** 3 for each in found)
-    return _evenly(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
+    return _thin(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
 
 
-def _evenly(passes: list[Pass], most: int) -> list[Pass]:
+def _thin(passes: list[RepeatDrive], most: int) -> list[RepeatDrive]:
     """Return at most `most` of them, evenly chosen."""
     if len(passes) <= most:
         return passes
     return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
 
 
-def _tags_along(wanted: Pass, sightings: list[TagPassage]) -> set[int]:
+def _tags_along(wanted: RepeatDrive, sightings: list[TagTrack]) -> set[int]:
     """Return the tags that are observed during a candidate drive."""
     return {
         each.tag
@@ -116,7 +118,7 @@ def _tags_along(wanted: Pass, sightings: list[TagPassage]) -> set[int]:
     }
 
 
-def gain_of_pass(graph: Graph, state: State, wanted: Pass) -> InformationGain:
+def repeat_drive_gain(graph: Graph, state: State, wanted: RepeatDrive) -> InformationGain:
     """Return the information of a repeated drive on the map's tags and calibration."""
     problem, offset = graph.problem, int(graph.first_pose[wanted.segment])
     first, last = offset + wanted.first, offset + wanted.last

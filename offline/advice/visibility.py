@@ -11,14 +11,16 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.advice.information_gain import JointCovariance
-from groundsbot.offline.advice.new_tags import DrivePaths, TagSite, TagViews, gain_of_place, is_in_view
+from groundsbot.offline.advice.new_tags import DrivePaths, TagSite, ViewStatistics, is_in_view, new_tag_gain
 
 # Points of equal weight on circles that hold 1/6, 1/2 and 5/6 of a normal distribution in the plane.
 _RADII: Final = np.sqrt(-2.0 * np.log1p(-np.array([1.0, 3.0, 5.0]) / 6.0))
 _ANGLES: Final = np.arange(8) * np.pi / 4.0
 
 
-def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
+def visibility_probabilities(
+    drives: DrivePaths, view: ViewStatistics, place: TagSite, known: JointCovariance
+) -> FloatArray:
     """Return the probability (k,) that each viewer of a site has in view a tag mounted relative to the pose beside it.
 
     Args:
@@ -32,7 +34,7 @@ def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite,
     face = drives.sensors[beside, :2] - place.position_m
     shares = []
     for viewer in place.viewers.tolist():
-        joint = known.of(np.concatenate([columns[beside], columns[viewer]]))
+        joint = known.marginal(np.concatenate([columns[beside], columns[viewer]]))
         by = np.hstack([_place_jacobian(drives, beside, place), -_place_jacobian(drives, viewer, place)])
         values, vectors = np.linalg.eigh(by @ joint @ by.T)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -43,7 +45,7 @@ def visibility_probabilities(drives: DrivePaths, view: TagViews, place: TagSite,
     return np.array(shares)
 
 
-def expected_sigmas_m(drives: DrivePaths, view: TagViews, place: TagSite, known: JointCovariance) -> FloatArray:
+def expected_sigmas_m(drives: DrivePaths, view: ViewStatistics, place: TagSite, known: JointCovariance) -> FloatArray:
     """Return the tags' sigmas (T,) with a tag at the site: their mean over which viewers have it in view.
 
     A single observation from an otherwise unconstrained drive carries the most information, so it matters whether there
@@ -56,7 +58,7 @@ def expected_sigmas_m(drives: DrivePaths, view: TagViews, place: TagSite, known:
     chances = -np.diff(np.append(levels, 0.0))
     expected: FloatArray = (1.0 - levels[0]) * known.sigmas_m()
     for level, chance in zip(levels, chances, strict=True):
-        expected = expected + chance * known.sigmas_with_m(gain_of_place(drives, view, place, shares >= level))
+        expected = expected + chance * known.predicted_sigmas_m(new_tag_gain(drives, view, place, shares >= level))
     return expected
 
 

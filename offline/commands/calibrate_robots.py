@@ -8,7 +8,7 @@ from typing import Any, Final
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import echo_line, metre_line, read_robot_files
+from groundsbot.offline.commands.shared import echo_line, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
@@ -43,15 +43,15 @@ class CalibrateOptions:
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibrationOutput:
     """The map of the drives, the parameters that were written, and the files."""
 
     result: MapResult
-    learnt: tuple[CalibrationResult, ...]
+    estimates: tuple[CalibrationResult, ...]
     files: tuple[Path, ...]
 
 
-def calibrate_robots(options: CalibrateOptions) -> Calibrated:
+def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     """Map the drives and write a file for each robot, and its camera's beside it.
 
     Raises:
@@ -83,27 +83,27 @@ def calibrate_robots(options: CalibrateOptions) -> Calibrated:
     written = []
     for robot_id, run in robots.items():
         written += _write(correct_robot(run.robot, corrections), _camera(run, corrections), paths[robot_id])
-    return Calibrated(result, tuple(learnt), tuple(written))
+    return CalibrationOutput(result, tuple(learnt), tuple(written))
 
 
-def summary(calibrated: Calibrated) -> list[str]:
+def summary(calibrated: CalibrationOutput) -> list[str]:
     """Return lines on what was estimated, what determines the scale, and the files."""
     result = calibrated.result
-    lines = correction_lines(result, calibrated.learnt)
-    lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+    lines = correction_lines(result, calibrated.estimates)
+    lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]
     lines += [f"written: {path}" for path in calibrated.files]
     return [*lines, "use it for other drives: mapping these ones with it would count their measurements twice"]
 
 
-def as_json(calibrated: Calibrated) -> dict[str, Any]:
+def as_json(calibrated: CalibrationOutput) -> dict[str, Any]:
     """Return what was estimated, and why the rest was not."""
     words = {(each.owner, each.name): choice_words(each) for each in calibrated.result.choices}
     return {
-        "learnt": [asdict(each) | {"choice": words.get((each.owner, each.name))} for each in calibrated.learnt],
+        "learnt": [asdict(each) | {"choice": words.get((each.owner, each.name))} for each in calibrated.estimates],
         "choices": [asdict(each) for each in calibrated.result.choices],
-        "metres": [asdict(each) for each in calibrated.result.metres],
+        "metres": [asdict(each) for each in calibrated.result.scale_budgets],
         "warnings": list(calibrated.result.warnings),
         "losses": list(calibrated.result.losses),
         "files": [str(path) for path in calibrated.files],

@@ -26,14 +26,21 @@ def compare(
     """
     import json
 
-    from groundsbot.offline.evaluation import MapErrors, SurveyErrors, evaluate, judge_survey, read_survey, read_truth
+    from groundsbot.offline.evaluation import (
+        MapErrors,
+        SurveyErrors,
+        evaluate,
+        evaluate_survey,
+        read_survey,
+        read_truth,
+    )
     from groundsbot.offline.maps import read_map
 
     errors: MapErrors | SurveyErrors
     if truth is not None and survey is None:
         errors = evaluate(read_map(folder), read_truth(truth))
     elif survey is not None and truth is None:
-        errors = judge_survey(read_map(folder), read_survey(survey))
+        errors = evaluate_survey(read_map(folder), read_survey(survey))
     else:
         raise typer.BadParameter("give either --truth or --survey")
     if json_output:

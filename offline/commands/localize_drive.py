@@ -182,12 +182,12 @@ def _run_lines(run: LocatedRun) -> list[str]:
     n = plural(len(run.tags), "tag")
     return [
         f"{run.name}: {plural(len(run.stamps_ns), 'keyframe')}, {run.distance_m:.1f} m, localised by {n} of the map",
-        f"  start {_place(run, 0)}",
-        f"  end   {_place(run, -1)}",
+        f"  start {_pose_text(run, 0)}",
+        f"  end   {_pose_text(run, -1)}",
     ]
 
 
-def _place(run: LocatedRun, at: int) -> str:
+def _pose_text(run: LocatedRun, at: int) -> str:
     x_m, y_m, theta_rad = run.T_map_base[at]
     sigma_x_m, sigma_y_m, sigma_rad = np.sqrt(np.diag(run.covariance[at]))
     return (

@@ -11,7 +11,7 @@ from typing import Final
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, echo_line, metre_line, read_robot_files
+from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
@@ -41,7 +41,7 @@ _FINEST_DEG: Final = 0.01
 _COARSEST_DEG: Final = 10.0
 # On one screen.
 _MOST_PAIRS: Final = 3
-_MOST_TO_ACT_ON: Final = 5
+_MOST_ACTION_LINES: Final = 5
 
 
 @dataclass(frozen=True)
@@ -151,25 +151,25 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
     ]
     lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
     if verbose or result.measurements:  # shows the effect of measurements on the scale
-        lines += [metre_line(each, several=len(result.metres) > 1) for each in result.metres]
+        lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
     if verbose and result.noise_fit is not None:
         lines += _noise_lines(result.noise_fit)
     lines += _floor_lines(result)
     lines += [*verdict_lines(result.robot_numbers), *refusal_lines(result)]
-    lines += _to_act_on(result, verbose=verbose)
+    lines += _action_lines(result, verbose=verbose)
     return [*lines, f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
 
 
-def _to_act_on(result: MapResult, *, verbose: bool) -> list[str]:
+def _action_lines(result: MapResult, *, verbose: bool) -> list[str]:
     """Return losses, outliers and warnings, and what to drive next; the gravest first."""
     lines = [f"lost: {loss}" for loss in result.losses]
-    lines += [f"suspect: {suspect.line()}" for suspect in result.suspects]
+    lines += [f"suspect: {suspect.line()}" for suspect in result.outliers]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += _advice_lines(result)
-    if verbose or len(lines) <= _MOST_TO_ACT_ON:
+    if verbose or len(lines) <= _MOST_ACTION_LINES:
         return lines
-    rest = len(lines) - _MOST_TO_ACT_ON
-    return [*lines[:_MOST_TO_ACT_ON], f"{rest} more: in the report, or with -v"]
+    rest = len(lines) - _MOST_ACTION_LINES
+    return [*lines[:_MOST_ACTION_LINES], f"{rest} more: in the report, or with -v"]
 
 
 def _report_line(output: Path) -> str:
@@ -215,7 +215,7 @@ def _alignment_line(alignment: AlignmentResult) -> str:
         f"alignment {alignment.from_run} <- {alignment.to_run}: {alignment.n_inliers} of {alignment.n_shared} shared "
         f"tags fit (RMS {alignment.inlier_rmse_m:.2f} m); "
         f"x {x_m:.2f} m, y {y_m:.2f} m, rotated {degrees(theta_rad):.1f} deg"
-        + (weak if alignment.is_sure else "; uncertain, so not used")
+        + (weak if alignment.is_accepted else "; uncertain, so not used")
     )
 
 

@@ -25,7 +25,7 @@ def echo_line(text: str) -> None:
     sys.stderr.write(text + "\n")
 
 
-def metre_line(metre: ScaleBudget, *, several: bool) -> str:
+def scale_line(metre: ScaleBudget, *, several: bool) -> str:
     """Return what determines the scale."""
     of = f" of component {metre.component}" if several else ""
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)

@@ -1,6 +1,6 @@
 from .against_truth import evaluate
 from .errors import MapErrors
-from .survey import judge_survey, read_survey
+from .survey import evaluate_survey, read_survey
 from .survey_errors import SurveyErrors
 from .truth import read_truth
 
@@ -8,7 +8,7 @@ __all__ = [
     "MapErrors",
     "SurveyErrors",
     "evaluate",
-    "judge_survey",
+    "evaluate_survey",
     "read_survey",
     "read_truth",
 ]

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.errors import ComponentErrors, MapErrors, StartError, TagError
-from groundsbot.offline.evaluation.nees import nees_per_dim, tangent_errors
+from groundsbot.offline.evaluation.nees import link_errors, nees_per_dim
 from groundsbot.offline.evaluation.truth import TrueRun, Truth
 from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
 
@@ -31,7 +31,7 @@ def evaluate(result: MapResult, truth: Truth) -> MapErrors:
                 f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
                 f"it has {', '.join(sorted(truth.runs)) or 'no runs'}; give the truth.json of these drives"
             )
-        components.append(_unknown(component) if frame is None else _evaluate(component, truth, frame))
+        components.append(_without_truth(component) if frame is None else _evaluate(component, truth, frame))
     return MapErrors(tuple(components))
 
 
@@ -45,11 +45,11 @@ def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
     true_run = truth.runs.get(run.run)
     if true_run is None:
         return None
-    poses, covered = true_run.at(run.stamps_ns[:1])
+    poses, covered = true_run.poses_at(run.stamps_ns[:1])
     return poses[0] if covered[0] else None
 
 
-def _unknown(component: Component) -> ComponentErrors:
+def _without_truth(component: Component) -> ComponentErrors:
     note = f"the truth lacks the start of {component.frame_run}; this component is not evaluated"
     runs = tuple(run.name for run in component.runs)
     return ComponentErrors(
@@ -61,10 +61,10 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
     notes = _notes(component, truth)
     places = _start_places(component, truth, T_world_map)
     starts = tuple(_start_error(a, b, places) for a, b in combinations(places, 2))
-    known = [i for i, tag in enumerate(component.tags) if _knows(truth, tag)]
+    known = [i for i, tag in enumerate(component.tags) if _is_in_truth(truth, tag)]
     tags = [component.tags[i] for i in known]
     found = np.array([tag.position_m for tag in tags]).reshape(-1, 2)
-    world = np.array([truth.tags_m[_name(tag)] for tag in tags]).reshape(-1, 2)
+    world = np.array([truth.tags_m[_tag_name(tag)] for tag in tags]).reshape(-1, 2)
     true = se2.apply(se2.inverse(T_world_map), world)
     errors = found - true
     nees_start, nees_tags = _nees(component, places, known, true)
@@ -127,7 +127,7 @@ def _nees(
     true_m = np.concatenate([np.array([places[name][1] for name in starts]).reshape(-1, 2), true_tags_m])
     if not len(rows) or not np.isfinite(covariance).all():
         return None, None
-    errors = tangent_errors(found_m, true_m, covariance)
+    errors = link_errors(found_m, true_m, covariance)
     n = len(starts)
     return (
         nees_per_dim(errors[:n].reshape(-1), covariance[: 2 * n, : 2 * n]),
@@ -153,7 +153,7 @@ def _trajectory_errors(runs: Iterable[RunResult], truth: Truth, T_world_map: Flo
     for run in runs:
         true_run = truth.runs.get(run.run)
         if true_run is not None:
-            T_world_base, covered = true_run.at(run.stamps_ns)
+            T_world_base, covered = true_run.poses_at(run.stamps_ns)
             T_map_base = se2.between(T_world_map, T_world_base)
             errors.append((run.T_map_base - T_map_base)[covered, :2])
     return np.concatenate(errors)
@@ -168,22 +168,22 @@ def _notes(component: Component, truth: Truth) -> list[str]:
     late = sum(_n_outside_truth(run, truth.runs[run.run]) for run in component.runs if run.run in truth.runs)
     if late:
         notes.append(f"{late} keyframes lie outside the truth's time, left out of trajectory_rmse_m")
-    unknown_tags = [tag.full_label for tag in component.tags if not _knows(truth, tag)]
+    unknown_tags = [tag.full_label for tag in component.tags if not _is_in_truth(truth, tag)]
     if unknown_tags:
         notes.append(f"not in the truth, or there more than once, left out: tags {', '.join(unknown_tags)}")
     return notes
 
 
 def _n_outside_truth(run: RunResult, true_run: TrueRun) -> int:
-    return int((~true_run.at(run.stamps_ns)[1]).sum())
+    return int((~true_run.poses_at(run.stamps_ns)[1]).sum())
 
 
-def _name(tag: TagResult) -> tuple[str, int, str]:
+def _tag_name(tag: TagResult) -> tuple[str, int, str]:
     return tag.family, tag.tag_id, tag.instance
 
 
-def _knows(truth: Truth, tag: TagResult) -> bool:
-    return _name(tag) in truth.tags_m and _name(tag) not in truth.ambiguous
+def _is_in_truth(truth: Truth, tag: TagResult) -> bool:
+    return _tag_name(tag) in truth.tags_m and _tag_name(tag) not in truth.ambiguous
 
 
 def _tag_error(tag: TagResult, error_m: FloatArray) -> TagError:

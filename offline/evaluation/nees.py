@@ -31,7 +31,7 @@ def nees_per_dim(error: FloatArray, covariance: FloatArray) -> float | None:
     return float(error @ linalg.cho_solve(factor, error)) / len(error)
 
 
-def tangent_errors(found_m: FloatArray, true_m: FloatArray, covariance: FloatArray) -> FloatArray:
+def link_errors(found_m: FloatArray, true_m: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return errors (N, 2) of positions to which the covariance applies; to first order they are found - true.
 
     Args:
@@ -40,13 +40,13 @@ def tangent_errors(found_m: FloatArray, true_m: FloatArray, covariance: FloatArr
         covariance: (2N, 2N) of the estimated positions.
     """
     found, true = (np.concatenate([places, np.zeros((1, 2))]) for places in (found_m, true_m))
-    along, across = _variances(found, covariance)
+    along, across = _difference_variances(found, covariance)
     length = np.linalg.norm(found[:, None] - found[None], axis=-1)
     # Lengths and directions for links whose length has a sigma below a quarter and whose direction below a radian, so
     # that strongly rotated links keep their length; plain differences for positions that may coincide.
     has_direction = (length**2 > 16.0 * along) & (length**2 > across)
     errors = np.zeros_like(found)
-    for child, parent in _tree(np.where(has_direction, along, along + across)):
+    for child, parent in _minimum_variance_tree(np.where(has_direction, along, along + across)):
         difference = found[child] - found[parent], true[child] - true[parent]
         of_link = _polar_error(*difference) if has_direction[child, parent] else difference[0] - difference[1]
         errors[child] = errors[parent] + of_link
@@ -65,7 +65,7 @@ def _polar_error(found: FloatArray, true: FloatArray) -> FloatArray:
     return error
 
 
-def _variances(places_m: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _difference_variances(places_m: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return variances (N + 1, N + 1) of differences along and across each; the last position is the origin, exact."""
     n = len(places_m) - 1
     joint = np.zeros((n + 1, n + 1, 2, 2))
@@ -80,7 +80,7 @@ def _variances(places_m: FloatArray, covariance: FloatArray) -> tuple[FloatArray
     return along, across
 
 
-def _tree(variance: FloatArray) -> list[tuple[int, int]]:
+def _minimum_variance_tree(variance: FloatArray) -> list[tuple[int, int]]:
     """Return (child, parent) of all places but the last one, parents first: the minimum spanning tree from there."""
     # scipy ignores links of zero weight and those below 1e-8.
     sigma = np.sqrt(np.maximum(variance / max(float(variance.max()), 1e-300), 1e-12))

@@ -17,7 +17,7 @@ from scipy.special import chdtrc, chdtri
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import fit_transform, se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation.survey_errors import ComponentSurvey, JudgedEntry, SurveyErrors
+from groundsbot.offline.evaluation.survey_errors import ComponentSurvey, EntryResult, SurveyErrors
 from groundsbot.offline.foundation import CsvTable, read_table
 from groundsbot.offline.maps import Component, MapResult
 
@@ -61,11 +61,11 @@ def read_survey(path: Path) -> list[SurveyEntry]:
         SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma)
         for family, tag_id, instance, x, y, sigma in zip(families, ids, instances, x_m, y_m, sigmas, strict=True)
     ]
-    _check_once(table, entries)
+    _check_no_duplicates(table, entries)
     return entries
 
 
-def _check_once(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
+def _check_no_duplicates(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
     seen = set()
     for row, entry in enumerate(entries):
         name = (entry.family, entry.tag_id, entry.instance)
@@ -74,7 +74,7 @@ def _check_once(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
         seen.add(name)
 
 
-def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:
+def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:
     """Compare every component that shares three entries or more.
 
     Raises:
@@ -87,10 +87,10 @@ def judge_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErr
             named.setdefault((tag.tag_id, tag.instance), []).append(i)
         matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry, named)]
         found |= {k for _, k in matched}
-        _check_different(component, [i for i, _ in matched])
+        _check_one_entry_per_tag(component, [i for i, _ in matched])
         if len(matched) >= 3:
             _check_extent(component, [entries[k] for _, k in matched])
-            components.append(_judge(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
+            components.append(_evaluate_component(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
     if not components:
         raise OfflineError(
             f"the survey shares {len(found)} tags with the map, at least three in one component are "
@@ -108,7 +108,7 @@ def _tags_of(component: Component, entry: SurveyEntry, named: Mapping[tuple[int,
     return fits if len(fits) == 1 else []
 
 
-def _check_different(component: Component, tags: Sequence[int]) -> None:
+def _check_one_entry_per_tag(component: Component, tags: Sequence[int]) -> None:
     """Refuse a tag that two entries mean, e.g. once with its family and once without."""
     for i in tags:
         if tags.count(i) > 1:
@@ -145,7 +145,7 @@ class _SurveyFit:
     residual: FloatArray
     reliability: FloatArray
 
-    def shift(self, rows: Sequence[int]) -> tuple[FloatArray, float]:
+    def estimate_shift(self, rows: Sequence[int]) -> tuple[FloatArray, float]:
         """Return the estimated shift of the entries with these rows, and its squared Mahalanobis length."""
         at = np.array(rows)
         pulled = (self.reliability @ self.residual)[at]
@@ -159,14 +159,14 @@ def _adjust(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> 
     T_map_survey = fit_transform(map_m, survey_m)
     for _ in range(_MAX_STEPS):
         placed = se2.apply(T_map_survey, survey_m)
-        jacobian = _by_transform(placed)
+        jacobian = _transform_jacobian(placed)
         normal = jacobian.T @ information @ jacobian
         step = _solve_least_norm(normal, jacobian.T @ information @ (map_m - placed).reshape(-1))
         T_map_survey = se2.compose(np.array([0.0, 0.0, step[2]]), T_map_survey) + np.array([step[0], step[1], 0.0])
         if np.abs(step).max() < 1e-12:
             break
     placed = se2.apply(T_map_survey, survey_m)
-    jacobian = _by_transform(placed)
+    jacobian = _transform_jacobian(placed)
     weighted = information @ jacobian
     reliability: FloatArray = information - weighted @ _solve_least_norm(jacobian.T @ weighted, weighted.T)
     return _SurveyFit(T_map_survey, (map_m - placed).reshape(-1), reliability)
@@ -177,7 +177,7 @@ def _solve_least_norm(normal: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
 
-def _by_transform(placed_m: FloatArray) -> FloatArray:
+def _transform_jacobian(placed_m: FloatArray) -> FloatArray:
     """Return the derivative (2n, 3) of positions by a shift and a rotation of the survey about the map's origin."""
     jacobian = np.zeros((len(placed_m), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
@@ -185,25 +185,25 @@ def _by_transform(placed_m: FloatArray) -> FloatArray:
     return jacobian.reshape(-1, 3)
 
 
-def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
+def _evaluate_component(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
     map_m = np.array([component.tags[i].position_m for i in tags])
     survey_m = np.array([entry.position_m for entry in entries])
     rows = np.array([(2 * i, 2 * i + 1) for i in tags]).reshape(-1)
     covariance = component.tag_covariance[np.ix_(rows, rows)]
     covariance = covariance + np.diag(np.repeat([entry.sigma_m**2 for entry in entries], 2))
-    good = _fitting(map_m, survey_m, covariance)
+    good = _reject_outliers(map_m, survey_m, covariance)
     swapped = _find_swaps(map_m, survey_m, covariance, good)
     judged = []
     for k, i in enumerate(tags):
-        part, adjusted = _with(map_m, survey_m, covariance, [*sorted({*good, k})])
+        part, adjusted = _fit_entries(map_m, survey_m, covariance, [*sorted({*good, k})])
         at = 2 * part.index(k)
-        shift, square = adjusted.shift([at, at + 1])
+        shift, square = adjusted.estimate_shift([at, at + 1])
         verdict = "fits" if k in good else "swapped" if k in swapped else "wrong"
         other = entries[swapped[k]].tag_id if k in swapped else None
-        judged.append(JudgedEntry(component.tags[i], shift, float(np.sqrt(max(square, 0.0))), verdict, other))
-    _, adjusted = _with(map_m, survey_m, covariance, good)
+        judged.append(EntryResult(component.tags[i], shift, float(np.sqrt(max(square, 0.0))), verdict, other))
+    _, adjusted = _fit_entries(map_m, survey_m, covariance, good)
     residual = map_m[good] - se2.apply(fit_transform(map_m[good], survey_m[good]), survey_m[good])
-    scale, scale_sigma = _scale(adjusted, map_m[good])
+    scale, scale_sigma = _scale_error(adjusted, map_m[good])
     n_over = residual.size - 3
     square = float(adjusted.residual @ adjusted.reliability @ adjusted.residual)
     return ComponentSurvey(
@@ -218,7 +218,7 @@ def _judge(component: Component, tags: Sequence[int], entries: Sequence[SurveyEn
     )
 
 
-def _with(
+def _fit_entries(
     map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray, part: list[int]
 ) -> tuple[list[int], _SurveyFit]:
     """Return the fit of some entries."""
@@ -226,13 +226,13 @@ def _with(
     return part, _adjust(map_m[part], survey_m[part], covariance[np.ix_(rows, rows)])
 
 
-def _fitting(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
+def _reject_outliers(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
     """Return the entries that are left after removing the worst, one at a time; at least three."""
     limit = chdtri(2, _FALSE_ALARM / len(map_m))
     good = list(range(len(map_m)))
     while len(good) > 3:
-        _, adjusted = _with(map_m, survey_m, covariance, good)
-        squares = [adjusted.shift([2 * k, 2 * k + 1])[1] for k in range(len(good))]
+        _, adjusted = _fit_entries(map_m, survey_m, covariance, good)
+        squares = [adjusted.estimate_shift([2 * k, 2 * k + 1])[1] for k in range(len(good))]
         worst = int(np.argmax(squares))
         if squares[worst] <= limit:
             break
@@ -249,14 +249,14 @@ def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray,
             continue
         exchanged = survey_m.copy()
         exchanged[[a, b]] = survey_m[[b, a]]
-        part, adjusted = _with(map_m, exchanged, covariance, [*sorted({*good, a, b})])
+        part, adjusted = _fit_entries(map_m, exchanged, covariance, [*sorted({*good, a, b})])
         rows = [2 * part.index(k) + axis for k in (a, b) for axis in (0, 1)]
-        if chdtrc(4, adjusted.shift(rows)[1]) > _FALSE_ALARM:
+        if chdtrc(4, adjusted.estimate_shift(rows)[1]) > _FALSE_ALARM:
             found[a], found[b] = b, a
     return found
 
 
-def _scale(adjusted: _SurveyFit, map_m: FloatArray) -> tuple[float, float]:
+def _scale_error(adjusted: _SurveyFit, map_m: FloatArray) -> tuple[float, float]:
     """Return the relative excess of the map's scale over the survey's, and its sigma."""
     direction = (map_m - map_m.mean(axis=0)).reshape(-1)
     pulled = adjusted.reliability @ direction

@@ -10,7 +10,7 @@ from groundsbot.offline.maps import TagResult
 
 
 @dataclass(frozen=True)
-class JudgedEntry:
+class EntryResult:
     """One entry against the map.
 
     Attributes:
@@ -47,7 +47,7 @@ class ComponentSurvey:
     """
 
     frame_run: str
-    entries: tuple[JudgedEntry, ...]
+    entries: tuple[EntryResult, ...]
     T_map_survey: FloatArray
     rmse_m: float
     worst_m: float
@@ -56,7 +56,7 @@ class ComponentSurvey:
     nees_per_dim: float | None
 
     @property
-    def odd(self) -> tuple[JudgedEntry, ...]:
+    def outliers(self) -> tuple[EntryResult, ...]:
         """Entries that look wrong."""
         return tuple(entry for entry in self.entries if entry.verdict != "fits")
 
@@ -87,7 +87,7 @@ class ComponentSurvey:
 
     def lines(self) -> list[str]:
         """Return lines for the user."""
-        n_good = len(self.entries) - len(self.odd)
+        n_good = len(self.entries) - len(self.outliers)
         nees = "no redundancy" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
         lines = [
             f"frame: start of {self.frame_run}; {len(self.entries)} surveyed tags, {n_good} fit",
@@ -95,7 +95,7 @@ class ComponentSurvey:
             f"  scale: {100.0 * self.scale_error:+.2f} % against the survey (sigma {100.0 * self.scale_sigma:.2f} %)",
             f"  NEES per dimension (1 is consistent): {nees}",
         ]
-        return lines + [f"  {entry.line()}" for entry in self.odd]
+        return lines + [f"  {entry.line()}" for entry in self.outliers]
 
 
 @dataclass(frozen=True)

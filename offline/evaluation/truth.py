@@ -25,7 +25,7 @@ class TrueRun:
     stamps_ns: IntArray  # (N,), ascending
     T_world_base: FloatArray  # (N, 3)
 
-    def at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+    def poses_at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
         """Return poses (K, 3) at stamps (K,), on the arc between neighbours, and which stamps (K,) the truth covers."""
         first, last = self.stamps_ns[0], self.stamps_ns[-1]
         covered = (stamps_ns >= first - _END_TOLERANCE_NS) & (stamps_ns <= last + _END_TOLERANCE_NS)

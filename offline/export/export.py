@@ -43,7 +43,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
         if options.form in _FOLDERS:
             with folder_written_whole(options.output) as partial:
                 _FOLDERS[options.form](component, partial)
-            lines = [_measure(component)]
+            lines = [_describe(component)]
         else:
             text, lines = _TEXTS[options.form](component, result, options)
             with atomic_write(options.output) as partial:
@@ -52,7 +52,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
         raise OfflineError(
             f"-o {options.output}: cannot be written ({error.strerror}); choose another place"
         ) from error
-    return [*lines, *_suspects(result, component), f"{options.form}: {options.output}"]
+    return [*lines, *_outlier_lines(result, component), f"{options.form}: {options.output}"]
 
 
 def _component(result: MapResult, index: int | None) -> Component:
@@ -71,13 +71,13 @@ def _component(result: MapResult, index: int | None) -> Component:
     return result.components[index]
 
 
-def _suspects(result: MapResult, component: Component) -> Lines:
+def _outlier_lines(result: MapResult, component: Component) -> Lines:
     """Return a warning for each tag with outliers, as other tools' formats cannot mark them."""
     there = {(tag.family, tag.tag_id) for tag in component.tags}
-    return [f"warning: suspect: {each.line()}" for each in result.suspects if (each.family, each.tag_id) in there]
+    return [f"warning: suspect: {each.line()}" for each in result.outliers if (each.family, each.tag_id) in there]
 
 
-def _measure(component: Component) -> str:
+def _describe(component: Component) -> str:
     runs, tags = plural(len(component.runs), "run"), plural(len(component.tags), "tag")
     return f"{runs}, {tags}, in the frame of {component.frame_run}'s start"
 
@@ -103,7 +103,7 @@ def _run_csv(run: RunResult) -> str:
 
 
 def _g2o(component: Component, result: MapResult, _options: ExportOptions) -> tuple[str, Lines]:
-    lines = [_measure(component)]
+    lines = [_describe(component)]
     used = {each.component for each in result.measurements}
     if any(each is component and i in used for i, each in enumerate(result.components)):
         lines.append("warning: --start and --distance measurements are not exported; the graph's optimum differs")
@@ -111,7 +111,7 @@ def _g2o(component: Component, result: MapResult, _options: ExportOptions) -> tu
 
 
 def _geojson(component: Component, _result: MapResult, options: ExportOptions) -> tuple[str, Lines]:
-    return _as_json(geojson_of(component, options)), [_measure(component)]
+    return _as_json(geojson_of(component, options)), [_describe(component)]
 
 
 def _frc(component: Component, _result: MapResult, options: ExportOptions) -> tuple[str, Lines]:

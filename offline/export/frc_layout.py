@@ -9,7 +9,7 @@ import numpy as np
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.export.options import ExportOptions, numbers
-from groundsbot.offline.export.tag_poses import PlacedTag, tags_in_space
+from groundsbot.offline.export.tag_poses import LayoutTag, layout_tags
 from groundsbot.offline.maps import Component
 
 # docs.limelightvision.io, "AprilTag Map Specification", names these two.
@@ -33,7 +33,7 @@ def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[st
     family = _one_family(component, options.family)
     twice = sorted({tag.tag_id for tag in component.tags if tag.family == family and tag.instance})
     chosen = [tag for tag in component.tags if tag.family == family and not tag.instance]
-    placed, said = tags_in_space(component, chosen, options)
+    placed, said = layout_tags(component, chosen, options)
     if twice:
         said.append(f"left out, since a layout has one pose per id: {', '.join(map(str, twice))}")
     tags = [{"ID": each.tag.tag_id, "pose": _wpilib_pose(each)} for each in placed]
@@ -55,7 +55,7 @@ def fmap_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any
                 f"--format limelight: needs the size of each tag, and the map has none of tag {tag.tag_id} "
                 "(its positions were imported); import the log with --robot, or choose another format"
             )
-    placed, said = tags_in_space(component, component.tags, options)
+    placed, said = layout_tags(component, component.tags, options)
     fiducials = [
         {
             "family": _LIMELIGHT_FAMILIES[each.tag.family],
@@ -81,7 +81,7 @@ def _one_family(component: Component, wanted: str | None) -> str:
     return wanted
 
 
-def _wpilib_pose(each: PlacedTag) -> dict[str, Any]:
+def _wpilib_pose(each: LayoutTag) -> dict[str, Any]:
     x_m, y_m = each.tag.position_m.tolist()
     x, y, z, w = each.R_map_tag.as_quat(canonical=True).tolist()
     return {
@@ -90,7 +90,7 @@ def _wpilib_pose(each: PlacedTag) -> dict[str, Any]:
     }
 
 
-def _row_major(each: PlacedTag) -> list[float]:
+def _row_major(each: LayoutTag) -> list[float]:
     x_m, y_m = each.tag.position_m.tolist()
     T_map_tag = np.eye(4)
     T_map_tag[:3, :3], T_map_tag[:3, 3] = each.R_map_tag.as_matrix(), (x_m, y_m, each.z_m)

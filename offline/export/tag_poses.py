@@ -24,7 +24,7 @@ _TO_LAYOUT: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0
 
 
 @dataclass(frozen=True)
-class PlacedTag:
+class LayoutTag:
     """Pose of a tag in space."""
 
     tag: TagResult
@@ -33,16 +33,16 @@ class PlacedTag:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class _HeightAndYaw:
     """Height and yaw in a row of --tag-poses; None for empty cells."""
 
     z_m: float | None
     yaw_rad: float | None
 
 
-def tags_in_space(
+def layout_tags(
     component: Component, tags: Sequence[TagResult], options: ExportOptions
-) -> tuple[list[PlacedTag], list[str]]:
+) -> tuple[list[LayoutTag], list[str]]:
     """Return poses of some tags: from --tag-poses, else from the map, else by --tag-height-m and --face-viewers.
 
     If the map has a tag's tilt, a yaw from --tag-poses only rotates the tag about the vertical.
@@ -55,21 +55,21 @@ def tags_in_space(
     """
     if options.tag_height_m is not None and not isfinite(options.tag_height_m):
         raise OfflineError(f"--tag-height-m {options.tag_height_m}: must be a number of metres")
-    measured = {} if options.tag_poses is None else _read(options.tag_poses, component)
-    viewed = _towards_viewers(component) if options.face_viewers else {}
+    measured = {} if options.tag_poses is None else _read_tag_poses(options.tag_poses, component)
+    viewed = _viewer_directions(component) if options.face_viewers else {}
     placed = []
     n_heights = n_directions = n_upright = 0
     for tag in tags:
-        row = measured.get(_key(tag), _Measured(None, None))
-        known = _Measured(None, None) if tag.pose is None else _Measured(tag.pose.height_m, tag.pose.yaw_rad)
-        z_m, yaw_rad = _first(row.z_m, known.z_m), _first(row.yaw_rad, known.yaw_rad)
+        row = measured.get(_key(tag), _HeightAndYaw(None, None))
+        known = _HeightAndYaw(None, None) if tag.pose is None else _HeightAndYaw(tag.pose.height_m, tag.pose.yaw_rad)
+        z_m, yaw_rad = _or_default(row.z_m, known.z_m), _or_default(row.yaw_rad, known.yaw_rad)
         n_heights += z_m is None
         n_directions += yaw_rad is None
         n_upright += tag.pose is None
-        z_m, yaw_rad = _first(z_m, options.tag_height_m), _first(yaw_rad, viewed.get(_key(tag)))
+        z_m, yaw_rad = _or_default(z_m, options.tag_height_m), _or_default(yaw_rad, viewed.get(_key(tag)))
         if z_m is None or yaw_rad is None:
-            raise OfflineError(_what_is_missing(tag, z_m, options))
-        placed.append(PlacedTag(tag, z_m, _rotate(tag, yaw_rad)))
+            raise OfflineError(_missing_value_text(tag, z_m, options))
+        placed.append(LayoutTag(tag, z_m, _orientation(tag, yaw_rad)))
     said = [] if tags and not n_upright else ["treated as upright, with x out of the face"]
     if 0 < n_upright < len(placed):
         said = [f"treated as upright, with x out of the face: {n_upright} of {len(placed)} tags"]
@@ -83,11 +83,11 @@ def tags_in_space(
     return placed, said
 
 
-def _first(value: float | None, otherwise: float | None) -> float | None:
+def _or_default(value: float | None, otherwise: float | None) -> float | None:
     return otherwise if value is None else value
 
 
-def _rotate(tag: TagResult, yaw_rad: float) -> Rotation:
+def _orientation(tag: TagResult, yaw_rad: float) -> Rotation:
     """Return R_map_tag in the axes of layouts for a yaw of the face, with the map's tilt."""
     if tag.pose is None:
         return Rotation.from_euler("z", yaw_rad)
@@ -95,7 +95,7 @@ def _rotate(tag: TagResult, yaw_rad: float) -> Rotation:
     return turn * Rotation.from_quat(tag.pose.quaternion_xyzw) * _TO_LAYOUT
 
 
-def _what_is_missing(tag: TagResult, z_m: float | None, options: ExportOptions) -> str:
+def _missing_value_text(tag: TagResult, z_m: float | None, options: ExportOptions) -> str:
     what, column, instead = ("height", "z_m", "--tag-height-m") if z_m is None else ("direction", "yaw_rad", "")
     instead = instead or "--face-viewers (errors of tens of degrees)"
     return (
@@ -108,7 +108,7 @@ def _key(tag: TagResult) -> _Key:
     return tag.family, tag.tag_id, tag.instance
 
 
-def _towards_viewers(component: Component) -> Mapping[_Key, float]:
+def _viewer_directions(component: Component) -> Mapping[_Key, float]:
     """Return the mean direction from each tag to the poses that observed it.
 
     Raises:
@@ -127,7 +127,7 @@ def _towards_viewers(component: Component) -> Mapping[_Key, float]:
     return found
 
 
-def _read(path: Path, component: Component) -> Mapping[_Key, _Measured]:
+def _read_tag_poses(path: Path, component: Component) -> Mapping[_Key, _HeightAndYaw]:
     """Return rows by tag; `family` is optional if ids are unique, other columns are ignored."""
     table = read_table(path)
     for column in ("tag_id", "z_m", "yaw_rad"):
@@ -139,11 +139,11 @@ def _read(path: Path, component: Component) -> Mapping[_Key, _Measured]:
     ids = table.integers("tag_id", minimum=0)
     family = table.text("family") if "family" in table else (families or [""]) * len(table)
     instance = table.text("instance") if "instance" in table else [""] * len(table)
-    rows: dict[_Key, _Measured] = {}
+    rows: dict[_Key, _HeightAndYaw] = {}
     for i, key in enumerate(zip(family, ids, instance, strict=True)):
         if key in rows:
             table.fail(i, "tag_id", "is there twice; leave one out")
-        rows[key] = _Measured(_number(table, "z_m", i), _number(table, "yaw_rad", i))
+        rows[key] = _HeightAndYaw(_number(table, "z_m", i), _number(table, "yaw_rad", i))
     return rows
 
 

@@ -11,7 +11,7 @@ from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import (
-    SuspectTag,
+    OutlierTag,
 )
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.outliers import (
@@ -43,7 +43,7 @@ class SolvedComponent(NamedTuple):
     members: Group
     graph: Graph
     solution: Solution
-    outliers: list[SuspectTag]
+    outliers: list[OutlierTag]
     refined: Refined | None = None
     messages: tuple[str, ...] = ()
     excluded_tags: frozenset[tuple[str, int]] = frozenset()
@@ -61,7 +61,7 @@ def solve_group(
 ) -> SolvedComponent:
     """Solve the members of a group together, with outlier tags split off unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
-    suspects: list[SuspectTag] = []
+    suspects: list[OutlierTag] = []
     told: list[str] = []
     gone: set[TagKey] = set()
     with stages.stage("tags that do not belong"):
@@ -103,7 +103,7 @@ def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap])
 
 def _outlier_report(
     searched: OutlierSearch, *, noise_is_fitted: bool
-) -> tuple[list[SuspectTag], set[TagKey], list[str]]:
+) -> tuple[list[OutlierTag], set[TagKey], list[str]]:
     """Return the outlier tags, the tags to leave out, and a sentence about those that are not named.
 
     Fitted noise has heavier tails than a normal distribution: there a deviating pass does not make its tag an outlier.

@@ -33,7 +33,7 @@ UNKNOWN_RANGE_OFFSET_SIGMA_M: Final = 0.1
 ENCODER_SCALE_SIGMA: Final = 0.01
 SPEED_SCALE_SIGMA: Final = 0.05
 RANGE_SCALE_SIGMA: Final = 0.02
-TOLD_SIZE_SIGMA: Final = 0.15
+DETECTOR_SCALE_SIGMA: Final = 0.15
 UNKNOWN_WHEEL_RATIO_SIGMA: Final = 0.02
 UNKNOWN_TRACK_SIGMA: Final = 0.3  # relative: wheels skid, and turning speeds may be uncalibrated
 # The log holds metres, so radius and ticks are not used, but robot.yaml requires them.
@@ -99,7 +99,7 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
-class KnownRobot:
+class RobotDefaults:
     """Parameters of the robot that the recording itself implies.
 
     Attributes:
@@ -141,7 +141,7 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
 
 
 def describe_robot(
-    recording: Path, options: ImportOptions, in_camera: bool, known: KnownRobot | None = None
+    recording: Path, options: ImportOptions, in_camera: bool, known: RobotDefaults | None = None
 ) -> tuple[Robot, str, list[str]]:
     """Return the run's robot, its robot.yaml as text for the log, and remarks for the user.
 
@@ -155,7 +155,7 @@ def describe_robot(
         OfflineError: the track width is given nowhere.
         CalibError: robot.yaml cannot be used.
     """
-    known = known or KnownRobot()
+    known = known or RobotDefaults()
     if options.robot is not None:
         data = read_robot_yaml(options.robot).model_dump()
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
@@ -178,7 +178,7 @@ def describe_robot(
     return parse_robot_yaml(text, f"{recording}: robot.yaml for the log"), text, remarks
 
 
-def _bare_robot(recording: Path, options: ImportOptions, known: KnownRobot) -> dict[str, Any]:
+def _bare_robot(recording: Path, options: ImportOptions, known: RobotDefaults) -> dict[str, Any]:
     if options.track_width_m is None and known.needs_track:
         raise OfflineError(
             f"{recording}: the distance between the wheels is unknown; give --track-width-m (roughly: map "

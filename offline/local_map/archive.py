@@ -224,7 +224,7 @@ def check_extendable(known: MapResult) -> None:
     Raises:
         OfflineError: it was made by an older program.
     """
-    if not known.kept:
+    if not known.archived_segments:
         raise OfflineError(
             "--extend: the map's map.npz does not contain its runs' measurements (an older program made it); map their "
             "logs together with the new ones"

@@ -1,12 +1,12 @@
 from .info import describe_log
-from .redetection import DetectOptions, detect_again, detectors, in_parallel
+from .redetection import DetectOptions, detect_again, detect_in_parallel, detectors
 from .salvaging import salvage
 
 __all__ = [
     "DetectOptions",
     "describe_log",
     "detect_again",
+    "detect_in_parallel",
     "detectors",
-    "in_parallel",
     "salvage",
 ]

@@ -34,7 +34,7 @@ _GAP_INTERVALS: Final = 5  # in a slow log, the limit is this many usual interva
 _WHEELS: Final = ("/wheels", "/odometry")
 _STREAMS: Final = (*_WHEELS, "/tags/detections", "/camera/image")
 _GAPS_SHOWN: Final = 5
-_PLACES_TOLD: Final = 20
+_MOST_LOSSES_LISTED: Final = 20
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
         gaps=tuple(gap for topic in _STREAMS for gap in _gaps(topic, collected.stamps_ns[topic], first_ns)),
         events=dict(sorted(collected.events.items())),
         file_bytes=_file_bytes(log),
-        losses=tuple(losses.lines(_PLACES_TOLD)),
+        losses=tuple(losses.lines(_MOST_LOSSES_LISTED)),
         lost=losses.in_words,
     )
 

@@ -63,7 +63,7 @@ class DetectReport:
 
     n_pictures: int = 0
     n_unusable: int = 0
-    n_kept: int = 0  # old detections, of pictures that were not recorded
+    n_unchanged: int = 0  # old detections, of pictures that were not recorded
     tags_before: Counter[tuple[str, int]] = field(default_factory=Counter)
     tags_after: Counter[tuple[str, int]] = field(default_factory=Counter)
     losses: LogLosses = field(default_factory=LogLosses)
@@ -72,7 +72,7 @@ class DetectReport:
         """Return lines for the user."""
         lines = [
             f"{self.n_pictures} pictures: {_describe(self.tags_before)} before, {_describe(self.tags_after)} now",
-            f"{self.n_kept} older detections kept, of pictures not recorded" if self.n_kept else "",
+            f"{self.n_unchanged} older detections kept, of pictures not recorded" if self.n_unchanged else "",
             f"{self.n_unusable} pictures cannot be used; their older detections stay" if self.n_unusable else "",
             *self.losses.lines(),
         ]
@@ -157,7 +157,7 @@ class _OldDetections:
         old.wheels.sort()
         return old
 
-    def place(self, message: TagDetections) -> None:
+    def fill_in(self, message: TagDetections) -> None:
         """Fill in the fields other than tags from the picture's old message; without one, the wheel sequence."""
         old = self.by_stamp_ns.get(message.stamp_ns)
         if old is not None:
@@ -184,7 +184,7 @@ def _detect_all(
     found: dict[int, bytes] = {}
     n_processes = options.n_processes or os.cpu_count() or 1
     with detectors(settings, n_processes) as (detect, library, described):
-        for stamp_ns, result in in_parallel(_pictures(log), detect, n_processes):
+        for stamp_ns, result in detect_in_parallel(_pictures(log), detect, n_processes):
             report.n_pictures += 1
             progress("looking for tags", report.n_pictures, old.n_pictures)
             if result.error is not None:
@@ -192,7 +192,7 @@ def _detect_all(
                 continue
             source = StampSource.STAMP_SOURCE_UNSPECIFIED
             message = detections_message(result.detections, result.size_px, stamp_ns, source, 0, library, described)
-            old.place(message)
+            old.fill_in(message)
             report.tags_after.update((each.family, each.tag_id) for each in message.detections)
             found[stamp_ns] = message.SerializeToString(deterministic=True)
     return found
@@ -232,7 +232,7 @@ def _pictures(log: Path) -> Iterator[tuple[int, Picture]]:
             yield each.publish_time_ns, each.message.data
 
 
-def in_parallel(
+def detect_in_parallel(
     pictures: Iterator[tuple[int, Picture]], detect: Detect, n_threads: int
 ) -> Iterator[tuple[int, DetectionResult]]:
     """Yield results as they are ready, with few pictures in memory."""
@@ -268,7 +268,7 @@ def _write(
             report.tags_before.update((tag.family, tag.tag_id) for tag in each.message.detections)
             if each.message.stamp_ns in found:
                 each.message.ParseFromString(found[each.message.stamp_ns])
-            elif not _stays(each.message, old, options, report):
+            elif not _should_keep(each.message, old, options, report):
                 continue
         writer.write(each.topic, each.message, at_ns, each.publish_time_ns)
         if each.topic == PICTURE_TOPIC and each.publish_time_ns not in old.by_stamp_ns:
@@ -276,19 +276,19 @@ def _write(
             if data is not None:
                 writer.write(_DETECTIONS, TagDetections.FromString(data), at_ns, each.publish_time_ns)
     if writer is not None:
-        _tell(writer, log, report)
+        _write_event(writer, log, report)
         writer.close()
 
 
-def _stays(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
+def _should_keep(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
     """Whether to keep detections that have no new ones."""
     if message.stamp_ns in old.pictures_ns:  # unusable now, so the old detection is better
         return True
-    report.n_kept += not options.drop_others
+    report.n_unchanged += not options.drop_others
     return not options.drop_others
 
 
-def _tell(writer: LogWriter, log: Path, report: DetectReport) -> None:
+def _write_event(writer: LogWriter, log: Path, report: DetectReport) -> None:
     now_ns = writer.last_log_time_ns
     text = f"tags detected again in the pictures of {log.name}: {'; '.join(report.lines())}"
     event = Event(

@@ -27,8 +27,8 @@ from groundsbot.offline.maps import (
     Component,
     ConsistencyCheck,
     MeasurementResult,
+    OutlierTag,
     ScaleBudget,
-    SuspectTag,
     inflate_covariances,
 )
 from groundsbot.offline.measurements import Measurements
@@ -40,7 +40,7 @@ class Findings:
     """Results of the components, in their order."""
 
     components: list[Component] = field(default_factory=list)
-    outliers: list[SuspectTag] = field(default_factory=list)
+    outliers: list[OutlierTag] = field(default_factory=list)
     calibration: list[CalibrationResult] = field(default_factory=list)
     measurements: list[MeasurementResult] = field(default_factory=list)
     checks: list[ConsistencyCheck] = field(default_factory=list)

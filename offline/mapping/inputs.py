@@ -55,7 +55,7 @@ def check_new(
         raise OfflineError("--calibrate: the map to extend is calibrated already; map all logs anew, or leave it out")
     if noise is not None:
         raise OfflineError("a map is extended under its own noise; leave --noise out, or map all logs anew with it")
-    names = {name for each in extending.kept for name in (each.run, each.name)}
+    names = {name for each in extending.archived_segments for name in (each.run, each.name)}
     for run in runs:
         if run.name in names:
             raise OfflineError(

@@ -130,8 +130,8 @@ def _result(maps: Sequence[LocalMap], pair: PairAlignment, alignment: Alignment)
         n_inliers=alignment.n_inliers,
         inlier_rmse_m=alignment.rmse_m,
         outliers=_ids(alignment.outliers),
-        is_sure=alignment.is_accepted,
-        rivals=tuple(AlternativeResult(each.T_a_b, _ids(each.inliers)) for each in alignment.alternatives),
+        is_accepted=alignment.is_accepted,
+        alternatives=tuple(AlternativeResult(each.T_a_b, _ids(each.inliers)) for each in alignment.alternatives),
     )
 
 

@@ -131,16 +131,16 @@ def build_map(
         robot_numbers=compare_with_files(given, calibration, choices),
         measurements=tuple(found.measurements),
         checks=tuple(found.checks),
-        metres=tuple(found.scale_budgets),
+        scale_budgets=tuple(found.scale_budgets),
         warnings=map_warnings(
             runs, maps, broken, merged, found, [each for each in joins if each.reason] if corners else None
         ),
         losses=tuple(f"{run.name}: mapped without what is lost of {run.log}: {run.lost}" for run in runs if run.lost),
-        suspects=tuple(found.outliers),
+        outliers=tuple(found.outliers),
         noise_fit=noise_fit,
         advice=tuple(found.advice),
         choices=choices,
-        kept=kept,
+        archived_segments=kept,
     )
 
 
@@ -175,8 +175,8 @@ def _measurements(
 ) -> Measurements:
     names, tags = [run.name for run in runs], {tag for segment in segments for tag in segment.tags}
     if extending is not None:
-        names = [*dict.fromkeys(each.run for each in extending.kept), *names]
-        tags |= {tag for each in extending.kept for tag in archived_tag_ids(each)}
+        names = [*dict.fromkeys(each.run for each in extending.archived_segments), *names]
+        tags |= {tag for each in extending.archived_segments for tag in archived_tag_ids(each)}
     return parse_measurements(tape, names, sorted(tags))
 
 
@@ -185,7 +185,7 @@ def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMa
     if extending is None:
         return []
     with stages.stage("the map that is extended"):
-        return [restore_local_map(each) for each in extending.kept]
+        return [restore_local_map(each) for each in extending.archived_segments]
 
 
 class _SolvedTogether(NamedTuple):

@@ -1,6 +1,6 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
 from .files import JSON_FILE, read_map, write_map
-from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, SuspectTag
+from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, OutlierTag
 from .json_document import advice_as_json, map_as_json
 from .mcap import MAP_FILE, write_mcap
 from .model import MapModel
@@ -52,11 +52,11 @@ __all__ = [
     "MapResult",
     "MeasurementResult",
     "Misfit",
+    "OutlierTag",
     "RobotNumber",
     "RunResult",
     "ScaleBudget",
     "StartToStart",
-    "SuspectTag",
     "TagPose",
     "TagResult",
     "TagScatter",

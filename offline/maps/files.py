@@ -18,7 +18,7 @@ from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
 from groundsbot.offline.maps.archive import ArchivedSegment, arrays_of, calibration_from, segment_from
-from groundsbot.offline.maps.fit_results import SuspectTag
+from groundsbot.offline.maps.fit_results import OutlierTag
 from groundsbot.offline.maps.json_document import (
     FORMAT_VERSION,
     advice_from,
@@ -44,7 +44,7 @@ JSON_FILE: Final = "map.json"
 ARRAYS_FILE: Final = "map.npz"
 TAGS_FILE: Final = "tags.csv"
 # Errors of reading a damaged map.json or map.npz.
-_DAMAGE: Final = (
+_DAMAGE_ERRORS: Final = (
     AttributeError,
     BadZipFile,
     CalibError,
@@ -106,16 +106,16 @@ def read_map(folder: Path) -> MapResult:
             robot_numbers=tuple(RobotNumber(**entry) for entry in data.get("robot_numbers", ())),
             measurements=tuple(measurement_from(entry) for entry in data["measurements"]),
             checks=tuple(check_from(entry) for entry in data["checks"]),
-            metres=tuple(ScaleBudget(**entry) for entry in data["metres"]),
+            scale_budgets=tuple(ScaleBudget(**entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
             losses=tuple(data.get("losses", ())),
-            suspects=tuple(SuspectTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
+            outliers=tuple(OutlierTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
             advice=tuple(advice_from(entry) for entry in data.get("advice", ())),
-            kept=kept,
+            archived_segments=kept,
         )
     except OSError as error:
         raise OfflineError(f"{error.filename}: cannot be read ({error.strerror}); make the map again") from error
-    except _DAMAGE as error:
+    except _DAMAGE_ERRORS as error:
         raise OfflineError(
             f"{folder}: the map's files are damaged or incomplete ({error}); make the map again"
         ) from error
@@ -141,7 +141,7 @@ def _arrays(result: MapResult) -> dict[str, Any]:
             arrays |= {f"{key}edges_{name}": value for name, value in vars(component.edges).items()}
         if component.calibration is not None:
             arrays |= arrays_of(component.calibration, f"{key}calibration_")
-    for index, kept in enumerate(result.kept):
+    for index, kept in enumerate(result.archived_segments):
         arrays |= arrays_of(kept, f"run{index}_")
     return arrays
 

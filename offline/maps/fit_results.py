@@ -24,8 +24,8 @@ class AlignmentResult:
     n_inliers: int
     inlier_rmse_m: float
     outliers: tuple[tuple[str, int], ...]  # (family, tag id) of shared tags that do not fit
-    is_sure: bool = True  # else it is not used: chance or an alternative explains the tags almost as well
-    rivals: tuple[AlternativeResult, ...] = ()
+    is_accepted: bool = True  # else it is not used: chance or an alternative explains the tags almost as well
+    alternatives: tuple[AlternativeResult, ...] = ()
     is_weak: bool = False  # rests on one tag: if that was moved in between, nothing shows it
     # (3, 3) of T_from_to as x, y, theta in the first run's frame; None if the transform is only an initial value.
     covariance: FloatArray | None = None
@@ -54,7 +54,7 @@ class Misfit:
 
 
 @dataclass(frozen=True)
-class SuspectTag:
+class OutlierTag:
     """Tag with outlier observations.
 
     Attributes:

@@ -16,7 +16,7 @@ from groundsbot.offline.maps.fit_results import (
     AlternativeResult,
     MeasurementResult,
     Misfit,
-    SuspectTag,
+    OutlierTag,
 )
 from groundsbot.offline.maps.parameter_results import ConsistencyCheck, FittedNoise, FittedParameter
 from groundsbot.offline.maps.result import (
@@ -51,23 +51,23 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
             {
                 "a": pair.a,
                 "b": pair.b,
-                "vector_m": _plain(pair.vector_m),
-                "distance_m": _plain(pair.distance_m),
-                "sigma_m": _plain(pair.sigma_m),
-                "covariance": _plain(pair.covariance),
+                "vector_m": _json_value(pair.vector_m),
+                "distance_m": _json_value(pair.distance_m),
+                "sigma_m": _json_value(pair.sigma_m),
+                "covariance": _json_value(pair.covariance),
             }
             for component in result.components
             for pair in component.start_to_start
         ],
         "noise": result.noise.model_dump() | _floor_json(result.components[0].floor if result.components else None),
-        "noise_fit": None if result.noise_fit is None else _plain(asdict(result.noise_fit)),
-        "calibration": [_plain(vars(entry)) for entry in result.calibration],
-        "choices": [_plain(vars(entry)) for entry in result.choices],
-        "robot_numbers": [_plain(vars(entry)) for entry in result.robot_numbers],
-        "measurements": [_plain(vars(entry)) for entry in result.measurements],
-        "checks": [_plain({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
-        "metres": [_plain(vars(entry)) for entry in result.metres],
-        "suspect_tags": [_suspect_json(suspect) for suspect in result.suspects],
+        "noise_fit": None if result.noise_fit is None else _json_value(asdict(result.noise_fit)),
+        "calibration": [_json_value(vars(entry)) for entry in result.calibration],
+        "choices": [_json_value(vars(entry)) for entry in result.choices],
+        "robot_numbers": [_json_value(vars(entry)) for entry in result.robot_numbers],
+        "measurements": [_json_value(vars(entry)) for entry in result.measurements],
+        "checks": [_json_value({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
+        "metres": [_json_value(vars(entry)) for entry in result.scale_budgets],
+        "suspect_tags": [_outlier_json(suspect) for suspect in result.outliers],
         "advice": [advice_as_json(advice) for advice in result.advice],
         "warnings": list(result.warnings),
         "losses": list(result.losses),
@@ -80,12 +80,12 @@ def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]
         "runs": [run.name for run in component.runs],
         "tags": [{"family": t.family, "tag_id": t.tag_id, "instance": t.instance} for t in component.tags],
         "model": component.model,
-        "cost": _plain(component.cost),
+        "cost": _json_value(component.cost),
         "n_residuals": component.n_residuals,
         "floor": _floor_json(component.floor) or None,
-        "heading_sigma_rad": None if shape is None else _plain(shape.heading_sigma_rad),
-        "sigma_factor": _plain(component.sigma_factor),
-        "misfit": None if component.misfit is None else _plain(asdict(component.misfit)),
+        "heading_sigma_rad": None if shape is None else _json_value(shape.heading_sigma_rad),
+        "sigma_factor": _json_value(component.sigma_factor),
+        "misfit": None if component.misfit is None else _json_value(asdict(component.misfit)),
     }
 
 
@@ -114,14 +114,14 @@ def _run_json(run: RunResult, component: int) -> dict[str, Any]:
         "run": run.name,
         "log": str(run.log),
         "robot": run.robot_id,
-        "T_map_start": _plain(run.T_map_start),
-        "covariance": _plain(run.covariance),
+        "T_map_start": _json_value(run.T_map_start),
+        "covariance": _json_value(run.covariance),
         "n_keyframes": run.n_keyframes,
-        "distance_m": _plain(run.distance_m),
+        "distance_m": _json_value(run.distance_m),
         "run_id": run.run_id,
         "stretch_of": None if run.run == run.name else run.run,
         "component": component,
-        "T_base_camera": None if run.T_base_camera is None else _plain(run.T_base_camera),
+        "T_base_camera": None if run.T_base_camera is None else _json_value(run.T_base_camera),
     }
 
 
@@ -130,13 +130,13 @@ def _tag_json(tag: TagResult, component: int, shape_sigma_m: float | None) -> di
         "family": tag.family,
         "tag_id": tag.tag_id,
         "instance": tag.instance,
-        "size_m": _plain(tag.size_m),
-        "position_m": _plain(tag.position_m if tag.pose is None else np.append(tag.position_m, tag.pose.height_m)),
-        "quaternion_xyzw": None if tag.pose is None else _plain(tag.pose.quaternion_xyzw),
-        "covariance": _plain(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
-        "pose_covariance": None if tag.pose is None else _plain(tag.pose.covariance),
-        "shape_sigma_m": _plain(shape_sigma_m),
-        "sigma_factor": _plain(tag.sigma_factor),
+        "size_m": _json_value(tag.size_m),
+        "position_m": _json_value(tag.position_m if tag.pose is None else np.append(tag.position_m, tag.pose.height_m)),
+        "quaternion_xyzw": None if tag.pose is None else _json_value(tag.pose.quaternion_xyzw),
+        "covariance": _json_value(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
+        "pose_covariance": None if tag.pose is None else _json_value(tag.pose.covariance),
+        "shape_sigma_m": _json_value(shape_sigma_m),
+        "sigma_factor": _json_value(tag.sigma_factor),
         "n_observations": tag.n_observations,
         "runs": list(tag.runs),
         "component": component,
@@ -147,22 +147,26 @@ def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
     return {
         "from": alignment.from_run,
         "to": alignment.to_run,
-        "transform": _plain(alignment.T_from_to),
+        "transform": _json_value(alignment.T_from_to),
         "n_shared": alignment.n_shared,
         "n_inliers": alignment.n_inliers,
-        "inlier_rmse_m": _plain(alignment.inlier_rmse_m),
+        "inlier_rmse_m": _json_value(alignment.inlier_rmse_m),
         "outliers": _tag_names_json(alignment.outliers),
-        "is_sure": alignment.is_sure,
+        "is_sure": alignment.is_accepted,
         "is_weak": alignment.is_weak,
-        "covariance": None if alignment.covariance is None else _plain(alignment.covariance),
+        "covariance": None if alignment.covariance is None else _json_value(alignment.covariance),
         "rivals": [
-            {"transform": _plain(rival.T_from_to), "n_inliers": len(rival.tags), "tags": _tag_names_json(rival.tags)}
-            for rival in alignment.rivals
+            {
+                "transform": _json_value(rival.T_from_to),
+                "n_inliers": len(rival.tags),
+                "tags": _tag_names_json(rival.tags),
+            }
+            for rival in alignment.alternatives
         ],
     }
 
 
-def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
+def _outlier_json(suspect: OutlierTag) -> dict[str, Any]:
     entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence")}
     other = {} if suspect.swapped_with is None else {"swapped_with": suspect.swapped_with}
     return entry | {"runs": list(suspect.runs)} | other
@@ -170,7 +174,7 @@ def _suspect_json(suspect: SuspectTag) -> dict[str, Any]:
 
 def advice_as_json(advice: AdviceResult) -> dict[str, Any]:
     """Return an entry of `advice` in map.json."""
-    entry = {name: _plain(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
+    entry = {name: _json_value(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
     return entry | {"tags": [_tag_key_json(tag) for tag in advice.tags], "worst_tag": _tag_key_json(advice.worst_tag)}
 
 
@@ -182,14 +186,14 @@ def _tag_names_json(tags: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
     return [{"family": family, "tag_id": tag_id} for family, tag_id in tags]
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any depth
+def _json_value(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to any depth
     """Return numbers, texts, nested lists and mappings for JSON, with null for NaN."""
     if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
+        return {name: _json_value(entry) for name, entry in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
+        return [_json_value(entry) for entry in value]
     if isinstance(value, np.ndarray):
-        return [_plain(entry) for entry in value] if value.ndim else _plain(float(value))
+        return [_json_value(entry) for entry in value] if value.ndim else _json_value(float(value))
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value
@@ -228,8 +232,8 @@ def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
         n_inliers=entry["n_inliers"],
         inlier_rmse_m=number_from(entry["inlier_rmse_m"]),
         outliers=_tag_names(entry["outliers"]),
-        is_sure=entry["is_sure"],
-        rivals=tuple(
+        is_accepted=entry["is_sure"],
+        alternatives=tuple(
             AlternativeResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
         ),
         is_weak=entry.get("is_weak", False),

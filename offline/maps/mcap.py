@@ -40,7 +40,7 @@ TAGS_TOPIC: Final = "/map/tags"
 RUNS_TOPIC: Final = "/map/runs"
 
 _TAG_DIAMETER_M: Final = 0.1
-_FLAT_M: Final = 0.002
+_ELLIPSE_THICKNESS_M: Final = 0.002
 _LINE_PX: Final = 2.0
 _TEXT_M: Final = 0.2
 _TAG_COLOR: Final = Color(r=0.9, g=0.6, b=0.0, a=1.0)
@@ -207,7 +207,7 @@ def _ellipse(tag: TagResult) -> CylinderPrimitive:
     x, y = tag.position_m.tolist()
     return CylinderPrimitive(
         pose=_pose(x, y, float(np.arctan2(axes[1, 1], axes[0, 1]))),
-        size=Vector3(x=major_m, y=minor_m, z=_FLAT_M),
+        size=Vector3(x=major_m, y=minor_m, z=_ELLIPSE_THICKNESS_M),
         bottom_scale=1.0,
         top_scale=1.0,
         color=_ELLIPSE_COLOR,

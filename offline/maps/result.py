@@ -11,7 +11,7 @@ from pathlib import Path
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.maps.archive import ArchivedCalibration, ArchivedSegment
-from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, SuspectTag
+from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, OutlierTag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
     CalibrationChoice,
@@ -215,15 +215,17 @@ class MapResult:
     calibration: tuple[CalibrationResult, ...] = ()
     measurements: tuple[MeasurementResult, ...] = ()
     checks: tuple[ConsistencyCheck, ...] = ()
-    metres: tuple[ScaleBudget, ...] = ()
+    scale_budgets: tuple[ScaleBudget, ...] = ()
     warnings: tuple[str, ...] = field(default=())
     losses: tuple[str, ...] = ()  # unreadable parts of the logs, a sentence each
-    suspects: tuple[SuspectTag, ...] = ()
+    outliers: tuple[OutlierTag, ...] = ()
     noise_fit: FittedNoise | None = None  # None: the noise was given
     advice: tuple[AdviceResult, ...] = ()  # of each component in turn, the best first
     choices: tuple[CalibrationChoice, ...] = ()  # of self-calibration; none if it was off
     robot_numbers: tuple[RobotNumber, ...] = ()  # estimates of each number of robots' files
-    kept: tuple[ArchivedSegment, ...] = ()  # each run's measurements, to solve them again jointly with another run's
+    archived_segments: tuple[
+        ArchivedSegment, ...
+    ] = ()  # each run's measurements, to solve them again jointly with another run's
 
     @property
     def runs(self) -> tuple[RunResult, ...]:

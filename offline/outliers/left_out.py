@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.maps import SuspectTag
+from groundsbot.offline.maps import OutlierTag
 from groundsbot.offline.measurements import FEW_READINGS, TagKey
 from groundsbot.offline.outliers.evidence import to_other_tags
 from groundsbot.offline.outliers.false_detections import MOST_READINGS
@@ -35,7 +35,7 @@ from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
-def find_false_detections(graph: Graph, suspects: Sequence[SuspectTag]) -> set[TagKey]:
+def find_false_detections(graph: Graph, suspects: Sequence[OutlierTag]) -> set[TagKey]:
     """Tags of the graph that are false detections and nothing else."""
     named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
     few = graph.n_readings() <= MOST_READINGS

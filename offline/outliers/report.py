@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, plural
-from groundsbot.offline.maps import SuspectTag
+from groundsbot.offline.maps import OutlierTag
 from groundsbot.offline.outliers.false_detections import MOST_READINGS, Views, chances, views_of
 from groundsbot.offline.outliers.kinds import (
     INCONSISTENT,
@@ -26,7 +26,7 @@ from groundsbot.offline.outliers.search import FALSE_ALARM
 _MOST_NAMED: Final = 4
 
 
-def outlier_report(searched: OutlierSearch) -> list[SuspectTag]:
+def outlier_report(searched: OutlierSearch) -> list[OutlierTag]:
     """All suspects of a component, in order of their ids."""
     return _Report(searched).suspects()
 
@@ -39,9 +39,9 @@ class _Report:
         self._views: Views = views_of(searched.graph, searched.solution.state, searched.tracks)
         self._chances: FloatArray = chances(searched.tracks, searched.place, self._views)
 
-    def suspects(self) -> list[SuspectTag]:
+    def suspects(self) -> list[OutlierTag]:
         """Each case once; then ids that nothing supports."""
-        found: dict[int, SuspectTag] = {}
+        found: dict[int, OutlierTag] = {}
         for i, j in swapped_pairs(self._cases, self._searched.evidence, self._searched.places):
             found[i], found[j] = self._swap(i, j), self._swap(j, i)
         wrong = wrong_runs(self._cases, self._searched.tracks)
@@ -57,7 +57,7 @@ class _Report:
                 found[i] = self._displacement(case)
         return sorted([*found.values(), *self._unsupported_tags()], key=lambda each: (each.family, each.tag_id))
 
-    def _displacement(self, case: SeveralPlaces) -> SuspectTag:
+    def _displacement(self, case: SeveralPlaces) -> OutlierTag:
         kind = case.kind()
         apart_m, sigmas = self._shift(case)
         if kind == MOVED:
@@ -73,7 +73,7 @@ class _Report:
         words = f"two tags with one id, {_metres(apart_m)} ({sigmas:.0f} sigma) apart: {self._where(case)}"
         return self._outlier(case, kind, list(case.seen), words)
 
-    def _swap(self, i: int, j: int) -> SuspectTag:
+    def _swap(self, i: int, j: int) -> OutlierTag:
         case, other = self._cases[i], self._cases[j]
         apart_m, sigmas = self._shift(case)
         first = {c for c, way in case.seen.items() if way == (0,)}
@@ -83,7 +83,7 @@ class _Report:
         )
         return self._outlier(case, SWAPPED, [c for c in case.seen if c not in first], words, other.tag.tag_id)
 
-    def _inconsistent(self, case: SeveralPlaces, run: int, n_wrong: int) -> SuspectTag:
+    def _inconsistent(self, case: SeveralPlaces, run: int, n_wrong: int) -> OutlierTag:
         apart_m, sigmas = self._shift(case)
         words = (
             f"{self._names[run]} has this tag and {n_wrong - 1} more, most of those it shares, elsewhere than all "
@@ -105,7 +105,7 @@ class _Report:
                 return k
         return None
 
-    def _false_detection(self, case: SeveralPlaces, k: int) -> SuspectTag:
+    def _false_detection(self, case: SeveralPlaces, k: int) -> OutlierTag:
         stand = case.stands[k]
         nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
         rest = sum(each.n_readings for each in case.stands) - stand.n_readings
@@ -115,7 +115,7 @@ class _Report:
         )
         return self._outlier(case, PHANTOM, list(stand.segments), words)
 
-    def _unsupported_tags(self) -> list[SuspectTag]:
+    def _unsupported_tags(self) -> list[OutlierTag]:
         """Ids read once or a few times from where they should have been read more often."""
         searched = self._searched
         sightings = searched.tracks
@@ -130,14 +130,14 @@ class _Report:
                 f"{int(self._views.near[s])} keyframes (by chance once in {1.0 / max(self._chances[s], 1e-9):.0f} "
                 "times): a false detection"
             )
-            found.append(SuspectTag(tag.family, tag.tag_id, PHANTOM, (run,), words))
+            found.append(OutlierTag(tag.family, tag.tag_id, PHANTOM, (run,), words))
         return found
 
     def _outlier(
         self, case: SeveralPlaces, kind: str, runs: Sequence[int], words: str, swapped_with: int | None = None
-    ) -> SuspectTag:
+    ) -> OutlierTag:
         names = tuple(self._names[c] for c in sorted(runs))
-        return SuspectTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with)
+        return OutlierTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with)
 
     def _shift(self, case: SeveralPlaces, first: int = 0, second: int = 1) -> tuple[float, float]:
         return shift(case, self._searched.evidence, self._searched.places, first, second)

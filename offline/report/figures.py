@@ -116,7 +116,7 @@ def _component(
             for tag, readings in zip(tags, tag_readings(solved), strict=True)
         ],
         "is_merged": len(runs) > 1,
-        "before": _before(solved, workings, colours, several_families=several),
+        "before": _unmerged_layers(solved, workings, colours, several_families=several),
         "advice": [
             {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
             | dict(zip("xy", _round_points(np.array(each["way_m"])), strict=True))
@@ -145,7 +145,7 @@ def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_fam
     }
 
 
-def _before(
+def _unmerged_layers(
     solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str], *, several_families: bool
 ) -> list[dict[str, Any]]:
     """Return each local map as the alignments place it, with its own tags."""

@@ -26,7 +26,7 @@ def alignments(document: dict[str, Any]) -> ReportTable:
                 f"{x_m:.2f}, {y_m:.2f}",
                 f"{degrees(theta_rad):.1f}",
                 ", ".join(str(tag["tag_id"]) for tag in each["outliers"]),
-                _sureness(each),
+                _acceptance(each),
             )
         )
     columns = ("run", "joined with", "shared tags that fit", "RMS (m)", "x, y (m)", "yaw (deg)", "left out", "accepted")
@@ -34,7 +34,7 @@ def alignments(document: dict[str, Any]) -> ReportTable:
     return table_of("alignments", "How the runs fit together", note, columns, rows)
 
 
-def _sureness(alignment: dict[str, Any]) -> str:
+def _acceptance(alignment: dict[str, Any]) -> str:
     if not alignment["is_sure"]:
         return f"no; {len(alignment['rivals'])} alternatives"
     if not alignment["is_weak"]:
@@ -43,7 +43,7 @@ def _sureness(alignment: dict[str, Any]) -> str:
     return f"weak: one tag; sigma {x_m:.2f} m, {y_m:.2f} m, {degrees(theta_rad):.2f} deg"
 
 
-def holding(document: dict[str, Any]) -> ReportTable:
+def linking_tag_table(document: dict[str, Any]) -> ReportTable:
     """Return the table of tags that several runs observed."""
     several = has_several_families(document)
     rows = []

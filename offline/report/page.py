@@ -42,7 +42,7 @@ def page(
             _text(listed, "li", warning)
     _add_tables(main, by_key, _ABOVE)
     _add_map(main, figures["components"])
-    _add_before(main, figures["components"])
+    _add_unmerged_maps(main, figures["components"])
     _add_tables(main, by_key, _MIDDLE)
     _add_searches(main, figures["searches"])
     _add_timelines(main, figures["timelines"], figures["n_timelines"])
@@ -81,7 +81,7 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
         _figure(section, "map", index, caption)
 
 
-def _add_before(main: Element, components: Sequence[dict[str, Any]]) -> None:
+def _add_unmerged_maps(main: Element, components: Sequence[dict[str, Any]]) -> None:
     if not any(component["is_merged"] for component in components):
         return
     section = _section(

@@ -29,7 +29,7 @@ _SHARED: Final = "#222222"
 _DPI: Final = 100
 _WIDTH_IN: Final = 16.0
 _HEIGHT_LIMITS_IN: Final = (7.0, 16.0)
-_FURNITURE_IN: Final = 1.6  # title, axis labels and legend
+_DECORATION_IN: Final = 1.6  # title, axis labels and legend
 _MARGIN: Final = 0.04  # relative to the extent, so that ids near the rim fit in
 _MOST_PANELS: Final = 6
 _VISIBLE_SHARE: Final = 0.006  # of the extent: ellipses are enlarged if a typical half axis is smaller
@@ -37,7 +37,7 @@ _FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
 _LABEL_PT: Final = 9.0
 _START_SIZE: Final = 17.0
-_DART: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)], closed=True)
+_ARROWHEAD: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)], closed=True)
 
 
 def write_picture(result: MapResult, path: Path) -> None:
@@ -78,7 +78,7 @@ def _height_in(components: Sequence[Component], columns: int, rows: int) -> floa
     """Return the height at which the widest panel fills its column."""
     panel_in = (_WIDTH_IN - 1.0) / columns
     ratio = max((high / wide for wide, high in map(_extent_m, components)), default=0.5)
-    return float(np.clip(rows * (panel_in * ratio + 0.6) + _FURNITURE_IN, *_HEIGHT_LIMITS_IN))
+    return float(np.clip(rows * (panel_in * ratio + 0.6) + _DECORATION_IN, *_HEIGHT_LIMITS_IN))
 
 
 def _points_m(component: Component) -> FloatArray:
@@ -144,7 +144,7 @@ def _draw_component(axes: Axes, component: Component, styles: dict[str, tuple[st
 def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
     """Draw an arrowhead in the direction of the start; an equilateral triangle would not show it."""
     x_m, y_m, theta_rad = run.T_map_start
-    marker = MarkerStyle(_DART, transform=Affine2D().rotate(theta_rad))
+    marker = MarkerStyle(_ARROWHEAD, transform=Affine2D().rotate(theta_rad))
     (start,) = axes.plot([x_m], [y_m], marker=marker, color=colour, markersize=_START_SIZE, zorder=6, linestyle="")
     start.set_markeredgecolor("white")
     start.set_markeredgewidth(1.2)
@@ -189,7 +189,7 @@ def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fa
         segments = f", {len(parts)} segments" if len(parts) > 1 else ""
         label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{segments}"
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
-    handles.append(_marker_handle(_DART, 11.0, "#777777", "start of a run, pointing ahead"))
+    handles.append(_marker_handle(_ARROWHEAD, 11.0, "#777777", "start of a run, pointing ahead"))
     shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"
     handles.append(_marker_handle("s", 4.0, "#777777", f"tag observed by one run (its colour), with {shown}"))
     if any(len(tag.runs) > 1 for component in result.components for tag in component.tags):

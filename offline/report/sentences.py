@@ -23,9 +23,9 @@ def sentences(document: dict[str, Any]) -> list[str]:
         contradiction_sentence(document),
         _joining_sentence(document),
         headline(document),
-        _scale(document),
-        *_mistrust(document),
-        *_next(document),
+        _scale_sentence(document),
+        *_doubt_sentences(document),
+        *_advice_sentences(document),
     ]
     return [sentence for sentence in told if sentence]
 
@@ -40,7 +40,7 @@ def contradiction_sentence(document: dict[str, Any]) -> str:
     where = f"In component {worst + 1} drives" if len(components) > 1 else "These drives"
     if len(components[worst]["runs"]) == 1:
         where = f"The drive {misfit['run']}"
-    what, look = _MISFITS[misfit["kind"]]
+    what, look = _MISFIT_PHRASES[misfit["kind"]]
     times, run = components[worst]["sigma_factor"], misfit["run"]
     return (
         f"{where} {'contradicts' if where.startswith('The ') else 'contradict'} {what} by more than chance explains "
@@ -49,7 +49,7 @@ def contradiction_sentence(document: dict[str, Any]) -> str:
     )
 
 
-_MISFITS: Final = {
+_MISFIT_PHRASES: Final = {
     "joins": ("each other", "suspect tags, the comparison of wheels with tags and calibration in the report"),
     "windows": ("the model", "suspect tags and the drive's residuals in the report"),
 }
@@ -112,44 +112,46 @@ def headline(document: dict[str, Any]) -> str:
     known = [(sigma, tag) for tag in tags if (sigma := largest_sigma_m(tag["covariance"])) is not None]
     if not known:
         return "It has no tags, so nothing corrects the wheels' odometry."
-    told = _shape(document, tags, float(np.median([sigma for sigma, _ in known])))
+    told = _accuracy_clause(document, tags, float(np.median([sigma for sigma, _ in known])))
     pairs = document["start_to_start"]
     if len(pairs) == 1:
         pair = pairs[0]
         told += (
             f"; from the start of {pair['a']} to that of {pair['b']} it is {pair['distance_m']:.2f} m, sigma "
-            f"{_metres(pair['sigma_m'])}"
+            f"{_length_text(pair['sigma_m'])}"
         )
     return told + "."
 
 
-def _shape(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_start_m: float) -> str:
+def _accuracy_clause(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_start_m: float) -> str:
     """Return how accurate tags are relative to each other, and relative to the first start."""
     component = document["components"][0]
     where, the_tags = ("In the largest component ", "tags") if len(document["components"]) > 1 else ("", "Tags")
     start = f"the start of {component['frame_run']}"
     if component["heading_sigma_rad"] is None:
-        return f"{where}{the_tags} are known to {_metres(seen_from_start_m)} (median, one sigma), relative to {start}"
+        return (
+            f"{where}{the_tags} are known to {_length_text(seen_from_start_m)} (median, one sigma), relative to {start}"
+        )
     median_m = float(np.median([tag["shape_sigma_m"] for tag in tags]))
     worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
     return (
-        f"{where}{the_tags} are known to {_metres(median_m)} relative to each other (median, one sigma; the worst, tag "
-        f"{worst['tag_id']}{worst['instance']}, to {_metres(worst['shape_sigma_m'])}); relative to {start}, whose "
-        f"heading is uncertain by {degrees(component['heading_sigma_rad']):.1f} degrees, to "
-        f"{_metres(seen_from_start_m)}"
+        f"{where}{the_tags} are known to {_length_text(median_m)} relative to each other (median, one sigma; "
+        f"the worst, tag {worst['tag_id']}{worst['instance']}, to {_length_text(worst['shape_sigma_m'])}); "
+        f"relative to {start}, whose heading is uncertain by {degrees(component['heading_sigma_rad']):.1f} degrees, to "
+        f"{_length_text(seen_from_start_m)}"
     )
 
 
-def _scale(document: dict[str, Any]) -> str:
+def _scale_sentence(document: dict[str, Any]) -> str:
     if not document["metres"] or document["metres"][0]["sigma"] is None:
         return ""
     metre = document["metres"][0]
     kind, share = max(metre["shares"].items(), key=lambda each: each[1], default=("", 0.0))
-    told = f"The scale is known to {_percent(metre['sigma'])}"
-    return f"{told}, {100.0 * share:.0f} % of that from {_HOLDS[kind]}." if kind else f"{told}."
+    told = f"The scale is known to {_percent_text(metre['sigma'])}"
+    return f"{told}, {100.0 * share:.0f} % of that from {_SCALE_SOURCES[kind]}." if kind else f"{told}."
 
 
-_HOLDS: Final = {
+_SCALE_SOURCES: Final = {
     "wheels": "the wheels' radii",
     "track": "the distance between the wheels",
     "tags": "the size of the tags",
@@ -159,7 +161,7 @@ _HOLDS: Final = {
 }
 
 
-def _mistrust(document: dict[str, Any]) -> list[str]:
+def _doubt_sentences(document: dict[str, Any]) -> list[str]:
     doubts = []
     contradicting = [check for check in document["checks"] if check_contradicts(check)]
     if contradicting:
@@ -167,11 +169,11 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
         about = "a full turn" if check["name"] == "turn" else "the scale"
         doubts.append(
             f"wheels and tags of {check['robot_id']} contradict each other about {about} by "
-            f"{_percent(abs(check['value']))} ({check['sigmas']:.0f} sigma)"
+            f"{_percent_text(abs(check['value']))} ({check['sigmas']:.0f} sigma)"
         )
     taped = [each for each in document["measurements"] if each["contradicts"]]
     if taped:
-        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do(taped)} not fit the rest")
+        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do_or_does(taped)} not fit the rest")
     suspects = document["suspect_tags"]
     if suspects:
         names = enumerate_names([f"{each['tag_id']} ({each['kind']})" for each in suspects])
@@ -179,7 +181,7 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
     unsure = [each for each in document["alignments"] if not each["is_sure"]]
     if unsure:
         names = enumerate_names([f"{each['from']} with {each['to']}" for each in unsure])
-        doubts.append(f"{plural(len(unsure), 'alignment')} {_were(unsure)} uncertain and not used: {names}")
+        doubts.append(f"{plural(len(unsure), 'alignment')} {_was_or_were(unsure)} uncertain and not used: {names}")
     weak = [each for each in document["alignments"] if each["is_sure"] and each["is_weak"]]
     if weak:
         names = enumerate_names([f"{each['from']} with {each['to']}" for each in weak])
@@ -187,7 +189,9 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
     few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_READINGS]
     if few:
         names = enumerate_names([str(tag["tag_id"]) for tag in few])
-        doubts.append(f"{plural(len(few), 'tag')} {_were(few)} observed fewer than {FEW_READINGS} times: {names}")
+        doubts.append(
+            f"{plural(len(few), 'tag')} {_was_or_were(few)} observed fewer than {FEW_READINGS} times: {names}"
+        )
     told = [f"Check this: {'; '.join(doubts)}."] if doubts else []
     n_warnings = len(document["warnings"])
     if n_warnings:
@@ -197,7 +201,7 @@ def _mistrust(document: dict[str, Any]) -> list[str]:
     return told or ["Nothing in it contradicts anything else by more than chance allows."]
 
 
-def _next(document: dict[str, Any]) -> list[str]:
+def _advice_sentences(document: dict[str, Any]) -> list[str]:
     """Return what to do next."""
     if len(document["components"]) > 1:
         return ["To merge the components, drive one more run past two or more tags of each of them."]
@@ -207,7 +211,7 @@ def _next(document: dict[str, Any]) -> list[str]:
 
 def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     """Return what to do and its effect on the worst tag, from an entry of `advice` in map.json."""
-    now, then = _metres(advice["sigma_m"]), _metres(advice["sigma_then_m"])
+    now, then = _length_text(advice["sigma_m"]), _length_text(advice["sigma_then_m"])
     worst = f"the largest sigma, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
         return f"One more drive or tag would hardly help: {worst}, would stay at {now}."
@@ -227,7 +231,7 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
 
 def would_help(advice: dict[str, Any]) -> bool:
     """Whether the effect is visible in the rounded numbers."""
-    return _metres(advice["sigma_m"]) != _metres(advice["sigma_then_m"])
+    return _length_text(advice["sigma_m"]) != _length_text(advice["sigma_then_m"])
 
 
 def has_several_families(document: dict[str, Any]) -> bool:
@@ -241,22 +245,22 @@ def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
     return f"{tag['family']}:{label}" if several_families else label
 
 
-def _do(entries: Sequence[object]) -> str:
+def _do_or_does(entries: Sequence[object]) -> str:
     return "does" if len(entries) == 1 else "do"
 
 
-def _were(entries: Sequence[object]) -> str:
+def _was_or_were(entries: Sequence[object]) -> str:
     return "was" if len(entries) == 1 else "were"
 
 
 def _tags_do(entries: Sequence[object]) -> str:
-    return f"{plural(len(entries), 'tag')} {_do(entries)}"
+    return f"{plural(len(entries), 'tag')} {_do_or_does(entries)}"
 
 
-def _metres(value_m: float) -> str:
+def _length_text(value_m: float) -> str:
     """Return a length in centimetres, above 9.5 cm in metres."""
     return f"{value_m:.2f} m" if value_m >= 0.095 else f"{100.0 * value_m:.1f} cm"
 
 
-def _percent(share: float) -> str:
+def _percent_text(share: float) -> str:
     return f"{100.0 * share:.2f} %"

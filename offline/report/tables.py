@@ -4,7 +4,7 @@ from math import degrees
 from typing import Any
 
 from groundsbot.offline.report.cells import ReportTable, number, table_of
-from groundsbot.offline.report.join_tables import alignments, holding, start_to_start
+from groundsbot.offline.report.join_tables import alignments, linking_tag_table, start_to_start
 from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
 from groundsbot.offline.report.sentences import advice_sentence, has_several_families, largest_sigma_m
 
@@ -15,7 +15,7 @@ def tables(document: dict[str, Any]) -> list[ReportTable]:
         _outliers(document),
         _advice(document),
         alignments(document),
-        holding(document),
+        linking_tag_table(document),
         start_to_start(document),
         robots(document),
         checks(document),

@@ -46,8 +46,8 @@ def _result(components: Sequence[SolvedComponent], join: TagJoin) -> AlignmentRe
         n_inliers=len(tags),
         inlier_rmse_m=float(np.sqrt((apart_m**2).sum(axis=1).mean())),
         outliers=(),
-        is_sure=not join.reason,
-        rivals=tuple(AlternativeResult(T, tags) for T in join.alternatives),
+        is_accepted=not join.reason,
+        alternatives=tuple(AlternativeResult(T, tags) for T in join.alternatives),
         is_weak=join.is_weak,
         covariance=covariance,
     )

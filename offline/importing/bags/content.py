@@ -40,9 +40,9 @@ class BagContent:
     frames: FixedFrames
     odometry: list[tuple[int, Any]] = field(default_factory=list)
     pictures: list[BagPicture] = field(default_factory=list)
-    sent_transforms: list[tuple[int, Any]] = field(default_factory=list)
+    tag_transforms: list[tuple[int, Any]] = field(default_factory=list)
     camera_infos: dict[str, Any] = field(default_factory=dict)
-    left_out: Counter[str] = field(default_factory=Counter)
+    n_excluded: Counter[str] = field(default_factory=Counter)
     remarks: list[str] = field(default_factory=list)
 
     @property
@@ -75,7 +75,7 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
         if each.msgtype in TRANSFORMS:
             content.frames.add(each.content)
             if chosen.tags.msgtype == APRILTAG_MSGS:
-                content.sent_transforms += [(_header_ns(t.header), t) for t in each.content.transforms]
+                content.tag_transforms += [(_header_ns(t.header), t) for t in each.content.transforms]
         elif each.msgtype == CAMERA_INFO:
             content.camera_infos.setdefault(each.topic, each.content)
         elif (stamp_ns := clock.stamp_ns(each)) is None:
@@ -83,15 +83,15 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
         elif each.msgtype in TAGS:
             look, left_out = read_picture(each.msgtype, each.content, stamp_ns, family)
             content.pictures.append(look)
-            content.left_out += left_out
+            content.n_excluded += left_out
         else:
             content.odometry.append((stamp_ns, each.content))
     clock.check([chosen.odometry] if chosen.has_pictures else [chosen.odometry, chosen.tags])
-    content.odometry, n_odometry = _each_time_once(content.odometry, _odometry_keys(content.odometry))
-    content.pictures, n_looks = _each_time_once(content.pictures, [(look.stamp_ns,) for look in content.pictures])
+    content.odometry, n_odometry = _sort_and_deduplicate(content.odometry, _odometry_keys(content.odometry))
+    content.pictures, n_looks = _sort_and_deduplicate(content.pictures, [(look.stamp_ns,) for look in content.pictures])
     if not chosen.has_pictures and not any(look.tags for look in content.pictures):
         told = "; ".join(
-            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *exclusion_lines(content.left_out)]
+            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *exclusion_lines(content.n_excluded)]
         )
         raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
     content.remarks = clock.remarks()
@@ -141,7 +141,7 @@ class BagClock:
         ]
 
 
-def _each_time_once(rows: list[Row], keys: list[tuple[Any, ...]]) -> tuple[list[Row], int]:
+def _sort_and_deduplicate(rows: list[Row], keys: list[tuple[Any, ...]]) -> tuple[list[Row], int]:
     """Return the first row of each key in ascending order, keys beginning with the time; and the number dropped."""
     first = dict(zip(reversed(keys), reversed(rows), strict=True))
     return [first[key] for key in sorted(first)], len(rows) - len(first)

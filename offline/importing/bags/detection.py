@@ -13,7 +13,7 @@ from groundsbot.offline.importing.bags.pictures import picture_of
 from groundsbot.offline.importing.bags.reader import Bag, BagTopic
 from groundsbot.offline.importing.bags.topics import BagOptions
 from groundsbot.offline.importing.run_writer import Entry
-from groundsbot.offline.logs import detectors, in_parallel
+from groundsbot.offline.logs import detect_in_parallel, detectors
 from groundsbot.onboard.detection import DetectorSettings, detections_message
 from groundsbot.onboard.log import Picture, StampSource
 
@@ -42,7 +42,7 @@ def detect_in_bag(
     unusable, n_processes = [], os.cpu_count() or 1
     with detectors(settings, n_processes) as (detect, library, described):
         pictures = _pictures(bag, topic, clock)
-        for n_done, (stamp_ns, result) in enumerate(in_parallel(pictures, detect, n_processes), start=1):
+        for n_done, (stamp_ns, result) in enumerate(detect_in_parallel(pictures, detect, n_processes), start=1):
             progress("looking for tags", n_done, topic.n_messages)
             if result.error is not None:
                 unusable.append(result.error)

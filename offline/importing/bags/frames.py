@@ -10,10 +10,10 @@ from groundsbot.offline.errors import OfflineError
 
 _Values = tuple[float, float, float, float, float, float, float]  # x, y, z, then quaternion x, y, z, w
 # Rounding of a transform that is sent repeatedly; a moving joint changes by more.
-_SAME: Final = 1e-6
-_UNIT_LENGTH: Final = 1e-3  # tolerance of a quaternion's length: far beyond rounding, even to float32
-_DEEPEST: Final = 100  # links from a frame to its root; more mean a cycle
-FARTHEST_MOUNT_M: Final = 10.0  # robot.yaml's limit too
+_TRANSFORM_TOLERANCE: Final = 1e-6
+_LENGTH_TOLERANCE: Final = 1e-3  # tolerance of a quaternion's length: far beyond rounding, even to float32
+_MAX_DEPTH: Final = 100  # links from a frame to its root; more mean a cycle
+MAX_MOUNT_M: Final = 10.0  # robot.yaml's limit too
 
 
 class FixedFrames:
@@ -32,18 +32,18 @@ class FixedFrames:
             t, q = each.transform.translation, each.transform.rotation
             values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
             old_parent, old = self._links.setdefault(child, (parent, values))
-            if old_parent != parent or not np.allclose(values, old, rtol=0.0, atol=_SAME):
+            if old_parent != parent or not np.allclose(values, old, rtol=0.0, atol=_TRANSFORM_TOLERANCE):
                 self._moving.add(child)
 
     def has(self, frame: str) -> bool:
         """Whether any transform names the frame."""
         return frame in self._links or any(parent == frame for parent, _ in self._links.values())
 
-    def joins(self, a: str, b: str) -> bool:
+    def are_connected(self, a: str, b: str) -> bool:
         """Whether fixed transforms connect two frames."""
         return self._path(a)[-1][0] == self._path(b)[-1][0]
 
-    def moving_near(self, frame: str) -> str | None:
+    def moving_root(self, frame: str) -> str | None:
         """Return the root that fixed transforms lead to from a frame, if it moves relative to its parent; else None."""
         root = self._path(frame)[-1][0]
         return root if root in self._moving else None
@@ -59,7 +59,7 @@ class FixedFrames:
     def _path(self, frame: str) -> list[tuple[str, _Values | None]]:
         """Return the frames from one up to its root, each with its transform to the next."""
         path: list[tuple[str, _Values | None]] = []
-        while frame in self._links and frame not in self._moving and len(path) < _DEEPEST:
+        while frame in self._links and frame not in self._moving and len(path) < _MAX_DEPTH:
             parent, values = self._links[frame]
             path.append((frame, values))
             frame = parent
@@ -84,7 +84,7 @@ def rigid_transform(values: _Values, where: str) -> RigidTransform:
         OfflineError: a number is not finite, or the quaternion is not of length 1.
     """
     length = float(np.linalg.norm(values[3:]))
-    if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_LENGTH:
+    if not np.isfinite(values).all() or abs(length - 1.0) > _LENGTH_TOLERANCE:
         raise OfflineError(
             f"{where}: {values} is no transform: its quaternion has length {length:.4g}, must be 1; correct its sender"
         )
@@ -103,9 +103,9 @@ def mount_of(T_base_camera: RigidTransform) -> Mount:
         OfflineError: the camera is implausibly far from the base.
     """
     place, rotation = T_base_camera.as_components()
-    if float(np.abs(place).max()) > FARTHEST_MOUNT_M:
+    if float(np.abs(place).max()) > MAX_MOUNT_M:
         raise OfflineError(
-            f"tf: the camera is {np.linalg.norm(place):.4g} m from its base, limit {FARTHEST_MOUNT_M:g} m; "
+            f"tf: the camera is {np.linalg.norm(place):.4g} m from its base, limit {MAX_MOUNT_M:g} m; "
             "check the base frame, or name it with --base-frame"
         )
     yaw, pitch, roll = (rotation * R_LEVEL_OPTICAL.inv()).as_euler("ZYX").tolist()

@@ -17,7 +17,7 @@ from groundsbot.offline.importing.bags.reader import open_bag
 from groundsbot.offline.importing.bags.sightings import find_camera, tag_entries
 from groundsbot.offline.importing.bags.topics import APRILTAG_ROS, JOINTS, BagOptions, ChosenTopics, choose_topics
 from groundsbot.offline.importing.csv.forms import refuse_tick_options
-from groundsbot.offline.importing.robot import ImportOptions, KnownRobot, describe_robot, safe_name, wheel_scale
+from groundsbot.offline.importing.robot import ImportOptions, RobotDefaults, describe_robot, safe_name, wheel_scale
 from groundsbot.offline.importing.run_writer import Entry, ImportReport, check_output, write_run
 from groundsbot.onboard.log import PlanarOdometry, log_head
 
@@ -53,7 +53,9 @@ def import_bag(
         camera = find_camera(path, chosen, content, options.robot)
         frames = {camera.frame} if camera is not None and chosen.has_pictures else content.camera_frames
         mount = find_mount(path, content.frames, content.base_frame, frames, options, bag_options)
-        known = KnownRobot(mount.mount, options.tag_family, bag_options.tag_size_m, chosen.odometry.msgtype == JOINTS)
+        known = RobotDefaults(
+            mount.mount, options.tag_family, bag_options.tag_size_m, chosen.odometry.msgtype == JOINTS
+        )
         robot, robot_yaml, robot_remarks = describe_robot(path, options, mount.in_camera, known)
         readings, distance_m = _odometry(path, chosen, content, robot.wheels.track_m, options, bag_options)
         tags = tag_entries(bag, chosen, content, robot, mount.in_camera, camera, bag_options, progress)

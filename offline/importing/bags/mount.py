@@ -19,7 +19,7 @@ _STEEP_RAD: Final = radians(60.0)
 
 
 @dataclass(frozen=True)
-class FoundMount:
+class BagMount:
     """Pose of the camera on its robot.
 
     Attributes:
@@ -40,7 +40,7 @@ def find_mount(
     camera_frames: Iterable[str],
     options: ImportOptions,
     bag_options: BagOptions,
-) -> FoundMount:
+) -> BagMount:
     """Return the mount from the transforms between the camera's frame and the base's.
 
     Args:
@@ -54,16 +54,16 @@ def find_mount(
     Raises:
         OfflineError: there are several cameras, or tf does not connect the frames.
     """
-    camera = _the_camera(path, set(camera_frames), bag_options)
-    base = _the_base(frames, base_of_odometry, bag_options)
+    camera = _camera_frame(path, set(camera_frames), bag_options)
+    base = _base_frame(frames, base_of_odometry, bag_options)
     if camera == base:
-        return FoundMount(None, False, (f"tags are observed in {base!r}, so no mount is needed",))
+        return BagMount(None, False, (f"tags are observed in {base!r}, so no mount is needed",))
     if options.robot is not None:
-        return FoundMount(None, True, ())
-    if not frames.joins(base, camera):
+        return BagMount(None, True, ())
+    if not frames.are_connected(base, camera):
         if options.has_mount:
-            return FoundMount(None, True, (f"tf does not connect {camera!r} to {base!r}; roll and pitch are set to 0",))
-        moving = [each for each in (frames.moving_near(camera), frames.moving_near(base)) if each is not None]
+            return BagMount(None, True, (f"tf does not connect {camera!r} to {base!r}; roll and pitch are set to 0",))
+        moving = [each for each in (frames.moving_root(camera), frames.moving_root(base)) if each is not None]
         why = f", since {moving[0]!r} moves on its parent" if moving else ""
         raise OfflineError(
             f"{path}: no fixed transforms connect the camera's frame {camera!r} to the base {base!r}{why}; record "
@@ -75,10 +75,10 @@ def find_mount(
     if abs(mount.pitch_rad) > _STEEP_RAD:
         steep = f"the camera's frame {camera!r} looks {abs(degrees(mount.pitch_rad)):.0f} deg"
         remarks.append(f"{steep} {'down' if mount.pitch_rad > 0 else 'up'}; is it the optical one? see --camera-frame")
-    return FoundMount(mount, True, tuple(remarks))
+    return BagMount(mount, True, tuple(remarks))
 
 
-def _the_camera(path: Path, named: set[str], options: BagOptions) -> str:
+def _camera_frame(path: Path, named: set[str], options: BagOptions) -> str:
     if options.camera_frame is not None:
         return frame_name(options.camera_frame)
     if len(named) > 1:
@@ -89,7 +89,7 @@ def _the_camera(path: Path, named: set[str], options: BagOptions) -> str:
     return next(iter(named), "")
 
 
-def _the_base(frames: FixedFrames, of_odometry: str, options: BagOptions) -> str:
+def _base_frame(frames: FixedFrames, of_odometry: str, options: BagOptions) -> str:
     if options.base_frame is not None:
         return frame_name(options.base_frame)
     if of_odometry:

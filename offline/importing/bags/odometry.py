@@ -17,8 +17,8 @@ from groundsbot.offline.measurements import growth, wheel_distances
 from groundsbot.onboard.log import PlanarOdometry
 
 # Allowance for bunched stamps, so that they do not look like a jump of the path.
-_BURST_M: Final = 0.5
-_PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and yaw of ROS's six
+_BUNCHED_STAMPS_M: Final = 0.5
+_PLANAR_INDICES: Final = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and yaw of ROS's six
 
 
 def odometry_readings(
@@ -35,7 +35,7 @@ def odometry_readings(
     Raises:
         OfflineError: a pose is invalid, or a wheel would be impossibly fast.
     """
-    poses = np.array([_planar(message.pose.pose) for message in messages])
+    poses = np.array([_planar_pose(message.pose.pose) for message in messages])
     wrong = np.flatnonzero(~np.isfinite(poses).all(axis=1))
     if len(wrong):
         raise OfflineError(
@@ -48,7 +48,7 @@ def odometry_readings(
         PlanarOdometry(stamp_ns=stamp_ns, pose=PlanarOdometry.PoseInOdom(x_m=x, y_m=y, theta_rad=theta))
         for stamp_ns, (x, y, theta) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
     ]
-    covariances = np.array([np.reshape(message.pose.covariance, (6, 6))[_PLANAR] for message in messages])
+    covariances = np.array([np.reshape(message.pose.covariance, (6, 6))[_PLANAR_INDICES] for message in messages])
     steps, told = growth(poses, covariances)
     if steps is not None:
         for reading, step in zip(readings, steps, strict=True):
@@ -75,7 +75,9 @@ def joint_readings(
     """
     if scale.metres_per_tick_left is None or scale.metres_per_tick_right is None:
         raise OfflineError(f"{where}: the wheels' radius is unknown; give --wheel-radius-m, or --robot")
-    stamps_ns, angles = _together(where, joints, [_angles(where, stamps_ns, messages, joint) for joint in joints])
+    stamps_ns, angles = _synchronise(
+        where, joints, [_joint_angles(where, stamps_ns, messages, joint) for joint in joints]
+    )
     left_m, right_m = (angles - angles[:, :1]) * [[scale.metres_per_tick_left], [scale.metres_per_tick_right]]
     check_wheel_speed(where, stamps_ns, left_m, right_m)
     readings = [
@@ -85,7 +87,7 @@ def joint_readings(
     return readings, _distance_m(left_m, right_m)
 
 
-def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str) -> tuple[IntArray, FloatArray]:
+def _joint_angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str) -> tuple[IntArray, FloatArray]:
     """Return stamps (K,), ascending, and unwrapped angles (K,) of one joint."""
     named = [
         (stamp, message) for stamp, message in zip(stamps_ns.tolist(), messages, strict=True) if joint in message.name
@@ -97,7 +99,7 @@ def _angles(where: str, stamps_ns: IntArray, messages: Sequence[Any], joint: str
     return stamps, np.unwrap(angles) if np.ptp(angles) <= 2.0 * pi else angles  # some publish it within one turn
 
 
-def _together(
+def _synchronise(
     where: str, joints: tuple[str, str], wheels: Sequence[tuple[IntArray, FloatArray]]
 ) -> tuple[IntArray, FloatArray]:
     """Return the left wheel's stamps (K,), and both angles (2, K) at them; each joint may have messages of its own."""
@@ -146,7 +148,7 @@ def check_wheel_speed(where: str, stamps_ns: IntArray, left_m: FloatArray, right
     """
     steps_m = np.abs(np.diff(np.stack([left_m, right_m]), axis=1)).max(axis=0, initial=0.0)
     seconds = np.diff(stamps_ns) * 1e-9
-    wrong = np.flatnonzero(steps_m > MAX_WHEEL_SPEED_M_S * seconds + _BURST_M)
+    wrong = np.flatnonzero(steps_m > MAX_WHEEL_SPEED_M_S * seconds + _BUNCHED_STAMPS_M)
     if len(wrong):
         at = int(wrong[0])
         raise OfflineError(
@@ -155,7 +157,7 @@ def check_wheel_speed(where: str, stamps_ns: IntArray, left_m: FloatArray, right
         )
 
 
-def _planar(pose: Any) -> tuple[float, float, float]:  # noqa: ANN401 - made by rosbags
+def _planar_pose(pose: Any) -> tuple[float, float, float]:  # noqa: ANN401 - made by rosbags
     q = pose.orientation
     quaternion = np.array([q.x, q.y, q.z, q.w])
     if not 0.5 < np.linalg.norm(quaternion) < 2.0:

@@ -24,7 +24,7 @@ from groundsbot.offline.importing.bags.topics import (
     APRILTAG_ROS,
     BagOptions,
     ChosenTopics,
-    the_camera_info,
+    only_camera_info,
 )
 from groundsbot.offline.importing.run_writer import Entry
 from groundsbot.offline.measurements import read_robot_file
@@ -33,12 +33,12 @@ from groundsbot.onboard.log import TagDetections, TagObservations
 
 
 @dataclass(frozen=True)
-class FoundCamera:
+class BagCamera:
     """Camera of a bag, its frame (empty if not named), and the source of its calibration."""
 
     model: CameraModel
     frame: str
-    said: str
+    source: str
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class TagEntries:
         return seen
 
 
-def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_file: Path | None) -> FoundCamera | None:
+def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_file: Path | None) -> BagCamera | None:
     """Return the camera that took the pictures, from robot.yaml, else from CameraInfo; None if not needed or unknown.
 
     Raises:
@@ -77,8 +77,8 @@ def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_fil
         return None  # it sends no corners
     given = read_robot_file(robot_file).camera if robot_file is not None else None
     if given is not None:
-        return FoundCamera(given, "", f"as in {robot_file}")
-    topic = the_camera_info(path, chosen)
+        return BagCamera(given, "", f"as in {robot_file}")
+    topic = only_camera_info(path, chosen)
     if topic is None:
         if chosen.has_pictures:
             raise OfflineError(
@@ -91,7 +91,7 @@ def find_camera(path: Path, chosen: ChosenTopics, content: BagContent, robot_fil
     info = content.camera_infos[topic.name]
     camera = camera_of(f"{path}: {topic.name}", info, rectified=is_rectified)
     how = "rectified" if is_rectified else "raw"
-    return FoundCamera(camera, frame_name(info.header.frame_id), f"{topic.name}, for {how} pictures")
+    return BagCamera(camera, frame_name(info.header.frame_id), f"{topic.name}, for {how} pictures")
 
 
 def tag_entries(
@@ -100,7 +100,7 @@ def tag_entries(
     content: BagContent,
     robot: Robot,
     in_camera: bool,
-    camera: FoundCamera | None,
+    camera: BagCamera | None,
     options: BagOptions,
     progress: Progress,
 ) -> TagEntries:
@@ -125,7 +125,7 @@ def tag_entries(
             entries, remarks = detect_in_bag(bag, chosen.tags, camera.model, robot, options, progress)
         else:
             entries, remarks = _corner_entries(content.pictures, camera.model, chosen.tags), []
-        found = TagEntries(entries, camera.model, [f"camera: {camera.said}", *remarks])
+        found = TagEntries(entries, camera.model, [f"camera: {camera.source}", *remarks])
     elif chosen.has_pictures or options.tag_size_m is not None:
         missing = "their size; give --tag-size-m, or --robot with `tags`" if camera else "a CameraInfo; record it"
         raise OfflineError(f"{where}: placing tags by their corners needs {missing}")
@@ -137,7 +137,7 @@ def tag_entries(
             f"{plural(len(found.entries), 'picture')}; is it the right family? see --tag-family"
         )
     _check_sizes(where, robot, found)
-    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *exclusion_lines(content.left_out)]
+    said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *exclusion_lines(content.n_excluded)]
     return TagEntries(found.entries, found.camera, [*said, *found.remarks])
 
 
@@ -169,7 +169,7 @@ def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Rob
     """Return the positions that the detector itself computed."""
     looks: Sequence[BagPicture] = content.pictures
     if chosen.tags.msgtype == APRILTAG_MSGS:
-        looks = with_tf_positions(looks, content.sent_transforms)
+        looks = with_tf_positions(looks, content.tag_transforms)
     n = sum(len(look.tags) for look in looks)
     n_placed = sum(each.position_m is not None for look in looks for each in look.tags)
     if not n_placed:

@@ -91,7 +91,7 @@ def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tupl
                 _family(detection.family), detection.id, corners_px=_corners(detection.corners) - _PIXEL_CENTRE_PX
             )
             sighting = _with_pose(sighting, detection.pose.pose, with_rotation=False)
-        why_not = _why_not(sighting)
+        why_not = _exclusion_reason(sighting)
         if why_not is None:
             found.append(sighting)
         else:
@@ -150,7 +150,7 @@ def _family(name: str) -> str:
     return name if name.startswith("tag") else f"tag{name}"
 
 
-def _why_not(sighting: BagTag) -> str | None:
+def _exclusion_reason(sighting: BagTag) -> str | None:
     if sighting.family not in families():
         return f"family {sighting.family!r} is unknown"
     if not 0 <= sighting.tag_id < family_size(sighting.family):

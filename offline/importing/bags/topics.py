@@ -21,7 +21,7 @@ COMPRESSED_IMAGE: Final = "sensor_msgs/msg/CompressedImage"
 IMAGES: Final = (IMAGE, COMPRESSED_IMAGE)
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_MOST_NAMED: Final = 8
+_MOST_LISTED: Final = 8
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
         OfflineError: nothing fits, several do, or what was named does not.
     """
     odometry = _topic_of_flag(path, topics, "--odometry-topic", options.odometry_topic, (ODOMETRY, JOINTS))
-    odometry = odometry or _only(path, topics, "--odometry-topic", (ODOMETRY,))
-    odometry = odometry or _only(path, topics, "--odometry-topic", (JOINTS,))
+    odometry = odometry or _only_topic(path, topics, "--odometry-topic", (ODOMETRY,))
+    odometry = odometry or _only_topic(path, topics, "--odometry-topic", (JOINTS,))
     if odometry is None:
         raise OfflineError(
             f"{path}: no odometry: no messages of {_types((ODOMETRY, JOINTS))}; it holds {_list_topics(topics)}; "
@@ -89,8 +89,8 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
         )
     tags = _topic_of_flag(path, topics, "--tags-topic", options.tags_topic, TAGS)
     tags = tags or _topic_of_flag(path, topics, "--image-topic", options.image_topic, IMAGES)
-    tags = tags or _only(path, topics, "--tags-topic", TAGS)
-    tags = tags or _only(path, topics, "--image-topic", IMAGES)
+    tags = tags or _only_topic(path, topics, "--tags-topic", TAGS)
+    tags = tags or _only_topic(path, topics, "--image-topic", IMAGES)
     if tags is None:
         raise OfflineError(
             f"{path}: no tags: no messages of {_types((*TAGS, *IMAGES))}; it holds {_list_topics(topics)}; record "
@@ -110,13 +110,13 @@ def _camera_infos(path: Path, topics: Sequence[BagTopic], options: BagOptions, t
     return tuple(each for each, n in zip(found, shared, strict=True) if n == max(shared))
 
 
-def the_camera_info(path: Path, chosen: ChosenTopics) -> BagTopic | None:
+def only_camera_info(path: Path, chosen: ChosenTopics) -> BagTopic | None:
     """Return the only camera_info; None if there is none.
 
     Raises:
         OfflineError: there are several.
     """
-    return _only(path, chosen.camera_infos, "--camera-info-topic", (CAMERA_INFO,))
+    return _only_topic(path, chosen.camera_infos, "--camera-info-topic", (CAMERA_INFO,))
 
 
 def _n_shared(a: list[str], b: list[str]) -> int:
@@ -142,7 +142,7 @@ def _topic_of_flag(
     )
 
 
-def _only(path: Path, topics: Sequence[BagTopic], flag: str, types: tuple[str, ...]) -> BagTopic | None:
+def _only_topic(path: Path, topics: Sequence[BagTopic], flag: str, types: tuple[str, ...]) -> BagTopic | None:
     found = [each for each in topics if each.msgtype in types]
     if len(found) > 1:
         raise OfflineError(f"{path}: {len(found)} topics fit: {_list_topics(found)}; choose one with {flag}")
@@ -154,6 +154,6 @@ def _types(types: Sequence[str]) -> str:
 
 
 def _list_topics(topics: Sequence[BagTopic]) -> str:
-    told = [f"{each.name} ({each.short_type}, {plural(each.n_messages, 'message')})" for each in topics[:_MOST_NAMED]]
-    more = [f"{len(topics) - _MOST_NAMED} more"] if len(topics) > _MOST_NAMED else []
+    told = [f"{each.name} ({each.short_type}, {plural(each.n_messages, 'message')})" for each in topics[:_MOST_LISTED]]
+    more = [f"{len(topics) - _MOST_LISTED} more"] if len(topics) > _MOST_LISTED else []
     return ", ".join([*told, *more]) or "no messages at all"

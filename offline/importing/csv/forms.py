@@ -46,7 +46,7 @@ class WheelPath:
 
 
 @dataclass(frozen=True)
-class Observation:
+class CsvObservation:
     """One tag: `first`, `second` are (x_m, y_m), y to the left, or (range_m, bearing_rad), positive to the left."""
 
     stamp_ns: int
@@ -68,7 +68,7 @@ def read_odometry(path: Path, scale: WheelScale) -> tuple[WheelPath, str]:
             the form does not use.
     """
     table = read_table(path)
-    form = _columns_of(table, _ODOMETRY)
+    form = _choose_columns(table, _ODOMETRY)
     if len(table) == 0:
         raise OfflineError(f"{path}: has a header but no rows; a run needs wheel readings, export it again")
     stamps = table.stamps_ns(strictly=True)
@@ -115,14 +115,14 @@ def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:
         raise OfflineError(f"{path}: holds no ticks, so {' and '.join(flags)} would not be used; leave that out")
 
 
-def read_observations(path: Path, max_tag_id: int) -> list[Observation]:
+def read_observations(path: Path, max_tag_id: int) -> list[CsvObservation]:
     """Read `observations.csv`; an empty list if it has a header only.
 
     Raises:
         OfflineError: a wrong column or value, or time running backwards.
     """
     table = read_table(path)
-    form = _columns_of(table, _POSITIONS, required=("tag_id",), optional=_SIGMAS)
+    form = _choose_columns(table, _POSITIONS, required=("tag_id",), optional=_SIGMAS)
     polar = form == ("range_m", "bearing_rad")
     stamps = table.stamps_ns(strictly=False)
     tag_ids = table.integers("tag_id", 0, max_tag_id)
@@ -138,7 +138,7 @@ def read_observations(path: Path, max_tag_id: int) -> list[Observation]:
         sigmas = [None] * len(table)
     kind: Literal["cartesian", "polar"] = "polar" if polar else "cartesian"
     return [
-        Observation(t, tag, kind, a, b, s)
+        CsvObservation(t, tag, kind, a, b, s)
         for t, tag, a, b, s in zip(stamps, tag_ids, first, second, sigmas, strict=True)
     ]
 
@@ -160,7 +160,7 @@ def read_paper_odometry(path: Path, state_rate_hz: float) -> WheelPath:
     return wheels
 
 
-def read_paper_landmarks(path: Path, n_states: int, state_rate_hz: float, max_tag_id: int) -> list[Observation]:
+def read_paper_landmarks(path: Path, n_states: int, state_rate_hz: float, max_tag_id: int) -> list[CsvObservation]:
     """Read the paper's `landmarks.csv`: rows `state, tag_id, forward_m, RIGHT_m, 0`, converted to y LEFT.
 
     The state is the number of odometry readings before the observation.
@@ -182,7 +182,7 @@ def read_paper_landmarks(path: Path, n_states: int, state_rate_hz: float, max_ta
     forward, right = table.numbers("forward_m"), table.numbers("right_m")
     _check_positions(table, False, forward, right)
     return [
-        Observation(state_stamp_ns(state, state_rate_hz), tag, "cartesian", x, -y)
+        CsvObservation(state_stamp_ns(state, state_rate_hz), tag, "cartesian", x, -y)
         for state, tag, x, y in zip(states, tag_ids, forward, right, strict=True)
     ]
 
@@ -192,7 +192,7 @@ def state_stamp_ns(state: int, state_rate_hz: float) -> int:
     return round(state * _NS_PER_S / state_rate_hz)
 
 
-def _columns_of(
+def _choose_columns(
     table: CsvTable,
     alternatives: tuple[tuple[str, str], ...],
     required: tuple[str, ...] = (),

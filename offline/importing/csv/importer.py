@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.forms import (
-    Observation,
+    CsvObservation,
     WheelPath,
     read_gyro,
     read_observations,
@@ -22,12 +22,12 @@ from groundsbot.offline.importing.csv.forms import (
     refuse_tick_options,
 )
 from groundsbot.offline.importing.robot import (
+    DETECTOR_SCALE_SIGMA,
     ENCODER_SCALE_SIGMA,
     RANGE_SCALE_SIGMA,
     SPEED_SCALE_SIGMA,
-    TOLD_SIZE_SIGMA,
     ImportOptions,
-    KnownRobot,
+    RobotDefaults,
     describe_robot,
     safe_name,
     wheel_scale,
@@ -41,12 +41,12 @@ _GYRO: Final = "gyro.csv"  # beside either pair
 
 
 @dataclass(frozen=True)
-class _Drive:
+class _CsvDrive:
     """Content of one folder in any form."""
 
     wheels: WheelPath
     n_odometry: int
-    observations: list[Observation]
+    observations: list[CsvObservation]
     in_camera: bool
     range_scale_sigma: float
     remarks: list[str]
@@ -62,14 +62,14 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
         GroundsbotError: one line that names file, line, column, value and what to do.
     """
     if not folder.is_dir():
-        raise OfflineError(f"{folder}: is not a folder; give one with {_pairs()}")
+        raise OfflineError(f"{folder}: is not a folder; give one with {_pair_names()}")
     run_id = options.run_id or safe_name(folder)
     run_folder = output / run_id
     check_output(output, run_folder)
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
     drive = _read_drive(folder, options)
-    known = KnownRobot(
+    known = RobotDefaults(
         needs_track=drive.wheels.needs_track,
         wheel_scale_sigma=ENCODER_SCALE_SIGMA if drive.wheels.needs_track else SPEED_SCALE_SIGMA,
         range_scale_sigma=drive.range_scale_sigma,
@@ -95,11 +95,11 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     )
 
 
-def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
+def _read_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
     pairs = [pair for pair in (_HEADER_PAIR, _PAPER_PAIR) if any((folder / name).is_file() for name in pair)]
     if len(pairs) != 1:
         found = "both pairs" if pairs else "neither"
-        raise OfflineError(f"{folder}: holds {found} of {_pairs()}; give a folder with one pair")
+        raise OfflineError(f"{folder}: holds {found} of {_pair_names()}; give a folder with one pair")
     for name in pairs[0]:
         if not (folder / name).is_file():
             raise OfflineError(f"{folder / name}: is missing beside the other file of its pair; add it")
@@ -118,7 +118,7 @@ def _read_drive(folder: Path, options: ImportOptions) -> _Drive:
     return drive
 
 
-def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
+def _header_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
     if options.state_rate_hz is not None:
         raise OfflineError(f"{folder}: --state-rate-hz is for odom.csv; odometry.csv holds its own times, leave it out")
     wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options))
@@ -126,10 +126,10 @@ def _header_drive(folder: Path, options: ImportOptions) -> _Drive:
     in_camera = options.has_mount or options.robot is None
     where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot without --camera options)"
     remarks = [f"odometry.csv: {form}", f"observations.csv: assumed to be in {where}, y to the left"]
-    return _Drive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks, [])
+    return _CsvDrive(wheels, len(wheels.stamps_ns), observations, in_camera, RANGE_SCALE_SIGMA, remarks, [])
 
 
-def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
+def _paper_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
     rate_hz = options.state_rate_hz
     if rate_hz is None:
         raise OfflineError(
@@ -143,15 +143,15 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _Drive:
         f"odom.csv: the paper's form, {rate_hz:g} states a second",
         "landmarks.csv: the paper's form, in the camera's frame, y converted from right to left",
     ]
-    return _Drive(wheels, n_states, observations, True, TOLD_SIZE_SIGMA, remarks, [])
+    return _CsvDrive(wheels, n_states, observations, True, DETECTOR_SCALE_SIGMA, remarks, [])
 
 
-def _n_outside(drive: _Drive) -> int:
+def _n_outside(drive: _CsvDrive) -> int:
     first, last = drive.wheels.stamps_ns[0], drive.wheels.stamps_ns[-1]
     return sum(not first <= observation.stamp_ns <= last for observation in drive.observations)
 
 
-def _messages(drive: _Drive, family: str) -> Iterator[Entry]:
+def _messages(drive: _CsvDrive, family: str) -> Iterator[Entry]:
     """Yield (stamp, topic, message) in order of time, odometry first at equal times."""
     frame = "camera_planar" if drive.in_camera else "base"
     gyro = ((at, "/gyro", Gyro(stamp_ns=at, yaw_rate_rad_s=rate)) for at, rate in drive.gyro)
@@ -165,13 +165,13 @@ def _odometry(wheels: WheelPath) -> Iterator[Entry]:
         yield stamp_ns, "/odometry", PlanarOdometry(stamp_ns=stamp_ns, wheels=distances)
 
 
-def _observations(observations: list[Observation], frame: str, family: str) -> Iterator[Entry]:
+def _observations(observations: list[CsvObservation], frame: str, family: str) -> Iterator[Entry]:
     for stamp_ns, group in groupby(observations, key=lambda observation: observation.stamp_ns):
         tags = [_tag_observation(observation, family) for observation in group]
         yield stamp_ns, "/tags/observations", TagObservations(stamp_ns=stamp_ns, frame=frame, observations=tags)
 
 
-def _tag_observation(observation: Observation, family: str) -> TagObservation:
+def _tag_observation(observation: CsvObservation, family: str) -> TagObservation:
     message = TagObservation(family=family, tag_id=observation.tag_id)
     if observation.kind == "polar":
         message.polar.range_m, message.polar.bearing_rad = observation.first, observation.second
@@ -183,5 +183,5 @@ def _tag_observation(observation: Observation, family: str) -> TagObservation:
     return message
 
 
-def _pairs() -> str:
+def _pair_names() -> str:
     return f"{' + '.join(_HEADER_PAIR)} or {' + '.join(_PAPER_PAIR)}"

@@ -46,7 +46,7 @@ def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParame
 
 def _true_state(graph: Graph, truth: Truth) -> State:
     """Poses and tags as they were, in the frame of the first segment's start; no correction of any calibration."""
-    T_world_base = [truth.runs[segment.run.name].at(segment.stamps_ns)[0] for segment in graph.segments]
+    T_world_base = [truth.runs[segment.run.name].poses_at(segment.stamps_ns)[0] for segment in graph.segments]
     T_map_world = se2.inverse(T_world_base[0][0])
     tags = {tag: se2.apply(T_map_world, truth.tags_m[tag.family, tag.tag_id, ""]) for tag in graph.tags}
     return graph.start(se2.compose(T_map_world, np.concatenate(T_world_base)), tags, {})

@@ -126,7 +126,7 @@ def make_scene(seed: int) -> Scene | None:
     component = _join(maps)
     if component is None:
         return None
-    known = MapResult((component,), (), NoiseParameters(), kept=tuple(archive_map(each) for each in maps))
+    known = MapResult((component,), (), NoiseParameters(), archived_segments=tuple(archive_map(each) for each in maps))
     later, moved = _with_moved_tags(town, rng) if seed % _MOVED_EVERY == _MOVED_EVERY - 1 else (town, frozenset[int]())
     drive = _drive(first + 2, later, float(rng.uniform(25.0, 100.0)))
     seen = {tag.tag_id for tag in drive.segment.tags}
@@ -246,7 +246,7 @@ def against(run: LocatedRun, online: OnlineLocalizer) -> tuple[float | None, flo
 def extended_against(scene: Scene) -> tuple[float | None, float | None]:
     """The kept map solved with the run against all runs solved at once: places in sigmas, and sigmas; the worst."""
     at_once = _join([*(solve_local_map(each.segment) for each in scene.map_drives), scene.local_map])
-    extended = _join([*(restore_local_map(each) for each in scene.known.kept), scene.local_map])
+    extended = _join([*(restore_local_map(each) for each in scene.known.archived_segments), scene.local_map])
     if at_once is None or extended is None:
         return None, None
     sigmas, own = (np.sqrt(np.diag(each.joint_covariance)[3:]) for each in (at_once, extended))

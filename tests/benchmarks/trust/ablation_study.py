@@ -94,7 +94,7 @@ def landmarks_rms_m(result: MapResult, survey: Path) -> tuple[float, float]:
 
 
 def _n_named(result: MapResult) -> int:
-    return sum(each.kind != PHANTOM for each in result.suspects)
+    return sum(each.kind != PHANTOM for each in result.outliers)
 
 
 def real(data: Path) -> None:

@@ -23,9 +23,9 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.advice.advice import Candidates, best_candidates, candidates_of, joint_covariance_of
-from groundsbot.offline.advice.new_tags import TagSite, is_in_view, place_beside
-from groundsbot.offline.advice.passes import Pass, most_length_m
+from groundsbot.offline.advice.advice import Candidates, best_candidates, find_candidates, tag_joint_covariance
+from groundsbot.offline.advice.new_tags import TagSite, is_in_view, site_beside
+from groundsbot.offline.advice.passes import RepeatDrive, max_repeat_length_m
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
@@ -73,20 +73,20 @@ def make_scene(seed: int, length_m: float = LENGTH_M, n_drives: int = N_DRIVES) 
     ]
     maps = [solve_local_map(drive.segment) for drive in drives]
     graph, solution = _map_runs(maps, None)
-    return Scene(drives, maps, graph, solution, candidates_of(graph, solution.state))
+    return Scene(drives, maps, graph, solution, find_candidates(graph, solution.state))
 
 
 def largest_sigma_m(scene: Scene, maps: Sequence[LocalMap]) -> float:
     """Of the scene's tags, in a map of these; infinite where one of them is no longer in it."""
     graph, solution = _map_runs(maps, scene.graph)
-    sigmas_m = dict(zip(graph.tags, joint_covariance_of(solution, []).sigmas_m().tolist(), strict=True))
+    sigmas_m = dict(zip(graph.tags, tag_joint_covariance(solution, []).sigmas_m().tolist(), strict=True))
     return max(float(sigmas_m.get(tag, np.inf)) for tag in scene.graph.tags)
 
 
-def with_candidate(scene: Scene, wanted: Pass | TagSite, seed: int) -> list[LocalMap]:
+def with_candidate(scene: Scene, wanted: RepeatDrive | TagSite, seed: int) -> list[LocalMap]:
     """The local maps after what was wanted has been done."""
     rng = np.random.default_rng([seed, 7])
-    if isinstance(wanted, Pass):
+    if isinstance(wanted, RepeatDrive):
         return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.segment), wanted))]
     true_m = se2.apply(_T_town_map_at(scene, wanted), wanted.position_m)
     face = se2.apply(_T_town_map_at(scene, wanted), _sensor(scene, wanted)[:2]) - true_m
@@ -97,12 +97,12 @@ def with_candidate(scene: Scene, wanted: Pass | TagSite, seed: int) -> list[Loca
     ]
 
 
-def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pass | TagSite]:
+def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[RepeatDrive | TagSite]:
     """N passes, and n places of tags."""
     found = scene.candidates
-    ways, sightings = found.drives.ways, found.passages
-    length_m = most_length_m(ways)
-    passes: list[Pass | TagSite] = []
+    ways, sightings = found.paths.along_m, found.tracks
+    length_m = max_repeat_length_m(ways)
+    passes: list[RepeatDrive | TagSite] = []
     while len(passes) < n:
         begin = sightings[rng.integers(len(sightings))]
         way = ways[begin.segment]
@@ -116,12 +116,12 @@ def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[Pa
         ]
         if reached:
             end = max(reached, key=lambda each: each.last)
-            passes.append(Pass(begin.segment, begin.first, end.last, begin.tag, end.tag))
-    places: list[Pass | TagSite] = []
+            passes.append(RepeatDrive(begin.segment, begin.first, end.last, begin.tag, end.tag))
+    places: list[RepeatDrive | TagSite] = []
     while len(places) < n:
         segment = int(rng.integers(len(ways)))
         keyframe = int(np.searchsorted(ways[segment], rng.uniform(0.0, float(ways[segment][-1]))))
-        place = place_beside(found.drives, found.view, segment, keyframe, float(rng.choice([-1.0, 1.0])))
+        place = site_beside(found.paths, found.view_statistics, segment, keyframe, float(rng.choice([-1.0, 1.0])))
         if len(place.viewers) > 1:
             places.append(place)
     return passes + places
@@ -135,7 +135,7 @@ def _map_runs(maps: Sequence[LocalMap], before: Graph | None) -> tuple[Graph, So
     return solve_global_map(maps, group, Stages())
 
 
-def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: Pass) -> Segment:
+def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: RepeatDrive) -> Segment:
     """That part of a segment with other errors, as a run of its own."""
     part = drive.segment.part(wanted.first, wanted.last + 1)
     part = replace(part, name=f"{part.name}_again", run=replace(part.run, name=f"{part.run.name}_again"))
@@ -160,7 +160,7 @@ def _past_new_tag(
     rng: np.random.Generator, scene: Scene, drive: LongDrive, true_m: FloatArray, face: FloatArray
 ) -> Segment:
     """A drive's segment as it is, had it read a new tag besides."""
-    segment, view = drive.segment, scene.candidates.view
+    segment, view = drive.segment, scene.candidates.view_statistics
     off = np.array([drive.calibration[name] for name in ("mount_x_m", "mount_y_m", "mount_yaw_rad")])
     sensors = se2.compose(se2.compose(drive.T_town_start, drive.T_start_base), segment.T_base_camera + off)
     is_read = is_in_view(sensors, true_m, face, view) & (rng.random(len(sensors)) < READ_SHARE)
@@ -217,7 +217,7 @@ def trial(scene: Scene, seed: int, n_draws: int) -> Outcome:
     return Outcome(
         sigma_m=largest_sigma_m(scene, scene.maps),
         kinds=tuple(each.kind for each in best),
-        foretold_m=tuple(float(each.then_m.max()) for each in best),
+        foretold_m=tuple(float(each.predicted_sigmas_m.max()) for each in best),
         found_m=found_m,
         random_m={"pass": tuple(sigmas_m[:n_draws]), "tag": tuple(sigmas_m[n_draws:])},
     )

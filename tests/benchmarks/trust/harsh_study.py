@@ -114,7 +114,7 @@ def _row(
     seed: int, calibrate: str, result: MapResult, truth: Path, bound_m: float, changed: set[int], clear: set[int]
 ) -> Row:
     errors = evaluate(result, read_truth(truth)).components[0]
-    named = {each.tag_id for each in result.suspects if each.kind != PHANTOM}
+    named = {each.tag_id for each in result.outliers if each.kind != PHANTOM}
     return Row(
         seed,
         calibrate,

@@ -27,7 +27,7 @@ from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.maps.fit_results import SuspectTag
+from groundsbot.offline.maps.fit_results import OutlierTag
 from groundsbot.offline.noise.reweighing import fit_and_weigh
 from groundsbot.offline.outliers.outliers import OutlierSearch, split_alone, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import minimise_places
@@ -90,7 +90,7 @@ def map_runs(maps: Sequence[LocalMap]) -> OutlierSearch | None:
     return split_together(*solve_global_map(apart, merged.groups[0], Stages()), apart)
 
 
-def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[SuspectTag]:
+def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[OutlierTag]:
     """Maps a scene and adds what came of it; `compare`: also with the map without the tags in question."""
     counts.n_maps += 1
     searched = map_runs([solve_local_map(drive.segment) for drive in scene.drives])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.advice.advice import advise, best_candidates, candidates_of, joint_covariance_of
+from groundsbot.offline.advice.advice import advise, best_candidates, find_candidates, tag_joint_covariance
 from groundsbot.offline.advice.information_gain import JointCovariance
-from groundsbot.offline.advice.new_tags import TagSite, gain_of_place, place_beside
-from groundsbot.offline.advice.passes import gain_of_pass, most_length_m
+from groundsbot.offline.advice.new_tags import TagSite, new_tag_gain, site_beside
+from groundsbot.offline.advice.passes import max_repeat_length_m, repeat_drive_gain
 from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
@@ -31,28 +31,28 @@ def scene() -> Scene:
 def sigmas_at(graph: Graph, state: State) -> dict[TagKey, float]:
     """Exact ones, where a graph is linearised at a state."""
     solution = Solution(state, (0.0,), "", True, graph.problem)
-    return dict(zip(graph.tags, joint_covariance_of(solution, []).sigmas_m().tolist(), strict=True))
+    return dict(zip(graph.tags, tag_joint_covariance(solution, []).sigmas_m().tolist(), strict=True))
 
 
 def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
-    candidates = candidates_of(scene.graph, scene.solution.state)
-    wanted = candidates.passes[len(candidates.passes) // 2]
-    gain = gain_of_pass(scene.graph, scene.solution.state, wanted)
-    foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
+    candidates = find_candidates(scene.graph, scene.solution.state)
+    wanted = candidates.repeat_drives[len(candidates.repeat_drives) // 2]
+    gain = repeat_drive_gain(scene.graph, scene.solution.state, wanted)
+    foretold = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
     part = scene.graph.segments[wanted.segment].part(wanted.first, wanted.last + 1)
     graph = build_graph([*scene.graph.segments, replace(part, name="again")])
     state = scene.solution.state
     driven = scene.graph.poses_of(state, wanted.segment)[wanted.first : wanted.last + 1]
     exact = sigmas_at(graph, State(np.concatenate([state.poses, driven]), state.tags, state.calibration))
     np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
-    assert foretold.max() < 0.999 * joint_covariance_of(scene.solution, []).sigmas_m().max()
+    assert foretold.max() < 0.999 * tag_joint_covariance(scene.solution, []).sigmas_m().max()
 
 
 def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
-    found = candidates_of(scene.graph, scene.solution.state)
-    place = max(found.places, key=lambda each: each.n_passages)
-    gain = gain_of_place(found.drives, found.view, place)
-    foretold = joint_covariance_of(scene.solution, [gain]).sigmas_with_m(gain)
+    found = find_candidates(scene.graph, scene.solution.state)
+    place = max(found.tag_sites, key=lambda each: each.n_tracks)
+    gain = new_tag_gain(found.paths, found.view_statistics, place)
+    foretold = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
     state, segments = scene.solution.state, list(scene.graph.segments)
     for i, segment in enumerate(segments):
         first = int(scene.graph.first_pose[i])
@@ -60,12 +60,12 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
         if not len(keyframe):
             continue
         like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
-        n_each = max(found.view.n_a_passage * place.n_passages / len(place.viewers), 1.0)
+        n_each = max(found.view_statistics.observations_per_track * place.n_tracks / len(place.viewers), 1.0)
         new = replace(
             like,
             keyframe=keyframe,
             tag=np.full(len(keyframe), len(segment.tags)),
-            value=_tags_seen(found.drives.sensors[first + keyframe], place),
+            value=_tags_seen(found.paths.sensors[first + keyframe], place),
             covariance=like.covariance / n_each,  # all readings of these drives have the same
         )
         both = concatenate_observations(segment.readings, new)
@@ -80,14 +80,14 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
 
 def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
     """Its mount and scale would be another robot's."""
-    found = candidates_of(scene.graph, scene.solution.state)
-    place = found.places[0]
+    found = find_candidates(scene.graph, scene.solution.state)
+    place = found.tag_sites[0]
     pose = int(scene.graph.first_pose[place.segment]) + place.keyframe
-    assert pose in place_beside(found.drives, found.view, place.segment, place.keyframe, 1.0).viewers
+    assert pose in site_beside(found.paths, found.view_statistics, place.segment, place.keyframe, 1.0).viewers
     lengths = [len(each.stamps_ns) for each in scene.graph.segments]
     is_silent = np.repeat(np.arange(len(lengths)), lengths) == place.segment
-    drives = found.drives._replace(example=np.where(is_silent, -1, found.drives.example))
-    assert not len(place_beside(drives, found.view, place.segment, place.keyframe, 1.0).viewers)
+    drives = found.paths._replace(example_observation=np.where(is_silent, -1, found.paths.example_observation))
+    assert not len(site_beside(drives, found.view_statistics, place.segment, place.keyframe, 1.0).viewers)
 
 
 def _tags_seen(sensors: FloatArray, place: TagSite) -> FloatArray:
@@ -99,25 +99,27 @@ def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
     told = advise(scene.graph, scene.solution, 0)
     best = best_candidates(scene.graph, scene.solution)
     assert sorted(each.kind for each in told) == ["pass", "tag"]
-    assert told[0].sigma_then_m <= told[1].sigma_then_m < told[0].sigma_m == pytest.approx(best[0].now_m.max())
-    found = candidates_of(scene.graph, scene.solution.state)
-    gains = {"pass": [gain_of_pass(scene.graph, scene.solution.state, each) for each in found.passes]}
-    drives, view = found.drives, found.view
-    gains["tag"] = [gain_of_place(drives, view, each) for each in found.places]
-    known = joint_covariance_of(scene.solution, gains["tag"])
-    shares = [visibility_probabilities(drives, view, each, known) for each in found.places]
+    assert told[0].sigma_then_m <= told[1].sigma_then_m < told[0].sigma_m == pytest.approx(best[0].sigmas_m.max())
+    found = find_candidates(scene.graph, scene.solution.state)
+    gains = {"pass": [repeat_drive_gain(scene.graph, scene.solution.state, each) for each in found.repeat_drives]}
+    drives, view = found.paths, found.view_statistics
+    gains["tag"] = [new_tag_gain(drives, view, each) for each in found.tag_sites]
+    known = tag_joint_covariance(scene.solution, gains["tag"])
+    shares = [visibility_probabilities(drives, view, each, known) for each in found.tag_sites]
     assert {float(each.max()) for each in shares} == {1.0}  # from the pose beside it
     assert min(float(each.min()) for each in shares) < 0.9  # some may have passed too far away
-    expected = [expected_sigmas_m(drives, view, each, known).max() for each in found.places]
+    expected = [expected_sigmas_m(drives, view, each, known).max() for each in found.tag_sites]
     for certain, doubtful in zip(gains["tag"], expected, strict=True):
-        assert known.sigmas_with_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
-    by_pass = joint_covariance_of(scene.solution, gains["pass"])
-    foretold = {"tag": expected, "pass": [by_pass.sigmas_with_m(gain).max() for gain in gains["pass"]]}
+        assert (
+            known.predicted_sigmas_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
+        )
+    by_pass = tag_joint_covariance(scene.solution, gains["pass"])
+    foretold = {"tag": expected, "pass": [by_pass.predicted_sigmas_m(gain).max() for gain in gains["pass"]]}
     for each in told:
         assert each.sigma_then_m == pytest.approx(min(foretold[each.kind]))
     (advised,) = [each for each in told if each.kind == "pass"]
     assert advised.length_m is not None
-    assert 0.0 < advised.length_m <= most_length_m(found.drives.ways) <= 50.0
+    assert 0.0 < advised.length_m <= max_repeat_length_m(found.paths.along_m) <= 50.0
     assert np.hypot(*np.diff(advised.way_m, axis=0).T).sum() <= 1.01 * advised.length_m
 
 
@@ -181,13 +183,13 @@ def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
 
 def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(scene: Scene) -> None:
     """Readings that count by their probability would promise as good as all of what certain ones do."""
-    found = candidates_of(scene.graph, scene.solution.state)
-    drives, view = found.drives, found.view
-    known = joint_covariance_of(scene.solution, [gain_of_place(drives, view, each) for each in found.places])
-    shares = [visibility_probabilities(drives, view, each, known) for each in found.places]
-    place, share = min(zip(found.places, shares, strict=True), key=lambda each: float(each[1].min()))
-    without = known.sigmas_with_m(gain_of_place(drives, view, place, share > share.min()))
-    with_it = known.sigmas_with_m(gain_of_place(drives, view, place))
+    found = find_candidates(scene.graph, scene.solution.state)
+    drives, view = found.paths, found.view_statistics
+    known = tag_joint_covariance(scene.solution, [new_tag_gain(drives, view, each) for each in found.tag_sites])
+    shares = [visibility_probabilities(drives, view, each, known) for each in found.tag_sites]
+    place, share = min(zip(found.tag_sites, shares, strict=True), key=lambda each: float(each[1].min()))
+    without = known.predicted_sigmas_m(new_tag_gain(drives, view, place, share > share.min()))
+    with_it = known.predicted_sigmas_m(new_tag_gain(drives, view, place))
     expected = expected_sigmas_m(drives, view, place, known)
     worst = int(np.argmax(without - with_it))
     assert with_it[worst] < expected[worst] < known.sigmas_m()[worst]

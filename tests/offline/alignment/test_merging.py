@@ -137,8 +137,8 @@ def test_tags_that_moved_as_one_make_it_ambiguous_and_both_ways_are_told() -> No
     merged = merge(maps)
     assert len(merged.groups) == 2
     (result,) = alignment_results(maps, merged)
-    assert not result.is_sure
-    (rival,) = result.rivals
+    assert not result.is_accepted
+    (rival,) = result.alternatives
     stayed, moved = {(FAMILY, i) for i in range(5, 10)}, {(FAMILY, i) for i in range(5)}
     assert {frozenset(result.outliers), frozenset(rival.tags)} in ({frozenset(stayed)}, {frozenset(moved)})
     ways = [se2.log(se2.between(T, STARTS["b"])) for T in (result.T_from_to, rival.T_from_to)]

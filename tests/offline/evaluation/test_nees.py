@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.evaluation.nees import nees_per_dim, tangent_errors
+from groundsbot.offline.evaluation.nees import link_errors, nees_per_dim
 
 _N_STEPS = 12
 _STEP_M = 5.0
@@ -58,7 +58,7 @@ def test_a_map_that_bends_as_its_covariance_says_is_honest() -> None:
     for _ in range(20):
         found, true, covariance = _draw(rng)
         plain.append(_nees(found - true, covariance))
-        bent.append(_nees(tangent_errors(found, true, covariance), covariance))
+        bent.append(_nees(link_errors(found, true, covariance), covariance))
     assert _honest(bent, 4 * _N_STEPS)
     assert np.mean(plain) > 10.0  # what a straight comparison makes of the same maps
 
@@ -71,7 +71,7 @@ def test_a_place_that_is_swung_far_round_is_honest() -> None:
     for _ in range(200):
         length, angle = 10.0 + 0.01 * rng.standard_normal(), 0.25 * rng.standard_normal()
         true = length * np.array([[np.cos(angle), np.sin(angle)]])
-        nees.append(_nees(tangent_errors(found, true, covariance), covariance))
+        nees.append(_nees(link_errors(found, true, covariance), covariance))
     assert _honest(nees, 2)
 
 
@@ -94,7 +94,7 @@ def test_a_spur_that_hangs_by_a_link_of_which_little_is_known_does_not_carry_the
     jacobian = np.stack([((placed(d) - placed(-d)) / 2e-6).reshape(-1) for d in step], axis=-1)
     covariance = jacobian @ np.diag(sigma**2) @ jacobian.T
     nees = [
-        _nees(tangent_errors(found, placed(-sigma * rng.standard_normal(len(sigma))), covariance), covariance)
+        _nees(link_errors(found, placed(-sigma * rng.standard_normal(len(sigma))), covariance), covariance)
         for _ in range(100)
     ]
     assert _honest(nees, 10)
@@ -102,19 +102,19 @@ def test_a_spur_that_hangs_by_a_link_of_which_little_is_known_does_not_carry_the
 
 def test_a_covariance_that_claims_too_much_is_found_out_in_a_bent_map() -> None:
     found, true, covariance = _draw(np.random.default_rng(7))
-    errors = tangent_errors(found, true, covariance)
+    errors = link_errors(found, true, covariance)
     honest = _nees(errors, covariance)
     assert _nees(errors, covariance / 4.0) == pytest.approx(4.0 * honest)
     # a tag one centimetre off, where the map knows its neighbour to 1.4 mm
     found[7, 0] += 0.01
-    worse = _nees(tangent_errors(found, true, covariance), covariance)
+    worse = _nees(link_errors(found, true, covariance), covariance)
     assert (worse - honest) * errors.size > chi2.ppf(0.999, 2)
 
 
 def test_small_errors_stand_as_they_are() -> None:
     found, true, covariance = _draw(np.random.default_rng(8))
     small = found + 1e-4 * (true - found)
-    errors = tangent_errors(found, small, covariance)
+    errors = link_errors(found, small, covariance)
     assert errors == pytest.approx(found - small, abs=1e-3 * np.abs(found - small).max())
 
 
@@ -124,7 +124,7 @@ def test_two_runs_that_start_side_by_side_are_honest(sigmas_apart: float) -> Non
     rng = np.random.default_rng(9)
     true = np.array([[0.01 * sigmas_apart, 0.0]])
     nees = [
-        _nees(tangent_errors(true + 0.01 * rng.standard_normal((1, 2)), true, 1e-4 * np.eye(2)), 1e-4 * np.eye(2))
+        _nees(link_errors(true + 0.01 * rng.standard_normal((1, 2)), true, 1e-4 * np.eye(2)), 1e-4 * np.eye(2))
         for _ in range(400)
     ]
     assert _honest(nees, 2)
@@ -133,12 +133,12 @@ def test_two_runs_that_start_side_by_side_are_honest(sigmas_apart: float) -> Non
 @pytest.mark.parametrize("scale", [1e-9, 1e6])
 def test_units_do_not_matter(scale: float) -> None:
     found, true, covariance = _draw(np.random.default_rng(10))
-    errors = tangent_errors(scale * found, scale * true, scale**2 * covariance)
-    assert errors == pytest.approx(scale * tangent_errors(found, true, covariance), rel=1e-6)
+    errors = link_errors(scale * found, scale * true, scale**2 * covariance)
+    assert errors == pytest.approx(scale * link_errors(found, true, covariance), rel=1e-6)
 
 
 def test_places_that_may_be_one_have_no_direction() -> None:
     """A run that started where the frame did, and a tag beside it known to 10 cm: differences count as they are."""
     found, true = np.array([[0.0, 0.0], [0.02, 0.0]]), np.array([[0.003, -0.004], [-0.05, 0.01]])
-    errors = tangent_errors(found, true, np.diag([1e-4, 1e-4, 1e-2, 1e-2]))
+    errors = link_errors(found, true, np.diag([1e-4, 1e-4, 1e-2, 1e-2]))
     assert errors == pytest.approx(found - true, abs=1e-12)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation.survey import SurveyEntry, judge_survey, read_survey
+from groundsbot.offline.evaluation.survey import SurveyEntry, evaluate_survey, read_survey
 from groundsbot.offline.maps.result import Component, MapResult, TagResult
 from tests.support.data.maps import make_component, make_map
 
@@ -54,8 +54,8 @@ def test_a_good_survey_fits_with_honest_figures() -> None:
     squares, flagged = [], 0
     for seed in range(30):
         result, survey = _map_and_survey(seed)
-        (judged,) = judge_survey(result, survey).components
-        flagged += len(judged.odd)
+        (judged,) = evaluate_survey(result, survey).components
+        flagged += len(judged.outliers)
         squares.append((judged.nees_per_dim or 0.0) * (2 * _N_TAGS - 3))
         assert judged.rmse_m == pytest.approx(np.sqrt(2) * np.hypot(_SIGMA_M, 0.01), rel=0.5)
         assert abs(judged.scale_error) < 4.0 * judged.scale_sigma
@@ -69,9 +69,9 @@ def test_wrong_entries_are_named_with_their_shift() -> None:
     d = np.array([0.3, -0.2])
     survey[4] = replace(survey[4], position_m=survey[4].position_m + d)
     survey[11] = replace(survey[11], position_m=survey[11].position_m + np.array([0.0, 15.0]))
-    (judged,) = judge_survey(result, survey).components
-    assert [(entry.tag.tag_id, entry.verdict) for entry in judged.odd] == [(4, "wrong"), (11, "wrong")]
-    assert np.linalg.norm(judged.odd[0].shift_m) == pytest.approx(np.linalg.norm(d), abs=0.1)
+    (judged,) = evaluate_survey(result, survey).components
+    assert [(entry.tag.tag_id, entry.verdict) for entry in judged.outliers] == [(4, "wrong"), (11, "wrong")]
+    assert np.linalg.norm(judged.outliers[0].shift_m) == pytest.approx(np.linalg.norm(d), abs=0.1)
     assert "entry tag36h11 4 looks wrong" in "\n".join(judged.lines())
     assert judged.rmse_m < 0.06  # of those that fit
 
@@ -82,15 +82,18 @@ def test_a_swapped_pair_is_named_as_one() -> None:
         replace(survey[3], position_m=survey[8].position_m),
         replace(survey[8], position_m=survey[3].position_m),
     )
-    (judged,) = judge_survey(result, survey).components
-    assert [(e.tag.tag_id, e.verdict, e.swapped_with) for e in judged.odd] == [(3, "swapped", 8), (8, "swapped", 3)]
+    (judged,) = evaluate_survey(result, survey).components
+    assert [(e.tag.tag_id, e.verdict, e.swapped_with) for e in judged.outliers] == [
+        (3, "swapped", 8),
+        (8, "swapped", 3),
+    ]
     assert "entry tag36h11 3 looks swapped with 8" in "\n".join(judged.lines())
 
 
 def test_a_wrong_scale_is_found_with_its_sigma() -> None:
     rng = np.random.default_rng(3)
     component, true = _component(rng)
-    (judged,) = judge_survey(make_map(component), _survey(rng, true, scale=0.99)).components
+    (judged,) = evaluate_survey(make_map(component), _survey(rng, true, scale=0.99)).components
     assert judged.scale_error == pytest.approx(0.01, abs=4.0 * judged.scale_sigma)
     assert judged.scale_sigma < 0.003
 
@@ -100,30 +103,30 @@ def test_a_tag_that_two_families_share_needs_its_family() -> None:
     component = result.components[0]
     other = replace(component.tags[1], family="tag25h9", tag_id=0)
     result = make_map(replace(component, tags=(component.tags[0], other, *component.tags[2:])))
-    notes = judge_survey(result, survey).notes
+    notes = evaluate_survey(result, survey).notes
     assert notes == ("not in the map: tags 0, 1",)
     survey[0] = replace(survey[0], family="tag36h11")
-    assert judge_survey(result, survey).notes == ("not in the map: tags 1",)
+    assert evaluate_survey(result, survey).notes == ("not in the map: tags 1",)
 
 
 def test_two_shared_tags_are_too_few() -> None:
     result, survey = _map_and_survey(5)
     with pytest.raises(OfflineError, match="shares 2 tags with the map, at least three"):
-        judge_survey(result, survey[:2])
+        evaluate_survey(result, survey[:2])
 
 
 def test_a_tag_with_and_without_its_family_is_no_third_tag() -> None:
     result, survey = _map_and_survey(5)
     again = replace(survey[1], family="tag36h11")
     with pytest.raises(OfflineError, match="has tag 1 of tag36h11 twice, once without its family"):
-        judge_survey(result, [*survey[:2], again])
+        evaluate_survey(result, [*survey[:2], again])
 
 
 def test_entries_in_one_place_tell_no_direction() -> None:
     result, survey = _map_and_survey(6)
     piled = [replace(entry, position_m=np.zeros(2)) for entry in survey]
     with pytest.raises(OfflineError, match="all in one place"):
-        judge_survey(result, piled)
+        evaluate_survey(result, piled)
 
 
 def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
@@ -133,8 +136,8 @@ def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
     board = tuple(replace(tag, position_m=np.zeros(2)) for tag in component.tags[:3])
     result = make_map(replace(component, tags=(*board, *component.tags[3:])))
     piled = [replace(entry, position_m=np.zeros(2)) for entry in survey[:3]]
-    (judged,) = judge_survey(result, [*piled, replace(survey[14], position_m=np.array([1e3, 0.0]))]).components
-    assert [entry.tag.tag_id for entry in judged.odd] == [14]
+    (judged,) = evaluate_survey(result, [*piled, replace(survey[14], position_m=np.array([1e3, 0.0]))]).components
+    assert [entry.tag.tag_id for entry in judged.outliers] == [14]
 
 
 @pytest.mark.parametrize(

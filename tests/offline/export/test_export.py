@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.maps.files import read_map, write_map
-from groundsbot.offline.maps.fit_results import SuspectTag
+from groundsbot.offline.maps.fit_results import OutlierTag
 from groundsbot.offline.maps.result import Component
 from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log
@@ -270,8 +270,8 @@ def test_a_map_without_its_graph_is_told(run: Run, tmp_path: Path) -> None:
 
 
 def test_tags_that_the_map_mistrusts_are_named(run: Run, tmp_path: Path) -> None:
-    suspects = (SuspectTag("tag36h11", 3, "moved", ("blue_two",), "it is 2 m off"),)
-    write_map(replace(make_map(), suspects=suspects), tmp_path)
+    suspects = (OutlierTag("tag36h11", 3, "moved", ("blue_two",), "it is 2 m off"),)
+    write_map(replace(make_map(), outliers=suspects), tmp_path)
     outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out")
     assert "warning: suspect: tag 3 (tag36h11) moved: it is 2 m off" in outcome.out
 

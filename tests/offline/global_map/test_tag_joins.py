@@ -72,7 +72,7 @@ def off_sigmas(result: MapResult) -> float:
 def test_one_tag_seen_well_joins_two_runs_and_is_said_to_be_weak(joined: MapResult) -> None:
     assert len(joined.components) == 1
     (alignment,) = joined.alignments
-    assert (alignment.is_sure, alignment.is_weak, alignment.n_shared) == (True, True, 1)
+    assert (alignment.is_accepted, alignment.is_weak, alignment.n_shared) == (True, True, 1)
     assert off_sigmas(joined) < chi2.isf(1e-4, 3)
     assert any("by tag 4 alone (weak: its start is known to" in warning for warning in joined.warnings)
     assert not any(warning.startswith("component") for warning in joined.warnings)
@@ -130,7 +130,7 @@ def test_what_one_tag_does_not_settle_stays_apart(
     result = build_map(pair, NOISE, corners=True)
     assert len(result.components) == 2
     assert any(reason in warning for warning in result.warnings), result.warnings
-    assert all(not alignment.is_sure for alignment in result.alignments)
+    assert all(not alignment.is_accepted for alignment in result.alignments)
 
 
 def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> None:
@@ -138,7 +138,7 @@ def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> N
     pair = [seeing(runs["a"], 2, 3, 0, looks=few), seeing(runs["b"], 5, 6, 7, 0, looks=few)]
     (alignment,) = build_map(pair, NOISE, corners=True).alignments
     true = se2.between(STARTS[alignment.from_run[0]], STARTS[alignment.to_run[0]])
-    ways = [alignment.T_from_to, *(rival.T_from_to for rival in alignment.rivals)]
+    ways = [alignment.T_from_to, *(rival.T_from_to for rival in alignment.alternatives)]
     assert len(ways) > 1
     assert min(abs(float(se2.wrap_angle(way[2] - true[2]))) for way in ways) < np.radians(5.0)
 
@@ -175,5 +175,5 @@ def test_a_ring_that_does_not_close_joins_nothing(runs: dict[str, Run]) -> None:
     ring = [seeing(runs["a"], 0, 4, 6), seeing(runs["b"], 1, 4, 5), seeing(runs["shifted"], 2, 5, 6)]
     result = build_map(ring, NOISE, corners=True)
     told = [warning for warning in result.warnings if warning.startswith("component")]
-    assert not any(alignment.is_sure and not alignment.is_weak for alignment in result.alignments)
+    assert not any(alignment.is_accepted and not alignment.is_weak for alignment in result.alignments)
     assert told

@@ -103,12 +103,12 @@ def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_b
     runs = [run_of(name, (1, 2, 3), 1.03, make_robot(name, **wide)) for name in ("a", "b")]
     apart_m = float(np.linalg.norm(np.subtract(PLACES[1], PLACES[3])))
     free = map_runs(runs)
-    (metre,) = free.metres
+    (metre,) = free.scale_budgets
     assert metre.sigma > 0.02
     assert metre.shares["distances"] == 0.0
     assert np.linalg.norm(tag(free, 1) - tag(free, 3)) < 0.985 * apart_m
     taped = map_runs(runs, distances=[f"1,3={apart_m!r},0.001"])
-    (metre,) = taped.metres
+    (metre,) = taped.scale_budgets
     assert metre.sigma == pytest.approx(0.001 / apart_m, rel=0.01)
     assert metre.shares["distances"] > 0.99
     assert sum(metre.shares.values()) == pytest.approx(1.0)
@@ -137,7 +137,7 @@ def test_tags_outvote_a_start_that_was_written_down_wrong() -> None:
     ids = (1, 2, 3, 4, 5)
     runs = [run_of("a", ids), run_of("b", ids, places=PLACES | {5: (2.0, 2.0)})]
     result = map_runs(runs, ["b_one=15,0,2,0.05,0.05,0.02"])
-    assert result.alignments[0].is_sure
+    assert result.alignments[0].is_accepted
     np.testing.assert_allclose(result.alignments[0].T_from_to, STARTS["b"], atol=1e-3)
     assert any("--start b_one: measured (15.000, 0.000) m" in warning for warning in result.warnings)
 

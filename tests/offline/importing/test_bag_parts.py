@@ -20,7 +20,7 @@ from groundsbot.offline.importing.bags.pictures import picture_of
 from groundsbot.offline.importing.bags.positions import planar_covariance
 from groundsbot.offline.importing.bags.reader import BagTopic, open_bag
 from groundsbot.offline.importing.bags.tags import BagTag, read_picture
-from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, the_camera_info
+from groundsbot.offline.importing.bags.topics import APRILTAG_MSGS, IMAGE, BagOptions, choose_topics, only_camera_info
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.importing.run_writer import ImportReport
 from groundsbot.offline.measurements.run import Run, load_run
@@ -113,10 +113,10 @@ def test_odometry_goes_before_joints_and_detections_before_pictures(log: Path) -
     chosen = choose_topics(log, topics, BagOptions())
     assert (chosen.odometry.name, chosen.tags.name) == ("/odom", "/tags")
     with pytest.raises(GroundsbotError, match=r"2 topics fit: /a/camera_info .*; choose one with --camera-info-topic"):
-        the_camera_info(log, chosen)
+        only_camera_info(log, chosen)
     chosen = choose_topics(log, topics, BagOptions(odometry_topic="/joint_states", image_topic="/b/image_raw"))
     assert (chosen.odometry.name, chosen.tags.name) == ("/joint_states", "/b/image_raw")
-    camera_info = the_camera_info(log, chosen)
+    camera_info = only_camera_info(log, chosen)
     assert camera_info is not None
     assert camera_info.name == "/b/camera_info"
 
@@ -260,16 +260,16 @@ def test_frames_are_joined_over_what_they_both_hang_on() -> None:
         ("odom", "base_footprint", (1, 0, 0)),
         ("odom", "base_footprint", (2, 0, 0)),
     )
-    assert frames.joins("base_footprint", "camera")
-    assert frames.joins("camera", "base_link")
+    assert frames.are_connected("base_footprint", "camera")
+    assert frames.are_connected("camera", "base_link")
     np.testing.assert_allclose(frames.transform("base_link", "camera").apply([0, 0, 1]), [0.2, 0.05, 1.3])
-    assert not frames.joins("odom", "camera")
-    assert frames.moving_near("camera") == "base_footprint"
+    assert not frames.are_connected("odom", "camera")
+    assert frames.moving_root("camera") == "base_footprint"
 
 
 def test_frames_in_a_circle_come_to_an_end() -> None:
     frames = fixed_frames(("a", "b", (0, 0, 1)), ("b", "a", (0, 0, 1)))
-    assert not frames.joins("a", "camera")
+    assert not frames.are_connected("a", "camera")
 
 
 def test_a_mount_is_the_transform_it_came_from() -> None:

@@ -66,7 +66,8 @@ def test_a_fitted_noise_and_what_readings_share_are_held(folder: Path) -> None:
     extended = build_map(runs_of(folder, "c"), extending=shared)
     assert (extended.noise, extended.noise_fit) == (shared.noise, shared.noise_fit)
     wide, narrow = (
-        build_map(runs_of(folder, "c"), extending=each).kept[-1].reading_covariance[:, 0, 0] for each in (shared, known)
+        build_map(runs_of(folder, "c"), extending=each).archived_segments[-1].reading_covariance[:, 0, 0]
+        for each in (shared, known)
     )
     assert (wide > 1.1 * narrow).all()
 
@@ -75,7 +76,7 @@ def test_an_extended_map_can_be_extended_and_reads_back(folder: Path, tmp_path: 
     one = build_map(runs_of(folder, "b"), extending=build_map(runs_of(folder, "a"), NOISE))
     write_map(one, tmp_path)
     again = read_map(tmp_path)
-    assert [kept.name for kept in again.kept] == ["a_one", "b_one", "b_one_stretch2"]
+    assert [kept.name for kept in again.archived_segments] == ["a_one", "b_one", "b_one_stretch2"]
     two = build_map(runs_of(folder, "c"), extending=again)
     assert [run.name for run in two.runs] == ["a_one", "b_one", "b_one_stretch2", "c_one"]
 
@@ -89,8 +90,8 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
         return str(caught.value)
 
     assert "is in the map already" in told(runs=runs_of(folder, "a"))
-    assert "does not contain its runs' measurements" in told(extending=replace(known, kept=()))
-    kept = arrays_of(known.kept[0], "")
+    assert "does not contain its runs' measurements" in told(extending=replace(known, archived_segments=()))
+    kept = arrays_of(known.archived_segments[0], "")
     older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
     assert (segment_from(kept, "") is None, segment_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
@@ -104,7 +105,7 @@ def test_the_command_writes_elsewhere(run: Program, folder: Path, tmp_path: Path
     assert (done.code, done.err) == (0, "")
     assert "in one map, in the frame of a_one's start" in done.out
     result: MapResult = read_map(tmp_path / "out")
-    assert len(result.kept) == 4
+    assert len(result.archived_segments) == 4
     for options, words in (
         (["-o", folder / "map", "--overwrite"], "inputs are not changed"),
         (["-o", tmp_path / "new", "--noise", folder / "map" / "map.json"], "--noise: a map is extended with its own"),

@@ -60,7 +60,7 @@ def observe(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: Ma
 
 def test_two_tags_in_one_picture_are_duplicated() -> None:
     result = build_map([drive_past(TAGS)], NoiseParameters())
-    (suspect,) = result.suspects
+    (suspect,) = result.outliers
     assert (suspect.tag_id, suspect.kind) == (0, "duplicated")
     places = [tag.position_m[:2] for tag in result.components[0].tags if tag.tag_id == 0]
     assert len(places) == 2

@@ -69,13 +69,13 @@ SWAPPED = {3: HALL[4], 4: HALL[3]}
 
 def test_a_hall_as_it_was_has_no_suspects() -> None:
     result = map_runs({}, {}, {}, {})
-    assert result.suspects == ()
+    assert result.outliers == ()
     assert all(tag.instance == "" for tag in result.components[0].tags)
 
 
 def test_a_moved_tag_is_named_and_has_two_places() -> None:
     result = map_runs({}, {}, MOVED, MOVED)
-    (suspect,) = result.suspects
+    (suspect,) = result.outliers
     assert (suspect.tag_id, suspect.kind, suspect.runs) == (3, "moved", ("c_one", "d_one"))
     assert "by 1.0" in suspect.evidence
     assert "in a_one and b_one (2 readings), then in c_one and d_one (2 readings)" in suspect.evidence
@@ -88,14 +88,14 @@ def test_a_moved_tag_is_named_and_has_two_places() -> None:
 
 def test_suspects_can_be_kept(tmp_path: Path) -> None:
     result = map_runs({}, {}, MOVED, MOVED, keep_suspects=True)
-    assert [each.kind for each in result.suspects] == ["moved"]
+    assert [each.kind for each in result.outliers] == ["moved"]
     assert [tag.instance for tag in result.components[0].tags if tag.tag_id == 3] == [""]
     assert any(line.startswith("suspect: tag 3 (tag36h11) moved: by") for line in summary(result, tmp_path))
 
 
 def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
     result = map_runs({}, {}, SWAPPED, SWAPPED)
-    assert [(each.tag_id, each.kind, each.swapped_with) for each in result.suspects] == [
+    assert [(each.tag_id, each.kind, each.swapped_with) for each in result.outliers] == [
         (3, "swapped", 4),
         (4, "swapped", 3),
     ]
@@ -103,14 +103,14 @@ def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
     entries = json.loads((tmp_path / "map.json").read_text())["suspect_tags"]
     assert [entry["swapped_with"] for entry in entries] == [4, 3]
     assert set(entries[0]) == {"family", "tag_id", "kind", "runs", "evidence", "swapped_with"}
-    assert read_map(tmp_path).suspects == result.suspects
+    assert read_map(tmp_path).outliers == result.outliers
     rows = (tmp_path / "tags.csv").read_text().splitlines()
     assert sum(",a," in row or ",b," in row for row in rows) == 4
 
 
 def test_there_and_back_is_two_tags_with_one_id() -> None:
     far = {3: HALL[3] + [4.0, -2.5]}
-    (suspect,) = map_runs({}, far, {}, far).suspects
+    (suspect,) = map_runs({}, far, {}, far).outliers
     assert (suspect.tag_id, suspect.kind) == (3, "duplicated")
     assert suspect.runs == ("a_one", "b_one", "c_one", "d_one")
 
@@ -118,7 +118,7 @@ def test_there_and_back_is_two_tags_with_one_id() -> None:
 def test_a_run_that_has_most_of_its_tags_elsewhere_is_wrong_itself() -> None:
     angle = np.linspace(0.0, 6.0, 5)
     shifted = {i: HALL[i] + 1.5 * np.array([np.cos(angle[i]), np.sin(angle[i])]) for i in range(5)}
-    suspects = map_runs({}, {}, shifted, {}).suspects
+    suspects = map_runs({}, {}, shifted, {}).outliers
     assert {(each.tag_id, each.kind, each.runs) for each in suspects} == {
         (i, "inconsistent", ("c_one",)) for i in range(5)
     }

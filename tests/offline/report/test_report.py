@@ -18,7 +18,7 @@ from groundsbot.offline.measurements.run import RunEvent
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.page import as_script_data, page
 from groundsbot.offline.report.report import write_report
-from groundsbot.offline.report.sentences import _metres, sentences
+from groundsbot.offline.report.sentences import _length_text, sentences
 from groundsbot.offline.report.tables import tables
 from tests.support.browser import Page, browser, chromium
 from tests.support.data.drives import START_NS, S, make_robot, write_drive
@@ -119,9 +119,9 @@ def test_the_sentences_are_those_of_the_map(made: Path) -> None:
     heading_deg = np.degrees(document["components"][0]["heading_sigma_rad"])
     (pair,) = document["start_to_start"]
     for part in (
-        f"Tags are known to {_metres(np.median(shape))} relative to each other",
-        f"the worst, tag {worst['tag_id']}, to {_metres(max(shape))})",
-        f"whose heading is uncertain by {heading_deg:.1f} degrees, to {_metres(np.median(sigmas))}",
+        f"Tags are known to {_length_text(np.median(shape))} relative to each other",
+        f"the worst, tag {worst['tag_id']}, to {_length_text(max(shape))})",
+        f"whose heading is uncertain by {heading_deg:.1f} degrees, to {_length_text(np.median(sigmas))}",
         f"it is {pair['distance_m']:.2f} m, sigma {100.0 * pair['sigma_m']:.1f} cm",
     ):
         assert part in words[1]

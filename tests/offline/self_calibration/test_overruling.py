@@ -48,7 +48,7 @@ def shape_m(result: MapResult, drives: Path) -> float:
 def test_all_is_found_that_is_off_by_far(result: MapResult, drives: Path) -> None:
     true = json.loads((drives / TRUTH_FILE).read_text())
     assert len(result.components) == 1
-    assert result.suspects == ()
+    assert result.outliers == ()
     found = {(each.owner, each.name): each for each in result.robot_numbers}
     for robot in ("hallway", "loop"):
         parameters = true["runs"][f"{robot}_seed{SEED}"]["parameters"]

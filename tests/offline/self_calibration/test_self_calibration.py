@@ -165,7 +165,7 @@ def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_t
     result = map_runs(log, long_wheels.model_copy(update={"tags": sure}))
     assert freed_names(result) == {"wheel_scale"}
     assert value_of(result, "wheel_scale") == pytest.approx(1.0 / 1.05 - 1.0, abs=3e-3)
-    (metre,) = result.metres
+    (metre,) = result.scale_budgets
     assert metre.shares["tags"] > 0.9
 
 

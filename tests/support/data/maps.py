@@ -67,7 +67,7 @@ def make_map(*components: Component) -> MapResult:
             MeasurementResult("distance", "red_one", "tag36h11:3", np.array([4.1]), np.array([0.01]), None),
         ),
         checks=(ConsistencyCheck("turn", 0, "red", None, 0.01, 0.002, 0.01),),
-        metres=(ScaleBudget(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
+        scale_budgets=(ScaleBudget(0, 0.003, {"wheels": 0.75, "tags": 0.25}),),
         warnings=("tag 9 lies elsewhere",),
         advice=(
             AdviceResult(
