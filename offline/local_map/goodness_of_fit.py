@@ -5,8 +5,9 @@ whole converged to, windows converge correctly, and their residuals determine th
 whole is the same problem under conditions: windows join, and a tag has one position. The cost of these conditions, in
 squared sigmas of the fitted noise, is chi-square with as many degrees of freedom as there are conditions (the test of
 nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise is fitted. A
-single wrong observation costs the same on either side. Correlated errors of neighbouring observations of a tag do not
-show one by one, but do where a tag is observed again; `correlated_errors` fits their size.
+single wrong observation costs the same on either side. Windows know an uncertain calibration less well, and it is more
+biased in them (`calibration_bias`); what this costs does not count. Correlated errors of neighbouring observations of a
+tag do not show one by one, but do where a tag is observed again; `correlated_errors` fits their size.
 """
 
 import math
@@ -18,6 +19,7 @@ from scipy import stats
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions
+from groundsbot.offline.local_map.calibration_bias import cost_of_calibration_bias
 from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
@@ -107,7 +109,7 @@ class Windows:
             carried corrupts a few of them. 0 where there are too few windows.
         sharing: (M, 2) further factors on each observation's sigmas, for correlated errors of its neighbours.
         freedom: effective degrees of freedom of the noise estimate.
-        cost: of the separate windows under that noise.
+        apart: the separate windows solved under that noise.
         n_conditions: number of parameters by which the windows exceed the whole.
         effort: solve budget of the logs, None if unlimited, and the share of it for a solve of the whole.
     """
@@ -118,7 +120,7 @@ class Windows:
     trimmed_factors: FloatArray
     correlated_error_factors: FloatArray
     degrees_of_freedom: float
-    cost: float
+    apart: Solution
     n_conditions: int
     effort: SolveBudget | None = None
     share: float = 1.0
@@ -131,11 +133,14 @@ class Windows:
         if self.effort:
             self.effort.spend(together)
         n = self.n_conditions
-        quantile = stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom) if n else 1.0
+        bound = float(n * stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom)) if n else 0.0
+        chi_square = max(0.0, 2.0 * (together.cost - self.apart.cost))
+        if n and chi_square > bound and self.apart.converged and together.converged:
+            chi_square = max(0.0, chi_square - cost_of_calibration_bias(self.apart, together))
         return GoodnessOfFit(
-            chi_square=max(0.0, 2.0 * (together.cost - self.cost)),
+            chi_square=chi_square,
             expected=n,
-            bound=float(n * quantile),
+            bound=bound,
             odometry_factor=float(self.factors[0]),
             reading_factor=float(self.factors[1]),
         )
@@ -207,7 +212,7 @@ def fit_windows(
     if effort:
         effort.spend(solution)
     usual = factors * _trimmed_factors(solution)
-    return Windows(problem, losses, factors, usual, sharing, freedom, solution.cost, n_conditions, effort, share)
+    return Windows(problem, losses, factors, usual, sharing, freedom, replace(solution), n_conditions, effort, share)
 
 
 def _trimmed_factors(solution: Solution) -> FloatArray:

@@ -157,28 +157,31 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
-    return _with_edges_at_solved_ranges(best, effort) if far_larger else best
+    return _with_edges_at_solved_ranges(best, effort)
 
 
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
-    """Return the map of noisy ranges solved again, with what depends on ranges evaluated at those of the map."""
+    """Return the map solved again, with what depends on ranges evaluated at those of the map.
 
-    def with_solved_ranges(segment: Segment) -> Segment:
-        graph = build_graph([segment])
-        state = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-        return replace(segment, readings=segment.readings.with_edges_at(graph.problem.readings.ranges_m(state)))
-
-    segment = with_solved_ranges(local_map.segment)
-    if not segment.readings.from_corners.any():
+    At measured ranges it would go along with their errors: see `Readings.with_edges_at`.
+    """
+    if not local_map.segment.readings.from_corners.any():
         return local_map
+    ranges_m = local_map.graph.problem.readings.ranges_m(local_map.solution.state)
+    segment = replace(local_map.segment, readings=local_map.segment.readings.with_edges_at(ranges_m))
     graph = build_graph([segment])
-    start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-    solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
+    solution = solve(
+        graph.problem,
+        local_map.solution.state,
+        most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE),
+    )
     graph.problem.arrowhead.without_scratch()
     whole = local_map.unfiltered
-    return replace(
-        local_map, segment=segment, graph=graph, solution=solution, unfiltered=whole and with_solved_ranges(whole)
-    )
+    if whole is not None:
+        unfiltered = build_graph([whole])
+        state = unfiltered.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
+        whole = replace(whole, readings=whole.readings.with_edges_at(unfiltered.problem.readings.ranges_m(state)))
+    return replace(local_map, segment=segment, graph=graph, solution=solution, unfiltered=whole)
 
 
 class WindowNoise(NamedTuple):

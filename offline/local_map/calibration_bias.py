@@ -1,0 +1,137 @@
+"""Bias of a calibration that is estimated together with poses, to first order.
+
+A joint solve maximises the likelihood over poses instead of integrating them out. There are as many poses as
+observations, so this biases what all of them share (Neyman and Scott, "Consistent estimates based on partially
+consistent observations", 1948). With poses x, tags and calibration y, and H_xx the information of the poses alone, the
+integrated likelihood has another term, -1/2 log det H_xx(x, y) (Laplace's approximation; Cox and Reid, "Parameter
+orthogonality and approximate conditional inference", 1987). Its gradient q moves the optimum by -H^-1 q.
+
+This holds where wheels slip at random about what they count, and noise is white and as large as assumed. Errors that
+last are counted with larger sigmas than they scatter by, and then the bias is less. The shift is therefore a bound, not
+a correction: of three recordings with known landmarks (MRCLAM sets 2, 4 and 9) it made two worse when applied.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam import PLAIN_SQUARES, Columns, Problem, Solution, State, factorise, losses_and_weights
+
+
+def calibration_bias(solution: Solution) -> FloatArray:
+    """Return (C,) by how much calibration changes when poses are integrated out; 0 where it is held."""
+    problem, state = solution.problem, solution.state
+    gradient = _gradient(problem, state, _conditional_covariances(solution), _weights(solution))
+    columns = problem.columns.calibration
+    return np.where(columns >= 0, -np.append(solution.factorisation.solve(gradient), 0.0)[columns], 0.0)
+
+
+def cost_of_calibration_bias(apart: Solution, together: Solution) -> float:
+    """Return the cost, in squared sigmas, of the difference in calibration that biases explain.
+
+    The difference between the two estimates, weighed by the information of the first, may contain any share of the
+    difference between their biases. The share that explains most of it is taken.
+
+    Args:
+        apart: windows, which share the calibration only.
+        together: the same observations as one map.
+    """
+    free = apart.problem.columns.calibration >= 0
+    if not free.any():
+        return 0.0
+    information = np.linalg.inv(apart.covariance(apart.problem.columns.calibration[free]))
+    difference = (apart.state.calibration - together.state.calibration)[free]
+    bias = (calibration_bias(apart) - calibration_bias(together))[free]
+    weighed = information @ bias
+    share = np.clip(-(difference @ weighed) / max(float(bias @ weighed), np.finfo(np.float64).tiny), 0.0, 1.0)
+    left = difference + share * bias
+    return max(0.0, float(difference @ information @ difference - left @ information @ left))
+
+
+def _weights(solution: Solution) -> FloatArray:
+    """Return (M,) robust weights of the observations."""
+    _, weights = losses_and_weights(solution.losses.readings, solution.problem.readings.residual(solution.state))
+    return weights
+
+
+def _conditional_covariances(solution: Solution) -> FloatArray:
+    """Return (P, 3, 3) of the poses where tags and calibration are known."""
+    problem = solution.problem
+    columns = problem.columns
+    free = columns.poses >= 0
+    poses = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
+    alone = Columns(poses, np.full_like(columns.tags, -1), np.full_like(columns.calibration, -1), int(free.sum()))
+    readings = problem.readings.whitening * np.sqrt(_weights(solution))[:, None, None]
+    held = replace(problem, columns=alone, readings=replace(problem.readings, whitening=readings))
+    system, _ = held.arrowhead.linearise(solution.state, *PLAIN_SQUARES)
+    factorisation, _ = factorise(held.arrowhead, system, 0.0)  # a drive without tags is not determined
+    return factorisation.pose_covariances(np.arange(len(poses)))
+
+
+def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return (n,) gradient of 1/2 log det H_xx in the tangent space.
+
+    Each observation adds w/2 tr(P K) to it, with P the information on the tag's place in base (u, at distance r and
+    direction psi from the sensor), and K the covariance of that place by the pose:
+
+        K = A C A^T,  A = [-I, (u_y, -u_x)^T],   P = R(psi) diag(1, 1/r) Omega diag(1, 1/r) R(psi)^T / (1 + tag scale)^2
+
+    Odometry adds nothing: its derivatives by the poses do not depend on where these are. Scaling wheels and tags
+    together scales all poses alike, which must not count; this fixes the derivative by the wheels' scale.
+    """
+    readings, columns = problem.readings, problem.columns
+    mount = readings.mount + state.calibration[readings.mount_parameters]
+    scale = 1.0 + state.calibration[readings.scale_parameter]
+    place = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
+    from_mount = place - mount[:, :2]
+    distance = np.maximum(np.hypot(from_mount[:, 0], from_mount[:, 1]), 1e-6)
+    polar = readings.polar
+    psi = np.where(polar, np.arctan2(from_mount[:, 1], from_mount[:, 0]), mount[:, 2])
+    range_ = np.where(polar, distance / scale, 1.0)
+    along = np.stack([np.cos(psi), np.sin(psi)], axis=-1)
+    turned = np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=-1)], axis=-1)  # R(psi)
+    omega = readings.whitening.swapaxes(-1, -2) @ readings.whitening
+    own = np.stack([np.ones_like(range_), 1.0 / range_], axis=-1)
+    own_information = omega * own[:, :, None] * own[:, None, :]
+    information = turned @ own_information @ turned.swapaxes(-1, -2) / (scale**2)[:, None, None]
+    covariance = covariances[readings.pose]
+    by_pose = np.zeros((len(place), 2, 3))  # A
+    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
+    by_pose[:, 0, 2], by_pose[:, 1, 2] = place[:, 1], -place[:, 0]
+    of_place = by_pose @ covariance @ by_pose.swapaxes(-1, -2)  # K
+    (k11, k12), (_, k22) = np.moveaxis(turned.swapaxes(-1, -2) @ of_place @ turned, 0, -1)
+    (i11, i12), (_, i22) = np.moveaxis(own_information, 0, -1)
+    half = 0.5 * weights / scale**2
+    by_psi = half * 2.0 * (i11 * k12 + i12 * (k22 - k11) - i22 * k12)
+    by_distance = np.where(polar, -half * 2.0 * (i12 * k12 + i22 * k22) / distance, 0.0)
+    # The information changes with the direction and distance from the sensor, the covariance with the place in base.
+    across = turned[..., 1] / distance[:, None]
+    by_sensor = np.where(polar[:, None], by_psi[:, None] * across + by_distance[:, None] * along, 0.0)
+    pulled = np.einsum("mij,mjk,mk->mi", information, by_pose, covariance[..., 2])
+    by_place = by_sensor + weights[:, None] * np.stack([-pulled[:, 1], pulled[:, 0]], axis=-1)
+    # At a given place the range by the tags' stated size is less by the scale, and so are the terms with 1 / r.
+    by_scale = np.where(
+        polar,
+        -2.0 * (half / scale) * (i11 * k11 + i12 * k12),
+        -2.0 * (half / scale) * (i11 * k11 + 2.0 * i12 * k12 + i22 * k22),
+    )
+    gradient = np.zeros(columns.n + 1)  # the last one takes what is held
+    theta = state.poses[readings.pose, 2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    in_map = np.stack([cos * by_place[:, 0] - sin * by_place[:, 1], sin * by_place[:, 0] + cos * by_place[:, 1]], -1)
+    by_wheels = -(by_place * place).sum(axis=1) - by_scale * scale
+    parameter = np.zeros(len(state.poses), dtype=np.int64)
+    for end in (0, 1):
+        parameter[problem.odometry.first + end] = problem.odometry.parameters[:, 0]
+    for at, values in (
+        (columns.poses[readings.pose], np.einsum("mi,mij->mj", by_place, by_pose)),
+        (columns.tags[readings.tag], in_map),
+        (columns.calibration[readings.mount_parameters[:, :2]], -by_sensor),
+        (columns.calibration[readings.mount_parameters[:, 2]], np.where(polar, 0.0, by_psi)),
+        (columns.calibration[readings.scale_parameter], by_scale),
+        (columns.calibration[parameter[readings.pose]], by_wheels),
+    ):
+        np.add.at(gradient, at, values)
+    return gradient[:-1]
