@@ -22,6 +22,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import TagKey
+from groundsbot.offline.sam import covariance_with_bias
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
     which = np.array([index[tag] for tag in tags], dtype=np.int64)
     pose = problem.anchor[which]
     columns = np.concatenate([problem.columns.poses[pose].reshape(-1), problem.columns.tags[which].reshape(-1)])
-    joint = variance_factor * local_map.solution.covariance(columns)
+    joint = variance_factor * covariance_with_bias(local_map.solution, columns)
     T_start_anchor = state.poses[pose]
     tag_m = se2.apply(se2.inverse(T_start_anchor), state.tags[which])
     return CondensedMap(

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Mount
 from groundsbot.offline.alignment import Group
@@ -26,7 +26,16 @@ from groundsbot.offline.maps import (
     nominal_row,
 )
 from groundsbot.offline.measurements import Measurements, TagKey
-from groundsbot.offline.sam import COST_TOLERANCE, Graph, Parameter, Solution, State, build_graph, solve
+from groundsbot.offline.sam import (
+    COST_TOLERANCE,
+    Graph,
+    Parameter,
+    Solution,
+    State,
+    build_graph,
+    covariance_with_bias,
+    solve,
+)
 
 # Where many residuals exceed the loss's threshold, steps become short; a hundredth of a sigma suffices there.
 _NOISY_COST_TOLERANCE: Final = 1e-6
@@ -59,7 +68,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     starts = graph.first_pose
     free = np.flatnonzero(columns.calibration >= 0)
     places = np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)])
-    whole = last.covariance(np.concatenate([places, columns.calibration[free]]))
+    whole = _covariance(last, np.concatenate([places, columns.calibration[free]]))
     joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
     n_starts = 3 * len(starts)
     runs = tuple(
@@ -92,12 +101,17 @@ def calibration_of(
 ) -> list[CalibrationResult]:
     """Return the estimates of the calibration parameters in the solve."""
     columns = solution.problem.columns.calibration
-    sigmas = np.sqrt(np.diag(solution.covariance(columns)))
+    sigmas = np.sqrt(np.diag(_covariance(solution, columns)))
     return [
         CalibrationResult(parameter.owner, parameter.name, component, float(value), float(sigma), parameter.sigma)
         for parameter, value, sigma, column in zip(parameters, solution.state.calibration, sigmas, columns, strict=True)
         if column >= 0
     ]
+
+
+def _covariance(solution: Solution | CornerSolution, columns: IntArray) -> FloatArray:
+    """Return the joint covariance (k, k) of k columns of the tangent vector, of the bias too where that is known."""
+    return covariance_with_bias(solution, columns) if isinstance(solution, Solution) else solution.covariance(columns)
 
 
 def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:

@@ -6,7 +6,7 @@ whole is the same problem under conditions: windows join, and a tag has one posi
 squared sigmas of the fitted noise, is chi-square with as many degrees of freedom as there are conditions (the test of
 nested linear models: Seber and Lee, "Linear Regression Analysis", 2003, chapter 4), and F since the noise is fitted. A
 single wrong observation costs the same on either side. Windows know an uncertain calibration less well, and it is more
-biased in them (`calibration_bias`); what this costs does not count. Correlated errors of neighbouring observations of a
+biased in them (`sam.bias`); what this costs does not count. Correlated errors of neighbouring observations of a
 tag do not show one by one, but do where a tag is observed again; `correlated_errors` fits their size.
 """
 
@@ -19,7 +19,6 @@ from scipy import stats
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions
-from groundsbot.offline.local_map.calibration_bias import cost_of_calibration_bias
 from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
@@ -32,6 +31,7 @@ from groundsbot.offline.sam import (
     Solution,
     SolveBudget,
     State,
+    bias_of,
     losses_and_weights,
     solve,
     stack,
@@ -136,7 +136,7 @@ class Windows:
         bound = float(n * stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom)) if n else 0.0
         chi_square = max(0.0, 2.0 * (together.cost - self.apart.cost))
         if n and chi_square > bound and self.apart.converged and together.converged:
-            chi_square = max(0.0, chi_square - cost_of_calibration_bias(self.apart, together))
+            chi_square = max(0.0, chi_square - _cost_of_bias(self.apart, together))
         return GoodnessOfFit(
             chi_square=chi_square,
             expected=n,
@@ -144,6 +144,29 @@ class Windows:
             odometry_factor=float(self.factors[0]),
             reading_factor=float(self.factors[1]),
         )
+
+
+def _cost_of_bias(apart: Solution, together: Solution) -> float:
+    """Return the cost, in squared sigmas, of the difference in calibration that biases explain.
+
+    The difference between the two estimates, weighed by the information of the first, may contain any share of the
+    difference between their biases. The share that explains most of it is taken.
+
+    Args:
+        apart: windows, which share the calibration only.
+        together: the same observations as one map.
+    """
+    columns = apart.problem.columns.calibration
+    free = columns >= 0
+    if not free.any():
+        return 0.0
+    information = np.linalg.inv(apart.covariance(columns[free]))
+    difference = (apart.state.calibration - together.state.calibration)[free]
+    bias = bias_of(apart)[columns[free]] - bias_of(together)[together.problem.columns.calibration[free]]
+    weighed = information @ bias
+    share = np.clip(-(difference @ weighed) / max(float(bias @ weighed), np.finfo(np.float64).tiny), 0.0, 1.0)
+    left = difference + share * bias
+    return max(0.0, float(difference @ information @ difference - left @ information @ left))
 
 
 def fit_windows(

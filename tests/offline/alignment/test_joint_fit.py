@@ -15,6 +15,7 @@ from groundsbot.offline.alignment.pairwise import align
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.sam.bias import covariance_with_bias
 from tests.support.data.long_drives import NOISE, make_long_drive, make_town
 
 
@@ -59,7 +60,7 @@ def test_a_condensed_map_has_the_places_and_the_covariance_of_the_solve() -> Non
     np.testing.assert_allclose(places, condensed.tags_m, atol=1e-9)
     # The tree leaves its root where it is: distances between tags know nothing of that.
     columns = local_map.graph.problem.columns.tags
-    full = 4.0 * local_map.solution.covariance(columns.reshape(-1))
+    full = 4.0 * covariance_with_bias(local_map.solution, columns.reshape(-1))
     own = jacobian @ tree.covariance @ jacobian.T
     for i, j in ((0, 1), (2, len(tags) - 1)):
         along = (places[j] - places[i]) / np.linalg.norm(places[j] - places[i])

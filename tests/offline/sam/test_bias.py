@@ -10,10 +10,11 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline.local_map import calibration_bias as bias
+from groundsbot.offline.local_map.goodness_of_fit import _cost_of_bias
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.measurements.segment import segments_of
+from groundsbot.offline.sam import bias
 from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from groundsbot.offline.self_calibration.robot import with_unknown_calibration
@@ -48,7 +49,8 @@ def test_the_gradient_is_that_of_dense_algebra(seed: int, polar: bool) -> None:
     problem = replace(made.problem, readings=readings)
     state = random_state(seed, made.truth, spread=0.02)
     solution = Solution(state, (0.0,), "", converged=True, problem=problem, losses=PLAIN_SQUARES)
-    found = bias._gradient(problem, state, bias._conditional_covariances(solution), np.ones(len(readings.tag)))
+    weights = np.ones(len(readings.tag))
+    found = bias._gradient(problem, state, bias._conditional_covariances(solution, weights), weights)
     expected = numeric(problem, state)
     wheel_scales = problem.columns.calibration[problem.odometry.parameters[:, 0]]
     rest = np.setdiff1d(np.arange(problem.columns.n), wheel_scales)
@@ -59,7 +61,6 @@ def test_the_gradient_is_that_of_dense_algebra(seed: int, polar: bool) -> None:
 def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it() -> None:
     made = make_problem(1)
     together = solve(made.problem, made.truth)
-    shift = bias.calibration_bias(together)
     apart = replace(
         together,
         problem=replace(
@@ -68,13 +69,15 @@ def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it(
         ),
     )
     free = made.problem.columns.calibration >= 0
-    information = np.linalg.inv(apart.covariance(apart.problem.columns.calibration[free]))
-    towards = bias.calibration_bias(apart) - shift
+    columns = made.problem.columns.calibration[free]
+    information = np.linalg.inv(apart.covariance(columns))
+    towards = np.zeros(len(free))
+    towards[free] = (bias.bias_of(apart) - bias.bias_of(together))[columns]
 
     def explained(times: float) -> float:
         moved = together.state.calibration - times * towards
         state = State(together.state.poses, together.state.tags, moved)
-        return bias.cost_of_calibration_bias(replace(apart, state=state), together)
+        return _cost_of_bias(replace(apart, state=state), together)
 
     whole = float(towards[free] @ information @ towards[free])
     assert whole > 0.0
