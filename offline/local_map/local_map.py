@@ -157,7 +157,7 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
-    return _with_edges_at_solved_ranges(best, effort)
+    return _with_edges_at_solved_ranges(best, effort) if far_larger or noise_is_open else best
 
 
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
