@@ -18,6 +18,9 @@ def import_recording(
     robot_id: Annotated[str | None, typer.Option(help="Name of the robot. [default: the recording's]")] = None,
     robot: Annotated[Path | None, typer.Option(help="robot.yaml with wheels and mount; options override it.")] = None,
     track_width_m: Annotated[float | None, typer.Option(help="Distance between the wheels.")] = None,
+    wheelbase_m: Annotated[
+        float | None, typer.Option(help="From the rear axle to the front one, for steering_rad.")
+    ] = None,
     state_rate_hz: Annotated[float | None, typer.Option(help="States a second, for odom.csv.")] = None,
     wheel_radius_m: Annotated[float | None, typer.Option(help="Radius of both wheels, for ticks and joints.")] = None,
     ticks_per_turn: Annotated[float | None, typer.Option(help="Ticks in one turn of a wheel.")] = None,
@@ -44,8 +47,8 @@ def import_recording(
 ) -> None:
     """Make a run log, DIR/RUN_ID/0000.core.mcap, from a folder of CSV files or a ROS bag (docs/formats.md).
 
-    CSV: observations in observations.csv are in the robot's base frame, unless a --camera option is given: then they
-    are in the camera's. Those in landmarks.csv always are. Bags, of ROS 1 or ROS 2: topics are found by type.
+    CSV: observations in observations.csv are in the sensor's frame; with --robot and no --camera option they are in the
+    robot's base frame. Those in landmarks.csv are in the camera's. Bags, of ROS 1 or ROS 2: topics are found by type.
     """
     from groundsbot.offline.importing import BagOptions, ImportOptions, is_bag
 
@@ -54,6 +57,7 @@ def import_recording(
         robot_id=robot_id,
         robot=robot,
         track_width_m=track_width_m,
+        wheelbase_m=wheelbase_m,
         state_rate_hz=state_rate_hz,
         wheel_radius_m=wheel_radius_m,
         ticks_per_turn=ticks_per_turn,

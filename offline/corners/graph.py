@@ -8,7 +8,6 @@ import numpy as np
 
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.geometry import wheels
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, FOCAL_SCALE, MOUNT_PARAMETERS, TIME_OFFSET
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
@@ -189,17 +188,12 @@ def _base_motion(
     wheel_segment = next(
         each for each in segment.run.wheel_segments if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1]
     )
-    speed, turning = wheel_segment.twist_at(stamps_ns, robot.wheels.track_m).T
-    twist = np.stack([speed, np.zeros_like(speed), turning], axis=-1)
+    twist = wheel_segment.twist_at(stamps_ns, robot.wheels.track_m)
     if robot.readout_s == 0.0:  # all rows at once
         return np.zeros((*corners_px.shape[:-1], 3)), twist
     share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
     rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
-    left_m, right_m = (
-        at_row - at_stamp[:, None]
-        for at_row, at_stamp in zip(wheel_segment.at(rows_ns), wheel_segment.at(stamps_ns), strict=True)
-    )
-    return wheels.advance(left_m, right_m, robot.wheels.track_m), twist
+    return wheel_segment.motions(stamps_ns[:, None], rows_ns, robot.wheels.track_m), twist
 
 
 def _height_parameter(segment: Segment) -> Parameter:

@@ -54,6 +54,7 @@ class ImportOptions:
     robot_id: str | None = None
     robot: Path | None = None
     track_width_m: float | None = None
+    wheelbase_m: float | None = None
     state_rate_hz: float | None = None
     wheel_radius_m: float | None = None
     ticks_per_turn: float | None = None
@@ -63,7 +64,7 @@ class ImportOptions:
     tag_family: str = "tag36h11"
 
     def __post_init__(self) -> None:
-        for option in ("track_width_m", "state_rate_hz", "wheel_radius_m", "ticks_per_turn"):
+        for option in ("track_width_m", "wheelbase_m", "state_rate_hz", "wheel_radius_m", "ticks_per_turn"):
             self._check_number(option, positive=True)
         least_hz, most_hz = _STATE_RATES_HZ
         if self.state_rate_hz is not None and not least_hz <= self.state_rate_hz <= most_hz:

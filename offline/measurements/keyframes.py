@@ -1,5 +1,6 @@
 """Which pictures of a drive become keyframes, the poses of the state."""
 
+from math import dist
 from typing import Final
 
 import numpy as np
@@ -43,12 +44,13 @@ def choose_keyframes(
 ) -> tuple[IntArray, IntArray]:
     """Thins by motion: (K,) stamps, and for each candidate its keyframe or -1 (passed over)."""
     left_m, right_m = wheel_segment.at(stamps_ns)
-    distance_m, turn_rad = 0.5 * (left_m + right_m), (right_m - left_m) / track_m
+    place_m = np.stack([0.5 * (left_m + right_m), wheel_segment.lateral_at(stamps_ns)], axis=-1).tolist()
+    turn_rad = (right_m - left_m) / track_m
     keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
     standing_m = _STANDING_TICKS * wheel_segment.quantum_m + _STANDING_M
     chosen: list[int] = []
-    for i, (distance, turn) in enumerate(zip(distance_m.tolist(), turn_rad.tolist(), strict=True)):
-        moved_m = abs(distance - distance_m[chosen[-1]]) if chosen else np.inf
+    for i, (place, turn) in enumerate(zip(place_m, turn_rad.tolist(), strict=True)):
+        moved_m = dist(place, place_m[chosen[-1]]) if chosen else np.inf
         turned_rad = abs(turn - turn_rad[chosen[-1]]) if chosen else np.inf
         standing = moved_m + 0.5 * track_m * turned_rad <= standing_m  # the wheel that moved more
         moved = moved_m >= KEYFRAME_DISTANCE_M or turned_rad >= KEYFRAME_TURN_RAD

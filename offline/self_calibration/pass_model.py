@@ -54,25 +54,26 @@ def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArra
         The poses (x_m, y_m, theta_rad), and (3, 3, M) their derivatives by time offset, wheel ratio and turn factor.
     """
     offset_s, ratio, turn = parameters[:3]
-    left_m, right_m, left_m_s, right_m_s = passes.wheels.at(passes.stations_s - offset_s).T
+    left_m, right_m, lateral_m, left_m_s, right_m_s, lateral_m_s = passes.wheels.at(passes.stations_s - offset_s).T
     turns = (1.0 + turn) / passes.wheels.track_m
     left, right = 1.0 - 0.5 * ratio, 1.0 + 0.5 * ratio
-    sums = np.stack([0.5 * (left * left_m + right * right_m), turns * (right * right_m - left * left_m)])
-    by_time = -np.stack([0.5 * (left * left_m_s + right * right_m_s), turns * (right * right_m_s - left * left_m_s)])
-    by_ratio = np.stack([0.25 * (right_m - left_m), 0.5 * turns * (right_m + left_m)])
-    by_turn = np.stack([np.zeros_like(left_m), sums[1] / (1.0 + turn)])
-    # Of (way, heading): the step from the previous station, and the heading since the pass began.
+    none = np.zeros_like(left_m)
+    forward_m_s, turning = 0.5 * (left * left_m_s + right * right_m_s), turns * (right * right_m_s - left * left_m_s)
+    sums = np.stack([0.5 * (left * left_m + right * right_m), turns * (right * right_m - left * left_m), lateral_m])
+    by_time = -np.stack([forward_m_s, turning, lateral_m_s])
+    by_ratio = np.stack([0.25 * (right_m - left_m), 0.5 * turns * (right_m + left_m), none])
+    by_turn = np.stack([none, sums[1] / (1.0 + turn), none])
+    # Of (way, heading, way to the left): the step from the previous station, and the heading since the pass began.
     all_sums = np.stack([sums, by_time, by_ratio, by_turn])
     steps = np.diff(all_sums, axis=-1, prepend=0.0)
     steps[..., passes.first_station] = 0.0
     since = all_sums[:, 1] - all_sums[:, 1][:, passes.first_station][:, passes.station_group]
     middle = since - 0.5 * steps[:, 1]
-    way_m, turned = steps[0]
-    sinc = np.sinc(0.5 * turned / np.pi)
-    chords_m = steps[:, 0] * sinc
-    chords_m[1:] -= way_m * turned / 12.0 * steps[1:, 1]  # sinc(turned / 2) to its first order
+    turned = steps[0, 1]
+    chords_m = steps[:, [0, 2]] * np.sinc(0.5 * turned / np.pi)
+    chords_m[1:] -= steps[0, [0, 2]] * turned / 12.0 * steps[1:, 1:2]  # sinc(turned / 2) to its first order
     cos, sin = np.cos(middle[0]), np.sin(middle[0])
-    x, y = chords_m * cos, chords_m * sin
+    x, y = chords_m[:, 0] * cos - chords_m[:, 1] * sin, chords_m[:, 0] * sin + chords_m[:, 1] * cos
     x[1:], y[1:] = x[1:] - y[0] * middle[1:], y[1:] + x[0] * middle[1:]
     places = np.cumsum(np.stack([x, y]), axis=-1)
     places = places[..., passes.at] - places[..., passes.first_station][..., passes.group]

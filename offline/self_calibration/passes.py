@@ -43,7 +43,8 @@ class WheelAxis:
 
     Attributes:
         time_s: (N,) increasing.
-        motion: (N, 4) cumulative distances of the left and of the right wheel in m, and their speeds in m/s.
+        motion: (N, 6) cumulative distances of the left and of the right wheel and to base's left in m, and the three
+            speeds in m/s.
         begins_s: start of each segment on this axis, in order of runs and of their segments.
         track_m: distance between the wheels, by robot.yaml.
     """
@@ -54,16 +55,17 @@ class WheelAxis:
     track_m: float
 
     def at(self, time_s: FloatArray) -> FloatArray:
-        """Return (K, 4) motion at the given times, linearly interpolated."""
+        """Return (K, 6) motion at the given times, linearly interpolated."""
         index = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         begin_s = self.time_s[index]
         share = np.clip((time_s - begin_s) / (self.time_s[index + 1] - begin_s), 0.0, 1.0)[:, None]
         return np.asarray((1.0 - share) * self.motion[index] + share * self.motion[index + 1])
 
     def twist_at(self, time_s: FloatArray) -> FloatArray:
-        """Return (K, 2) speed in m/s and turning rate in rad/s at the given times."""
-        left_m_s, right_m_s = self.at(time_s)[:, 2:].T
-        return np.stack([0.5 * (left_m_s + right_m_s), (right_m_s - left_m_s) / self.track_m], axis=-1)
+        """Return (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the given times."""
+        left_m_s, right_m_s, lateral_m_s = self.at(time_s)[:, 3:].T
+        turning_rad_s = (right_m_s - left_m_s) / self.track_m
+        return np.stack([0.5 * (left_m_s + right_m_s), lateral_m_s, turning_rad_s], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,8 @@ def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
         begins_s.append(end_s)
         if len(wheel_segment.stamps_ns):
             times.append(end_s + _since_s(wheel_segment.stamps_ns, wheel_segment.stamps_ns[0]))
-            wheels.append(np.stack([wheel_segment.left_m, wheel_segment.right_m]))
+            lateral_m = wheel_segment.lateral_at(wheel_segment.stamps_ns)
+            wheels.append(np.stack([wheel_segment.left_m, wheel_segment.right_m, lateral_m]))
             end_s = times[-1][-1] + _BETWEEN_SEGMENTS_S
     if sum(map(len, times)) < 2:
         return None
@@ -173,8 +176,9 @@ def _wheel_axis(runs: Sequence[Run]) -> WheelAxis | None:
 
 def _stamps(runs: Sequence[Run], wheels: WheelAxis) -> _Stamps:
     """Return all observations around which wheel readings are known."""
-    left_m, right_m = np.diff(wheels.motion[:, :2], axis=0, prepend=wheels.motion[:1, :2]).T
-    way_m, turn_rad = np.cumsum(np.abs(left_m + right_m) / 2), np.cumsum(np.abs(right_m - left_m) / wheels.track_m)
+    left_m, right_m, lateral_m = np.diff(wheels.motion[:, :3], axis=0, prepend=wheels.motion[:1, :3]).T
+    way_m = np.cumsum(np.hypot((left_m + right_m) / 2, lateral_m))
+    turn_rad = np.cumsum(np.abs(right_m - left_m) / wheels.track_m)
     moved: list[FloatArray] = [np.zeros((3, 0))]
     names: list[IntArray] = [np.zeros((3, 0), dtype=np.int64)]
     begins_s, reach_ns = iter(wheels.begins_s), round(REACH_S * 1e9)

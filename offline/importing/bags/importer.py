@@ -16,7 +16,7 @@ from groundsbot.offline.importing.bags.odometry import joint_readings, odometry_
 from groundsbot.offline.importing.bags.reader import open_bag
 from groundsbot.offline.importing.bags.sightings import find_camera, tag_entries
 from groundsbot.offline.importing.bags.topics import APRILTAG_ROS, JOINTS, BagOptions, ChosenTopics, choose_topics
-from groundsbot.offline.importing.csv.forms import refuse_tick_options
+from groundsbot.offline.importing.csv.odometry import refuse_tick_options
 from groundsbot.offline.importing.robot import ImportOptions, RobotDefaults, describe_robot, safe_name, wheel_scale
 from groundsbot.offline.importing.run_writer import Entry, ImportReport, check_output, write_run
 from groundsbot.onboard.log import PlanarOdometry, log_head
@@ -125,6 +125,8 @@ def _check_options_used(path: Path, chosen: ChosenTopics, options: ImportOptions
     """
     if options.state_rate_hz is not None:
         raise OfflineError(f"{path}: --state-rate-hz is for odom.csv; a bag holds its own times, leave it out")
+    if options.wheelbase_m is not None:
+        raise OfflineError(f"{path}: --wheelbase-m is for steering_rad in odometry.csv; leave it out")
     if chosen.odometry.msgtype != JOINTS:
         refuse_tick_options(path, options.tick_flags)
         if bag_options.left_joint is not None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.bags.topics import BagOptions
-from groundsbot.offline.importing.csv.forms import MAX_WHEEL_SPEED_M_S
+from groundsbot.offline.importing.csv.odometry import MAX_WHEEL_SPEED_M_S
 from groundsbot.offline.importing.robot import WheelScale
 from groundsbot.offline.measurements import growth, wheel_distances
 from groundsbot.onboard.log import PlanarOdometry
@@ -42,8 +42,9 @@ def odometry_readings(
             f"{where}: the pose of message {wrong[0] + 1} is invalid (NaN, or a quaternion of length 0); "
             "correct what published it"
         )
-    left_m, right_m, _ = wheel_distances(poses, track_m)
+    left_m, right_m, lateral_m = wheel_distances(poses, track_m)
     check_wheel_speed(where, stamps_ns, left_m, right_m)
+    check_wheel_speed(where, stamps_ns, lateral_m, lateral_m)
     readings = [
         PlanarOdometry(stamp_ns=stamp_ns, pose=PlanarOdometry.PoseInOdom(x_m=x, y_m=y, theta_rad=theta))
         for stamp_ns, (x, y, theta) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
@@ -54,7 +55,7 @@ def odometry_readings(
         for reading, step in zip(readings, steps, strict=True):
             reading.covariance.extend(step.ravel().tolist())
     said = f"covariances of the odometry {told}{'' if steps is not None else '; the noise model is used instead'}"
-    return readings, _distance_m(left_m, right_m), said
+    return readings, _distance_m(left_m, right_m, lateral_m), said
 
 
 def joint_readings(
@@ -175,5 +176,6 @@ def _position(where: str, message: Any, joint: str) -> float:  # noqa: ANN401 - 
     return float(message.position[index])
 
 
-def _distance_m(left_m: FloatArray, right_m: FloatArray) -> float:
-    return float(np.abs(np.diff(0.5 * (left_m + right_m))).sum())
+def _distance_m(left_m: FloatArray, right_m: FloatArray, lateral_m: FloatArray | float = 0.0) -> float:
+    forward_m, lateral_m = np.broadcast_arrays(0.5 * (left_m + right_m), lateral_m)
+    return float(np.hypot(np.diff(forward_m), np.diff(lateral_m)).sum())

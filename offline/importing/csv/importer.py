@@ -11,21 +11,16 @@ from typing import Final
 from groundsbot.calib.foundation import plural
 from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.importing.csv.forms import (
-    CsvObservation,
-    WheelPath,
-    read_gyro,
-    read_observations,
+from groundsbot.offline.importing.csv.forms import CsvObservation, read_gyro, read_observations, read_paper_landmarks
+from groundsbot.offline.importing.csv.odometry import (
+    OdometryPath,
     read_odometry,
-    read_paper_landmarks,
     read_paper_odometry,
     refuse_tick_options,
 )
 from groundsbot.offline.importing.robot import (
     DETECTOR_SCALE_SIGMA,
-    ENCODER_SCALE_SIGMA,
     RANGE_SCALE_SIGMA,
-    SPEED_SCALE_SIGMA,
     ImportOptions,
     RobotDefaults,
     describe_robot,
@@ -44,7 +39,7 @@ _GYRO: Final = "gyro.csv"  # beside either pair
 class _CsvDrive:
     """Content of one folder in any form."""
 
-    wheels: WheelPath
+    wheels: OdometryPath
     n_odometry: int
     observations: list[CsvObservation]
     in_camera: bool
@@ -71,7 +66,7 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     drive = _read_drive(folder, options)
     known = RobotDefaults(
         needs_track=drive.wheels.needs_track,
-        wheel_scale_sigma=ENCODER_SCALE_SIGMA if drive.wheels.needs_track else SPEED_SCALE_SIGMA,
+        wheel_scale_sigma=drive.wheels.scale_sigma,
         range_scale_sigma=drive.range_scale_sigma,
     )
     robot, robot_yaml, robot_remarks = describe_robot(folder, options, drive.in_camera, known)
@@ -121,7 +116,7 @@ def _read_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
 def _header_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
     if options.state_rate_hz is not None:
         raise OfflineError(f"{folder}: --state-rate-hz is for odom.csv; odometry.csv holds its own times, leave it out")
-    wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options))
+    wheels, form = read_odometry(folder / _HEADER_PAIR[0], wheel_scale(options), options.wheelbase_m)
     observations = read_observations(folder / _HEADER_PAIR[1], family_size(options.tag_family) - 1)
     in_camera = options.has_mount or options.robot is None
     where = "the frame of the camera (or other sensor)" if in_camera else "base (--robot without --camera options)"
@@ -136,6 +131,8 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
             f"{folder / _PAPER_PAIR[0]}: holds no times; give --state-rate-hz (the paper's authors used 4.2)"
         )
     refuse_tick_options(folder / _PAPER_PAIR[0], options.tick_flags)
+    if options.wheelbase_m is not None:
+        raise OfflineError(f"{folder / _PAPER_PAIR[0]}: holds wheel speeds, so --wheelbase-m would not be used")
     wheels = read_paper_odometry(folder / _PAPER_PAIR[0], rate_hz)
     n_states = len(wheels.stamps_ns) - 1
     observations = read_paper_landmarks(folder / _PAPER_PAIR[1], n_states, rate_hz, family_size(options.tag_family) - 1)
@@ -159,7 +156,12 @@ def _messages(drive: _CsvDrive, family: str) -> Iterator[Entry]:
     return merge(_odometry(drive.wheels), gyro, observations, key=lambda each: each[0])
 
 
-def _odometry(wheels: WheelPath) -> Iterator[Entry]:
+def _odometry(wheels: OdometryPath) -> Iterator[Entry]:
+    if wheels.poses:
+        for stamp_ns, (x_m, y_m, theta_rad) in zip(wheels.stamps_ns, wheels.poses, strict=True):
+            pose = PlanarOdometry.PoseInOdom(x_m=x_m, y_m=y_m, theta_rad=theta_rad)
+            yield stamp_ns, "/odometry", PlanarOdometry(stamp_ns=stamp_ns, pose=pose)
+        return
     for stamp_ns, left_m, right_m in zip(wheels.stamps_ns, wheels.left_m, wheels.right_m, strict=True):
         distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=right_m)
         yield stamp_ns, "/odometry", PlanarOdometry(stamp_ns=stamp_ns, wheels=distances)

@@ -1,7 +1,8 @@
 """Wheel readings between keyframes -> one motion, its covariance and its dependence on the wheel calibration.
 
 No reading is thinned out: exact arcs from reading to reading, composed, with the noise of each carried to the
-keyframe's end. Notation: T_start_base is the dead-reckoned pose in the frame of the segment's first wheel reading.
+keyframe's end. Robots that also move sideways go by a constant twist from reading to reading instead, exp(d, l, turn).
+Notation: T_start_base is the dead-reckoned pose in the frame of the segment's first wheel reading.
 """
 
 from dataclasses import dataclass, replace
@@ -43,6 +44,7 @@ class WheelSegment:
         stamps_ns: (N,) strictly increasing.
         left_m, right_m: (N,) cumulative, by the nominal radii.
         quantum_m: distance of one encoder tick; 0 where unknown.
+        lateral_m: (N,) cumulative motion to base's left; None for robots that cannot move that way.
         covariance: (N, 3, 3) of the right tangent of the step that ends at each reading; NaN where the noise model
             tells, None where it tells for all.
     """
@@ -52,6 +54,7 @@ class WheelSegment:
     right_m: FloatArray
     quantum_m: float = 0.0
     covariance: FloatArray | None = None
+    lateral_m: FloatArray | None = None
 
     @cached_property
     def _since_first_s(self) -> FloatArray:
@@ -63,14 +66,29 @@ class WheelSegment:
         times = _seconds(stamps_ns, self.stamps_ns[0])
         return np.interp(times, self._since_first_s, self.left_m), np.interp(times, self._since_first_s, self.right_m)
 
+    def lateral_at(self, stamps_ns: IntArray) -> FloatArray:
+        """Cumulative motion to the left at other times, in metres."""
+        if self.lateral_m is None:
+            return np.zeros(np.shape(stamps_ns))
+        return np.interp(_seconds(stamps_ns, self.stamps_ns[0]), self._since_first_s, self.lateral_m)
+
+    def motions(self, from_ns: IntArray, to_ns: IntArray, track_m: float) -> FloatArray:
+        """(..., 3) motions between times within one step each, by a constant twist."""
+        before, after = self.at(from_ns), self.at(to_ns)
+        left_m, right_m = after[0] - before[0], after[1] - before[1]
+        if self.lateral_m is None:
+            return wheels.advance(left_m, right_m, track_m)
+        return se2.exp(_twists(left_m, right_m, self.lateral_at(to_ns) - self.lateral_at(from_ns), track_m))
+
     def twist_at(self, stamps_ns: IntArray, track_m: float) -> FloatArray:
-        """(K, 2) speed in m/s and turning rate in rad/s about some times, by differences over a short while."""
+        """(K, 3) velocity of base (m/s forward, m/s to the left, rad/s) by differences over a short while."""
         before = np.maximum(stamps_ns - _WHILE_NS, self.stamps_ns[0])
         after = np.minimum(stamps_ns + _WHILE_NS, self.stamps_ns[-1])
         left_m, right_m = (m[1] - m[0] for m in self.at(np.stack([before, after])))
         seconds = np.maximum(after - before, 1) * 1e-9
         speed_m_s, turning_rad_s = 0.5 * (left_m + right_m) / seconds, (right_m - left_m) / (track_m * seconds)
-        return np.stack([speed_m_s, turning_rad_s], axis=-1)
+        lateral_m = self.lateral_at(after) - self.lateral_at(before)
+        return np.stack([speed_m_s, lateral_m / seconds, turning_rad_s], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -145,8 +163,16 @@ def compose_odometry(
     ]
     grid_ns = np.union1d(inner, keyframe_stamps_ns)
     left_m, right_m = wheel_segment.at(grid_ns)
-    left_m, right_m = np.diff(left_m), np.diff(right_m)
-    pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
+    left_m, right_m, lateral_m = np.diff(left_m), np.diff(right_m), np.diff(wheel_segment.lateral_at(grid_ns))
+    forward_m = 0.5 * (left_m + right_m)
+    if wheel_segment.lateral_m is None:
+        pieces, d_wheels, d_track = wheels.advance_with_jacobians(left_m, right_m, track_m)
+        by_parameters = _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
+        jacobian = se2.right_tangent_from_coordinates(pieces) @ by_parameters
+    else:
+        twists = _twists(left_m, right_m, lateral_m, track_m)
+        pieces = se2.exp(twists)
+        jacobian = se2.right_jacobian(twists) @ _twists_by_wheel_parameters(twists, track_m)
     poses = chain_motions(pieces, np.zeros(3))
 
     ends = np.searchsorted(grid_ns, keyframe_stamps_ns)
@@ -155,10 +181,11 @@ def compose_odometry(
     to_step_end = se2.adjoint(se2.between(poses[ends[1:]][step_of_piece], poses[1:]))
 
     duration_s = np.diff(grid_ns).astype(np.float64) * 1e-9
-    while_of_piece = _whiles(step_of_piece, 0.5 * (np.abs(left_m) + np.abs(right_m)), wheel_segment.quantum_m)
-    net_forward_m = _net(0.5 * (left_m + right_m), duration_s, while_of_piece)
+    rolled_m = 0.5 * (np.abs(left_m) + np.abs(right_m)) + np.abs(lateral_m)
+    while_of_piece = _whiles(step_of_piece, rolled_m, wheel_segment.quantum_m)
+    net_forward_m, net_lateral_m = (_net(each, duration_s, while_of_piece) for each in (forward_m, lateral_m))
     net_turn_rad = np.abs(_net(right_m - left_m, duration_s, while_of_piece)) / track_m
-    unit, in_gap = _piece_covariances(net_forward_m, net_turn_rad, duration_s)
+    unit, in_gap = _piece_covariances(net_forward_m, net_lateral_m, net_turn_rad, duration_s)
     known = _logged_covariances(wheel_segment, grid_ns)
     is_given = np.isfinite(known).all((-1, -2))
     unit[:, is_given] = 0.0
@@ -169,14 +196,12 @@ def compose_odometry(
         _sum_by_step(_carry(to_step_end, in_gap + known), ends)
         + np.diag(_quantisation_variance(wheel_segment.quantum_m, track_m)),
     )
-    tangent = se2.right_tangent_from_coordinates(pieces)
-    jacobian = tangent @ _by_wheel_parameters(d_wheels, d_track, left_m, right_m, track_m)
     return SegmentOdometry(
         motion=se2.between(poses[ends[:-1]], poses[ends[1:]]),
         covariance=parts.under(noise),
         parts=parts,
         jacobian=_sum_by_step(to_step_end @ jacobian, ends),
-        distance_m=_sum_by_step(np.abs(0.5 * (left_m + right_m)), ends),
+        distance_m=_sum_by_step(np.hypot(forward_m, lateral_m), ends),
     )
 
 
@@ -215,20 +240,24 @@ def _net(moved: FloatArray, duration_s: FloatArray, while_of_piece: IntArray) ->
 
 
 def _piece_covariances(
-    forward_m: FloatArray, net_turn_rad: FloatArray, duration_s: FloatArray
+    forward_m: FloatArray, lateral_m: FloatArray, net_turn_rad: FloatArray, duration_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """(4, N, 3, 3) by ODOMETRY_NOISE, of the pieces' right tangents, and (N, 3, 3) what a gap adds.
 
-    Noise comes in all along a piece.
+    Noise comes in all along a piece; that of the distance along its direction, lateral noise across it.
     """
-    distance_m = np.abs(forward_m)
+    distance_m = np.hypot(forward_m, lateral_m)
     heading = np.zeros((len(forward_m), 3, 3))
-    # A heading error made u before the end moves the end sideways by u times it: means of u^2 and u over the piece.
-    heading[:, 1, 1] = forward_m**2 / 3.0
-    heading[:, 1, 2] = heading[:, 2, 1] = forward_m / 2.0
+    # A heading error made u before the end moves the end across by u times it: means of u^2 and u over the piece.
+    across = np.stack([-lateral_m, forward_m], axis=-1)
+    heading[:, :2, :2] = across[:, :, None] * across[:, None, :] / 3.0
+    heading[:, :2, 2] = heading[:, 2, :2] = across / 2.0
     heading[:, 2, 2] = 1.0
     unit = np.zeros((len(ODOMETRY_NOISE), len(forward_m), 3, 3))
-    unit[0, :, 0, 0] = unit[1, :, 1, 1] = distance_m
+    across /= np.where(distance_m > 0.0, distance_m, 1.0)[:, None]
+    along = np.stack([across[:, 1], -across[:, 0]], axis=-1)
+    for of_unit, axis in ((unit[0], along), (unit[1], across)):
+        of_unit[:, :2, :2] = distance_m[:, None, None] * axis[:, :, None] * axis[:, None, :]
     unit[2] = distance_m[:, None, None] * heading
     unit[3] = net_turn_rad[:, None, None] * heading
     in_gap = np.zeros((len(forward_m), 3, 3))
@@ -242,6 +271,20 @@ def _by_wheel_parameters(
     """(N, 3, 3) derivative of the pieces' coordinates by WHEEL_PARAMETERS."""
     by_left, by_right = d_wheels[..., 0] * left_m[:, None], d_wheels[..., 1] * right_m[:, None]
     return np.stack([by_left + by_right, 0.5 * (by_right - by_left), d_track * track_m], axis=-1)
+
+
+def _twists(left_m: FloatArray, right_m: FloatArray, lateral_m: FloatArray, track_m: float) -> FloatArray:
+    """(..., 3) right tangents of the pieces."""
+    return np.stack([0.5 * (left_m + right_m), lateral_m, (right_m - left_m) / track_m], axis=-1)
+
+
+def _twists_by_wheel_parameters(twists: FloatArray, track_m: float) -> FloatArray:
+    """(N, 3, 3) derivative of the pieces' twists by WHEEL_PARAMETERS; the scale is of motion to the left too."""
+    forward_m, _, turn_rad = twists.T
+    none = np.zeros_like(turn_rad)
+    by_ratio = np.stack([0.25 * track_m * turn_rad, none, forward_m / track_m], axis=-1)
+    by_track = np.stack([none, none, -turn_rad], axis=-1)
+    return np.stack([twists, by_ratio, by_track], axis=-1)
 
 
 def _quantisation_variance(quantum_m: float, track_m: float) -> FloatArray:

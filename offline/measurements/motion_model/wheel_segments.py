@@ -20,6 +20,8 @@ WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and
 # a log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
 _FREE_RESETS = 10
 _RESETS_AT_A_MIB = 15
+# Less sideways motion than this in a whole drive is rounding of the poses.
+_SIDEWAYS_M = 1e-6
 
 
 def wheel_segments_of(
@@ -89,39 +91,37 @@ def _imported_segment(
     where = f"{log}: /odometry"
     stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
     check_stamps(stamps_ns, where)
+    lateral_m = None
     left_m = np.array([reading.wheels.left_m for reading in readings])
     right_m = np.array([reading.wheels.right_m for reading in readings])
     check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)
     if readings[0].WhichOneof("motion") == "pose":
         poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
         check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
-        left_m, right_m, sideways = wheel_distances(poses, robot.wheels.track_m)
-        if sideways > 0.05:
-            warnings.append(
-                f"{100.0 * sideways:.0f} % of the odometry's motion is sideways, which a differential drive cannot do; "
-                "it is not used"
-            )
+        left_m, right_m, lateral_m = wheel_distances(poses, robot.wheels.track_m)
+        if np.ptp(lateral_m) < _SIDEWAYS_M:
+            lateral_m = None
     table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
     if dropped:
         warnings.append(f"{plural(dropped, 'odometry reading')} not later than the one before; left out")
     keep = table[:, 1]
-    check_speed(stamps_ns[keep], np.column_stack([left_m, right_m])[keep], where)
+    rolled_m = [left_m, right_m] if lateral_m is None else [left_m, right_m, lateral_m]
+    check_speed(stamps_ns[keep], np.column_stack(rolled_m)[keep], where)
     covariance, n_bad = given_covariances(readings)
     if n_bad:
         warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
     given = covariance[keep] if covariance is not None else None
-    return [WheelSegment(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given)], warnings
+    lateral = lateral_m[keep] if lateral_m is not None else None
+    return [WheelSegment(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given, lateral_m=lateral)], warnings
 
 
-def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, float]:
-    """Cumulative (left_m, right_m) whose arcs join odometry poses (N, 3), and the share of motion that is sideways."""
+def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cumulative (left_m, right_m, lateral_m), each (N,), of the twists that join odometry poses (N, 3)."""
     twists = se2.log(se2.between(poses[:-1], poses[1:]))
     half_turn_m = 0.5 * track_m * twists[:, 2]
     left_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] - half_turn_m)])
     right_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] + half_turn_m)])
-    forward = float(np.abs(twists[:, 0]).sum())
-    sideways = float(np.abs(twists[:, 1]).sum())
-    return left_m, right_m, sideways / max(forward, 1e-9) if sideways > 1e-6 else 0.0
+    return left_m, right_m, np.concatenate([[0.0], np.cumsum(twists[:, 1])])
 
 
 def _strictly_later(table: IntArray) -> tuple[IntArray, int]:

@@ -21,12 +21,12 @@ def read_at_once(
         camera: the camera that saw them.
         corners_px: (M, 4, 2) raw pixels.
         sides_m: (M,) of the tags.
-        twist: (M, 2) speed and turning rate of base.
+        twist: (M, 3) velocity of base (m/s forward, m/s to the left, rad/s).
     """
     if robot.readout_s == 0.0:
         return corners_px
     late_s = robot.readout_s * np.clip(corners_px[..., 1] / (camera.height_px - 1) - 0.5, -0.5, 0.5)
-    moved = np.stack([late_s * twist[:, :1], np.zeros_like(late_s), late_s * twist[:, 1:]], axis=-1)
+    moved = late_s[..., None] * twist[:, None, :]
     turn, place_m = robot.mount.T_base_camera.rotation.as_matrix(), robot.mount.T_base_camera.translation
     with np.errstate(all="ignore"):
         rays = camera.unproject(corners_px)

@@ -58,7 +58,7 @@ def read_detections(
         run: whose camera and tag sizes apply.
         detections: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
-        twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
+        twist: (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the keyframes.
         noise: for the corners' sigma.
 
     Returns:
@@ -173,7 +173,7 @@ def read_positions(
         robot: whose sensor it is: its mount, and by how much it reads ranges too long.
         positions: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
-        twist: (K, 2) speed in m/s and turning rate in rad/s at the keyframes.
+        twist: (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the keyframes.
         noise: for the sigmas of range and bearing.
 
     Returns:
@@ -248,7 +248,7 @@ def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArra
     Args:
         robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
         found: (M,) the readings.
-        twist: (M, 2) speed and turning rate.
+        twist: (M, 3) velocity of base.
     """
     range_m, bearing_rad = found.range_bearing.T
     apart_m = range_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad)], axis=-1)
@@ -269,7 +269,7 @@ def _by_sensor(
         value: (M, 2) in either form.
         polar: (M,) which.
         in_camera: (M,) about the camera's place and yaw, else about base.
-        twist: (M, 2) speed and turning rate.
+        twist: (M, 3) velocity of base.
     """
     mount = np.where(in_camera[:, None], [robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad], 0.0)
     cos, sin = np.cos(value[:, 1]), np.sin(value[:, 1])
@@ -286,8 +286,8 @@ def _by_sensor(
 
 def _rates(in_base_m: FloatArray, twist: FloatArray) -> FloatArray:
     """(M, 2) m/s by which tags (M, 2) move in base: a picture that was taken later shows them there."""
-    speed, turning = twist.T
-    return np.stack([turning * in_base_m[:, 1] - speed, -turning * in_base_m[:, 0]], axis=-1)
+    forward, left, turning = twist.T
+    return np.stack([turning * in_base_m[:, 1] - forward, -turning * in_base_m[:, 0] - left], axis=-1)
 
 
 def _by_place(in_sensor_m: FloatArray, polar: BoolArray, moved: FloatArray) -> FloatArray:

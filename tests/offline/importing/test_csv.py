@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
-from groundsbot.offline.importing.csv.forms import read_odometry
 from groundsbot.offline.importing.csv.importer import import_folder
+from groundsbot.offline.importing.csv.odometry import read_odometry
 from groundsbot.offline.importing.robot import ImportOptions, WheelScale
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.reading.decoder import LogMessage

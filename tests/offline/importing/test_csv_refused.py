@@ -21,7 +21,7 @@ BAD_ODOMETRY = [
     ("t_s,left_m_s\n0,0\n", "column 'right_m_s' is missing beside 'left_m_s'"),
     ("left_m_s,right_m_s\n0,0\n", "needs exactly one of the columns t_s and t_ns"),
     ("t_s,t_ns,left_m_s,right_m_s\n0,0,0,0\n", "needs exactly one of the columns t_s and t_ns"),
-    ("t_s,left_m_s,right_m_s,v_m_s,omega_rad_s\n0,0,0,0,0\n", "needs exactly one of these pairs"),
+    ("t_s,left_m_s,right_m_s,v_m_s,omega_rad_s\n0,0,0,0,0\n", "needs exactly one of these sets"),
     ("t_s,left_m_s,left_m_s,right_m_s\n0,0,0,0\n", "column 'left_m_s' is there twice"),
     ("t_s;left_m_s;right_m_s\n0;0;0\n", "column 't_s;left_m_s;right_m_s' is unknown"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,0\n", "odometry.csv line 3: has 2 cells where 3 belong"),
@@ -37,6 +37,13 @@ BAD_ODOMETRY = [
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,250,250\n", "means a wheel at 250 m/s, above 20 m/s"),
     ("t_s,left_ticks,right_ticks\n0,0,0\n1,5,5\n", "the length of a tick is unknown; give --wheel-radius-m"),
     ("t_s,left_m_s,right_m_s\n0,\x000,0\n", "is not a number"),
+    ("t_s,vx_m_s,vy_m_s\n0,0,0\n", "column 'omega_rad_s' is missing beside 'vx_m_s'"),
+    ("t_s,x_m,y_m\n0,0,0\n", "column 'theta_rad' is missing beside 'x_m'"),
+    ("t_s,v_m_s\n0,0\n", "needs exactly one of these sets of columns"),
+    ("t_s,vx_m_s,vy_m_s,omega_rad_s\n0,0,0,0\n1,0,25,0\n", "means a wheel at 25 m/s, above 20 m/s"),
+    ("t_s,x_m,y_m,theta_rad\n0,0,0,0\n1,0,300,0\n", "means a wheel at 300 m/s, above 20 m/s"),
+    ("t_s,x_m,y_m,theta_rad\n0,0,0,0\n1,0,nan,0\n", "line 3, column y_m: 'nan' is not finite"),
+    ("t_s,v_m_s,steering_rad\n0,0,0\n1,1,0.1\n", "holds steering angles; give --wheelbase-m"),
 ]
 
 
@@ -84,7 +91,7 @@ def test_lines_end_where_csv_ends_them(tmp_path: Path) -> None:
 BAD_OBSERVATIONS = [
     ("", "observations.csv: is empty"),
     ("t_s,x_m,y_m\n0,1,1\n", "column 'tag_id' is missing"),
-    ("t_s,tag_id,x_m,bearing_rad\n0,1,1,1\n", "needs exactly one of these pairs"),
+    ("t_s,tag_id,x_m,bearing_rad\n0,1,1,1\n", "needs exactly one of these sets"),
     ("t_s,tag_id,x_m,y_m,sigma_x_m\n0,1,1,1,1\n", "column 'sigma_y_m' is missing beside 'sigma_x_m'"),
     ("t_s,tag_id,x_m,y_m,sigma_range_m\n0,1,1,1,1\n", "'sigma_range_m' does not go with x_m,y_m"),
     ("t_s,tag_id,x_m,y_m,sigma_x_m,sigma_y_m\n0,1,1,1,0,1\n", "column sigma_x_m: '0' must be above 0"),

@@ -30,7 +30,7 @@ from tests.support.data.drives import (
 )
 
 NOISE = NoiseParameters()
-NO_TWIST = np.zeros((1000, 2))  # speed and turning rate at the keyframes
+NO_TWIST = np.zeros((1000, 3))  # velocity of base at the keyframes
 STILL = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)])
 ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4, "yaw_rad": 0.1, "pitch_rad": 0.05})
 UPRIGHT = [MadeTag(i, (2.0 + 0.7 * i, 0.3 * i - 0.4, 0.4), np.pi + 0.2 * i - 0.3) for i in range(5)]
@@ -288,7 +288,7 @@ def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
     """By moving the robot on and by reading with another mount, both by hand."""
     tag, speed_m_s, turning_rad_s = UPRIGHT[0], 0.4, -0.7
     run = run_of([tag])
-    twist = np.array([[speed_m_s, turning_rad_s]])
+    twist = np.array([[speed_m_s, 0.0, turning_rad_s]])
 
     def read(robot: Robot, T_map_base: FloatArray) -> Readings:
         corners_px = seen_corners_px(tag, T_map_base, run.robot, CAMERA)
@@ -319,7 +319,7 @@ def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) 
     def read(too_far_out_px: float) -> Readings:
         seen = np.tile(shift_edges(corners_px, -too_far_out_px), (3, 1, 1))
         detections = detections_of(seen, [0, 0, 0])
-        return read_detections(run, detections, np.arange(3), np.zeros((3, 2)), NOISE)[0]
+        return read_detections(run, detections, np.arange(3), np.zeros((3, 3)), NOISE)[0]
 
     here = read(0.0)
     assert len(here) == 3

@@ -216,8 +216,8 @@ def test_no_pass_goes_over_a_pause_or_is_read_while_the_robot_stands() -> None:
 def smooth(wheels: WheelAxis) -> WheelAxis:
     """Wheels whose speeds are what their distances change by, to the last digit."""
     t = np.linspace(wheels.time_s[0], wheels.time_s[-1], 200_000)
-    distance_m = np.stack([0.5 * t + 0.3 * np.sin(t), 0.4 * t - 0.3 * np.cos(1.1 * t)])
-    speed_m_s = np.stack([0.5 + 0.3 * np.cos(t), 0.4 + 0.33 * np.sin(1.1 * t)])
+    distance_m = np.stack([0.5 * t + 0.3 * np.sin(t), 0.4 * t - 0.3 * np.cos(1.1 * t), 0.2 * np.sin(0.7 * t)])
+    speed_m_s = np.stack([0.5 + 0.3 * np.cos(t), 0.4 + 0.33 * np.sin(1.1 * t), 0.14 * np.cos(0.7 * t)])
     return replace(wheels, time_s=t, motion=np.concatenate([distance_m, speed_m_s]).T)
 
 
