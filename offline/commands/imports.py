@@ -35,6 +35,9 @@ def import_recording(
     tags_topic: Annotated[str | None, typer.Option(help="Bag: topic of AprilTag detections.")] = None,
     image_topic: Annotated[str | None, typer.Option(help="Bag: topic of pictures, to detect tags in.")] = None,
     camera_info_topic: Annotated[str | None, typer.Option(help="Bag: topic of the camera's calibration.")] = None,
+    imu_topic: Annotated[
+        str | None, typer.Option(help="Bag: topic of Imu whose yaw rate the odometry does not contain.")
+    ] = None,
     left_joint: Annotated[str | None, typer.Option(help="Bag: the left wheel's joint, in JointState.")] = None,
     right_joint: Annotated[str | None, typer.Option(help="Bag: the right wheel's joint.")] = None,
     base_frame: Annotated[str | None, typer.Option(help="Bag: base frame. [default: the odometry's child]")] = None,
@@ -71,6 +74,7 @@ def import_recording(
         tags_topic=tags_topic,
         image_topic=image_topic,
         camera_info_topic=camera_info_topic,
+        imu_topic=imu_topic,
         left_joint=left_joint,
         right_joint=right_joint,
         base_frame=base_frame,

@@ -13,6 +13,7 @@ from groundsbot.offline.importing.bags.tags import BagPicture, exclusion_lines, 
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
     CAMERA_INFO,
+    IMU,
     TAGS,
     TRANSFORMS,
     BagOptions,
@@ -30,6 +31,7 @@ class BagContent:
     Attributes:
         frames: from the fixed transforms.
         odometry: (stamp in ns, message), ascending.
+        imu: (stamp in ns, message), ascending.
         pictures: with their detections, ascending.
         sent_transforms: (stamp in ns, TransformStamped) that may be tag poses.
         camera_infos: the first message of each such topic.
@@ -39,6 +41,7 @@ class BagContent:
 
     frames: FixedFrames
     odometry: list[tuple[int, Any]] = field(default_factory=list)
+    imu: list[tuple[int, Any]] = field(default_factory=list)
     pictures: list[BagPicture] = field(default_factory=list)
     tag_transforms: list[tuple[int, Any]] = field(default_factory=list)
     camera_infos: dict[str, Any] = field(default_factory=dict)
@@ -55,6 +58,12 @@ class BagContent:
         """Child frame of the odometry; empty if its messages name none."""
         return str(getattr(self.odometry[0][1], "child_frame_id", ""))
 
+    def add_transforms(self, message: Any, *, may_be_tags: bool) -> None:  # noqa: ANN401 - made by rosbags
+        """Add a message of `/tf` or `/tf_static`."""
+        self.frames.add(message)
+        if may_be_tags:
+            self.tag_transforms += [(_header_ns(t.header), t) for t in message.transforms]
+
 
 def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: str) -> BagContent:
     """Read all messages but pictures.
@@ -69,13 +78,10 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
         OfflineError: the bag is damaged, its messages have no times, or its detections no tags.
     """
     content, clock = BagContent(FixedFrames(str(bag.path))), BagClock(bag.path, options)
-    topics = [chosen.odometry, *chosen.transforms, *chosen.camera_infos]
-    topics += [] if chosen.has_pictures else [chosen.tags]
-    for each in bag.messages(topics):
+    timed = _timed_topics(chosen)
+    for each in bag.messages([*timed, *chosen.transforms, *chosen.camera_infos]):
         if each.msgtype in TRANSFORMS:
-            content.frames.add(each.content)
-            if chosen.tags.msgtype == APRILTAG_MSGS:
-                content.tag_transforms += [(_header_ns(t.header), t) for t in each.content.transforms]
+            content.add_transforms(each.content, may_be_tags=chosen.tags.msgtype == APRILTAG_MSGS)
         elif each.msgtype == CAMERA_INFO:
             content.camera_infos.setdefault(each.topic, each.content)
         elif (stamp_ns := clock.stamp_ns(each)) is None:
@@ -84,21 +90,39 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
             look, left_out = read_picture(each.msgtype, each.content, stamp_ns, family)
             content.pictures.append(look)
             content.n_excluded += left_out
+        elif each.msgtype == IMU:
+            content.imu.append((stamp_ns, each.content))
         else:
             content.odometry.append((stamp_ns, each.content))
-    clock.check([chosen.odometry] if chosen.has_pictures else [chosen.odometry, chosen.tags])
+    clock.check(timed)
+    content.imu, _ = _sort_and_deduplicate(content.imu, [(stamp_ns,) for stamp_ns, _ in content.imu])
     content.odometry, n_odometry = _sort_and_deduplicate(content.odometry, _odometry_keys(content.odometry))
     content.pictures, n_looks = _sort_and_deduplicate(content.pictures, [(look.stamp_ns,) for look in content.pictures])
-    if not chosen.has_pictures and not any(look.tags for look in content.pictures):
-        told = "; ".join(
-            [f"no tag was seen in {plural(len(content.pictures), 'picture')}", *exclusion_lines(content.n_excluded)]
-        )
-        raise OfflineError(f"{bag.path}: {chosen.tags.name}: {told}; is it the right topic?")
+    if not chosen.has_pictures:
+        _require_tags(bag.path, chosen.tags, content)
     content.remarks = clock.remarks()
     for n, topic in ((n_odometry, chosen.odometry), (n_looks, chosen.tags)):
         if n:
             content.remarks.append(f"{topic.name}: {plural(n, 'message')} left out: other messages have the same times")
     return content
+
+
+def _require_tags(path: Path, topic: BagTopic, content: BagContent) -> None:
+    """Check that any detection is of a tag.
+
+    Raises:
+        OfflineError: none is.
+    """
+    if not any(look.tags for look in content.pictures):
+        n_pictures = plural(len(content.pictures), "picture")
+        told = "; ".join([f"no tag was seen in {n_pictures}", *exclusion_lines(content.n_excluded)])
+        raise OfflineError(f"{path}: {topic.name}: {told}; is it the right topic?")
+
+
+def _timed_topics(chosen: ChosenTopics) -> list[BagTopic]:
+    """Return the topics whose messages are read with their times."""
+    tags = [] if chosen.has_pictures else [chosen.tags]
+    return [chosen.odometry, *tags, *([] if chosen.imu is None else [chosen.imu])]
 
 
 class BagClock:

@@ -11,6 +11,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
 from groundsbot.offline.importing.bags.content import BagContent, read_content
+from groundsbot.offline.importing.bags.gyro import gyro_entries
 from groundsbot.offline.importing.bags.mount import find_mount
 from groundsbot.offline.importing.bags.odometry import joint_readings, odometry_readings, wheel_joints
 from groundsbot.offline.importing.bags.reader import open_bag
@@ -59,10 +60,16 @@ def import_bag(
         robot, robot_yaml, robot_remarks = describe_robot(path, options, mount.in_camera, known)
         readings, distance_m = _odometry(path, chosen, content, robot.wheels.track_m, options, bag_options)
         tags = tag_entries(bag, chosen, content, robot, mount.in_camera, camera, bag_options, progress)
+    base_frame = bag_options.base_frame or content.base_frame
+    gyro = [] if chosen.imu is None else gyro_entries(path, chosen.imu, content, base_frame)
     outside = _check_times(path, readings, tags.entries)
     head = log_head(robot, robot_yaml, tags.camera, run_id, readings[0].stamp_ns, 0)
     odometry: list[Entry] = [(reading.stamp_ns, "/odometry", reading) for reading in readings]
-    write_run(output / run_id, head, merge(odometry, tags.entries, key=lambda entry: entry[0]))
+    write_run(output / run_id, head, merge(odometry, gyro, tags.entries, key=lambda entry: entry[0]))
+    if chosen.unused_imus:
+        content.remarks.append(
+            f"{', '.join(chosen.unused_imus)} not used; --imu-topic takes its yaw rate, unless the odometry contains it"
+        )
     used = f"odometry: {chosen.odometry.name} ({chosen.odometry.short_type})"
     return ImportReport(
         run_folder=output / run_id,

@@ -20,6 +20,7 @@ IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE: Final = "sensor_msgs/msg/CompressedImage"
 IMAGES: Final = (IMAGE, COMPRESSED_IMAGE)
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _MOST_LISTED: Final = 8
 
@@ -32,6 +33,7 @@ class BagOptions:
     tags_topic: str | None = None
     image_topic: str | None = None
     camera_info_topic: str | None = None
+    imu_topic: str | None = None
     left_joint: str | None = None
     right_joint: str | None = None
     base_frame: str | None = None
@@ -60,12 +62,18 @@ class BagOptions:
 
 @dataclass(frozen=True)
 class ChosenTopics:
-    """Topics of odometry and of tags: detections or pictures."""
+    """Topics of odometry and of tags: detections or pictures; that of the yaw rate where it was named.
+
+    Attributes:
+        unused_imus: others of that type, if none was named: fused odometry contains what they measured already.
+    """
 
     odometry: BagTopic
     tags: BagTopic
     transforms: tuple[BagTopic, ...]
     camera_infos: tuple[BagTopic, ...]  # several if that of the tags is ambiguous
+    imu: BagTopic | None = None
+    unused_imus: tuple[str, ...] = ()
 
     @property
     def has_pictures(self) -> bool:
@@ -97,7 +105,9 @@ def choose_topics(path: Path, topics: Sequence[BagTopic], options: BagOptions) -
             "detections or pictures"
         )
     transforms = tuple(each for each in topics if each.msgtype in TRANSFORMS)
-    return ChosenTopics(odometry, tags, transforms, _camera_infos(path, topics, options, tags))
+    imu = _topic_of_flag(path, topics, "--imu-topic", options.imu_topic, (IMU,))
+    unused = () if imu else tuple(each.name for each in topics if each.msgtype == IMU)
+    return ChosenTopics(odometry, tags, transforms, _camera_infos(path, topics, options, tags), imu, unused)
 
 
 def _camera_infos(path: Path, topics: Sequence[BagTopic], options: BagOptions, tags: BagTopic) -> tuple[BagTopic, ...]:

@@ -177,6 +177,20 @@ class BagOfLog:
             self.add(topic, "nav_msgs/msg/Odometry", stamp, fields)
         return self
 
+    def imu(self, topic: str = "/imu", frame: str = "imu", upside_down: bool = False) -> "BagOfLog":
+        """sensor_msgs/Imu at the wheels' times, with a bias of 0.01 rad/s; upside down its z axis points down."""
+        track_m = self.run.robot.wheels.track_m
+        rates = self.track.twist_at(self.track.stamps_ns, track_m)[:, 2] + 0.01
+        for stamp, rate in zip(self.track.stamps_ns.tolist(), rates.tolist(), strict=True):
+            measured = xyz([0.0, 0.0, -rate if upside_down else rate])
+            self.add(
+                topic, "sensor_msgs/msg/Imu", stamp, {"header": header(stamp, frame), "angular_velocity": measured}
+            )
+        turned = Rotation.from_euler("x", np.pi if upside_down else 0.0)
+        link = {"header": header(0, BASE), "child_frame_id": frame, "transform": _transform(np.ones(3), turned)}
+        self.add("/tf_static", "tf2_msgs/msg/TFMessage", int(self.track.stamps_ns[0]), {"transforms": [link]})
+        return self
+
     def joints(
         self, topic: str = "/joint_states", names: Sequence[str] = ("wheel_left", "arm", "wheel_right")
     ) -> "BagOfLog":
