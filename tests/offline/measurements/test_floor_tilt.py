@@ -89,7 +89,7 @@ def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:
     for tilt_rad in (0.0, TILT_RAD):
         corners_px, tag, keyframe = driven_past(tilt_rad, 1)
         detections = Detections(keyframe.astype(np.int64), tag, corners_px)
-        readings, warnings = read_detections(run, detections, keyframe, np.zeros((N, 2)), NoiseParameters())
+        readings, warnings = read_detections(run, detections, keyframe, np.zeros((N, 3)), NoiseParameters())
         assert warnings == []
         covariances.append(readings.covariance)
         np.testing.assert_allclose(readings.parts.under(NoiseParameters()), readings.covariance, rtol=1e-9)
@@ -97,8 +97,8 @@ def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:
     assert np.median(covariances[1][:, 1, 1]) > 9.0 * np.median(covariances[0][:, 1, 1])
 
 
-@pytest.mark.parametrize("twist", [(0.5, 0.0), (0.3, 0.6), (0.0, -1.0)])
-def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float, float]) -> None:
+@pytest.mark.parametrize("twist", [(0.5, 0.0, 0.0), (0.3, -0.2, 0.6), (0.0, 0.0, -1.0)])
+def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float, float, float]) -> None:
     robot = make_robot(mount=ROBOT.mount.model_dump(), readout_s=0.03)
     tags = [MadeTag(i, (3.0, 0.5 * i - 0.8, 0.4 * i - 0.4), np.pi + 0.2 * i) for i in range(4)]  # in all rows
     still = np.array([seen_corners_px(tag, np.zeros(3), robot, CAMERA) for tag in tags])
@@ -107,7 +107,7 @@ def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float
         late_s = 0.03 * (rolled[..., 1] / (CAMERA.height_px - 1) - 0.5)
         for i, tag in enumerate(tags):
             for corner in range(4):
-                pose = se2.exp(late_s[i, corner] * np.array([twist[0], 0.0, twist[1]]))
+                pose = se2.exp(late_s[i, corner] * np.array(twist))
                 rolled[i, corner] = np.asarray(seen_corners_px(tag, pose, robot, CAMERA))[corner]
     twists = np.tile(twist, (len(TAGS), 1))
     put_back = read_at_once(robot, CAMERA, rolled, np.full(len(TAGS), 0.15), twists)

@@ -16,8 +16,8 @@ from groundsbot.offline.measurements.tags import Positions
 from tests.support.data.drives import make_positions, make_robot
 
 NOISE = NoiseParameters()
-NO_TWIST = np.zeros((2, 2))  # speed and turning rate at the keyframes
-TWIST = np.array([[0.4, -0.7]])
+NO_TWIST = np.zeros((2, 3))  # velocity of base at the keyframes
+TWIST = np.array([[0.4, 0.15, -0.7]])
 ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "yaw_rad": 0.4})
 TAG_M = np.array([2.5, -1.2])  # on the map, where the robot stands at the origin
 COVARIANCE = [[0.04, 0.01], [0.01, 0.09]]
@@ -100,7 +100,7 @@ def test_a_late_stamp_shows_what_is_seen_farther_along_the_drive(
     step_s = 1e-4
     earlier, here, later = (
         read_one(
-            observe_from(se2.exp(t_s * np.array([TWIST[0, 0], 0.0, TWIST[0, 1]])), polar=polar, in_camera=in_camera),
+            observe_from(se2.exp(t_s * TWIST[0]), polar=polar, in_camera=in_camera),
             polar=polar,
             in_camera=in_camera,
             covariance=covariance,
