@@ -33,7 +33,7 @@ class AlignmentBudget:
     """Remaining budget for all pairs of a map.
 
     Attributes:
-        left: work.
+        remaining: work.
     """
 
     remaining: float = np.inf

@@ -79,7 +79,7 @@ class AnchorTree:
         parent: (n,) of each node; -1: the root.
         step: (n, 3) T_parent_anchor.
         tag_m: (n, 2) in the anchor's frame.
-        above: (n, n) whether node k is on the path from the root to node i, i itself included.
+        is_ancestor: (n, n) whether node k is on the path from the root to node i, i itself included.
         covariance: (5 n, 5 n) of xi: the n steps' right tangents, then the n tags in their anchors.
     """
 

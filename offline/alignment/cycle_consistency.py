@@ -23,7 +23,7 @@ class Link:
     Attributes:
         T_a_b: (3,)
         covariance: (3, 3) of its right tangent.
-        evidence_nats: log Bayes factor of the alignment over chance.
+        log_bayes_factor: log Bayes factor of the alignment over chance.
         names: of both maps; they break ties.
     """
 

@@ -46,14 +46,14 @@ class FitState:
 
 @dataclass(frozen=True)
 class LinearisedFit:
-    """Differences of all shared tags around a linearisation point: f_a - T f_b = apart + by_transform dT + noise.
+    """Differences of all shared tags around a linearisation point: f_a - T f_b = difference + by_transform dT + noise.
 
     Attributes:
-        apart: (2 n,) for maps without errors.
+        difference: (2 n,) for maps without errors.
         covariance: (2 n, 2 n) of the noise.
         by_transform: (2 n, 3) by a motion (x, y, turn) of map b about `centre`.
         by_a: (2 n, 5 n) by xi_a; by_b by xi_b.
-        effort: the budget that fits of its tags are charged to.
+        budget: the budget that fits of its tags are charged to.
     """
 
     at: FitState
@@ -180,7 +180,7 @@ class SubsetFit:
         root: (2 m, 2 m) lower Cholesky factor of the covariance.
         motion: (3,) estimated motion of map b.
         information: (3, 3) of it.
-        pull: (2 m,) inverse covariance times residual.
+        weighted_residual: (2 m,) inverse covariance times residual.
         cost_increase: sum of squared sigmas of m tags, chi-square with 2 m - 3 degrees of freedom.
         log_determinant: of their covariance.
     """

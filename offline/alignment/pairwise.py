@@ -50,11 +50,11 @@ class Alignment:
         inlier: (n_shared,) which of them are consistent with the prediction from the others.
         off_m: (n_shared,) distance of outliers from the prediction; off_sigmas: in sigmas.
         rmse_m: of the inliers, with rigid maps.
-        rise: cost increase of a joint solve over the local ones due to the inliers, in squared sigmas: chi-square with
+        cost_increase: of a joint solve over the local ones due to the inliers, in squared sigmas: chi-square with
             2 n - 3 degrees of freedom under the model.
-        evidence_nats: log of its Bayes factor over chance.
-        is_sure: accepted: consistent, no alternative almost as likely, and more likely than chance.
-        rivals: alternatives that explain the tags almost as well.
+        log_bayes_factor: log of its Bayes factor over chance.
+        is_accepted: consistent, no alternative almost as likely, and more likely than chance.
+        alternatives: others that explain the tags almost as well.
     """
 
     T_a_b: FloatArray

@@ -39,7 +39,7 @@ class _Pictures(NamedTuple):
 
     Attributes:
         pose: (P,) keyframe; slope: (P, 3) of the cost; information: (P, 3, 3).
-        look_picture: (M,) of each look; coupled: (M, 3, 18) with its columns (M, 18).
+        picture_of: (M,) of each observation; coupled: (M, 3, 18) with its columns (M, 18).
         range_m: (P,) to the tags, in the mean.
     """
 

@@ -34,10 +34,10 @@ class SolvedComponent(NamedTuple):
         members: of the local maps.
         graph: its segments are the members' in order.
         solution: of the graph, on tag positions.
-        suspects: outlier tags.
+        outliers: outlier tags.
         refined: on corners; None where it is not.
-        told: sentences: what was left out, why it is not refined although requested, or which tags are not upright.
-        left_out: family and id of tags some or all of whose observations are not in the graph.
+        messages: sentences: what was left out, why it is not refined although requested, or which tags are not upright.
+        excluded_tags: family and id of tags some or all of whose observations are not in the graph.
     """
 
     members: Group

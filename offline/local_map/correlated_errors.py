@@ -32,8 +32,10 @@ class CorrelatedErrors:
     """Variances of whitened observations, by component of the observation.
 
     Attributes:
-        own: (2,) of the independent part, and own_redundancy: (2,) its number of measurements.
-        shared: (2,) of the part common to a cell, and shared_redundancy: (2,) its number of cells.
+        independent_variance: (2,) of the independent part.
+        independent_redundancy: (2,) its number of measurements.
+        common_variance: (2,) of the part common to a cell.
+        common_redundancy: (2,) its number of cells.
     """
 
     independent_variance: FloatArray

@@ -105,10 +105,11 @@ class Windows:
         problem: the whole, under the given sigmas.
         losses: of wheels and observations.
         factors: (2,) noise of wheels and of observations as a multiple of the given sigmas.
-        usual_factors: (2,) the same without the windows of largest cost, since a tag that moves or a robot that is
+        trimmed_factors: (2,) the same without the windows of largest cost, since a tag that moves or a robot that is
             carried corrupts a few of them. 0 where there are too few windows.
-        sharing: (M, 2) further factors on each observation's sigmas, for correlated errors of its neighbours.
-        freedom: effective degrees of freedom of the noise estimate.
+        correlated_error_factors: (M, 2) further factors on each observation's sigmas, for errors in common with its
+            neighbours.
+        degrees_of_freedom: effective degrees of freedom of the noise estimate.
         apart: the separate windows solved under that noise.
         n_conditions: number of parameters by which the windows exceed the whole.
         effort: solve budget of the logs, None if unlimited, and the share of it for a solve of the whole.

@@ -190,7 +190,7 @@ class WindowNoise(NamedTuple):
     Attributes:
         is_far_larger: far larger than given, so that it is taken as unknown.
         factors: of wheels and observations, as multiples of the given noise.
-        added: names of the position noise that corners have in addition.
+        extra_noise: names of the position noise that corners have in addition.
     """
 
     is_far_larger: bool

@@ -38,7 +38,7 @@ class Diagnostics:
 
     Attributes:
         maps: the local maps as they were aligned.
-        solved: the components, largest first.
+        components: the solved ones, largest first.
         runs: as they were given.
         searches: time offset searches by robot.
     """

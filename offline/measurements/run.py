@@ -50,7 +50,7 @@ class Run:
 
     Attributes:
         name: robot id and run id, unique among the runs of a map.
-        segments: wheel readings with unbroken odometry, in order.
+        wheel_segments: wheel readings with unbroken odometry, in order.
         picture_stamps_ns: (F,) every picture, also those that show no tag.
         tags: what was seen, sorted.
         camera: None in an imported log.

@@ -55,7 +55,7 @@ class OutlierSearch:
 
     Attributes:
         graph, solution: with the splits.
-        sightings: of the graph's segments.
+        tracks: of the graph's segments.
         place: (S,) equal where sightings are of one tag.
         evidence: at the solution, and places: of its sightings.
     """

@@ -48,7 +48,7 @@ class FreedRobots(NamedTuple):
     Attributes:
         runs: with wide sigmas for freed parameters in their files.
         choices: which parameters were freed, and why the others were not.
-        put_in: corrections already applied to the runs' files.
+        applied: corrections already applied to the runs' files.
         searches: time offset searches by robot.
     """
 

@@ -6,6 +6,7 @@ A function is called after what it does (an imperative) or returns (a noun), so 
 alone (`settled`), before a preposition (`told_by`) or at the end (`tags_joined`). As an adjective it may stand before a
 noun (`weighted_mean`), and predicates (`is_fixed`) and handlers (`on_camera_lost`) may end with one. Public names use
 the field's terms, so words that once stood for them are refused. A class name of the packages stands for one thing.
+What a docstring lists under Attributes or Args is there.
 """
 
 import ast
@@ -69,6 +70,29 @@ def private_words(name: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+", name)} & _PRIVATE_WORDS
 
 
+def documented_names(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """Names that a class's docstring lists under Attributes, or a function's under Args."""
+    section = "Attributes" if isinstance(node, ast.ClassDef) else "Args"
+    found = re.search(rf"^{section}:\n((?:    .*\n?|\n)+)", ast.get_docstring(node) or "", re.MULTILINE)
+    heads = re.findall(r"^    ([A-Za-z_*][\w, *]*): ", found[1], re.MULTILINE) if found else []
+    return [name.strip(" *") for head in heads for name in head.split(",")]
+
+
+def names_there(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    """Attributes and methods of a class, or parameters of a function."""
+    if not isinstance(node, ast.ClassDef):
+        given = node.args
+        stars = [each for each in (given.vararg, given.kwarg) if each is not None]
+        return {each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs, *stars)}
+    names = {each.name for each in node.body if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)}
+    for each in ast.walk(node):
+        if isinstance(each, ast.Attribute) and isinstance(each.value, ast.Name) and each.value.id == "self":
+            names.add(each.attr)
+        elif isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
+            names.add(each.id)
+    return names
+
+
 def complaints(path: Path, top: str) -> Iterator[str]:
     """One line for each name of a file that should be another."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -76,6 +100,8 @@ def complaints(path: Path, top: str) -> Iterator[str]:
             continue
         where = f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
         decorators = {ast.unparse(each).split("(")[0] for each in node.decorator_list}
+        if missing := [name for name in documented_names(node) if name not in names_there(node)]:
+            yield f"{where}: its docstring tells of {', '.join(missing)}, which it does not have"
         is_value = decorators & {"property", "cached_property", "pytest.fixture"}
         if not isinstance(node, ast.ClassDef) and not is_value and names_after_a_participle(node.name):
             yield f"{where}: is a past participle; name what the function does or returns"

@@ -37,8 +37,8 @@ class PlacedTags:
         place_m: (K, 3) in its frame, height above the floor.
         turn: (K, 3, 3) R_anchor_tag.
         covariance: (6 K, 6 K) of position and of a small rotation about the anchor's axes, tag by tag.
-        nats: negative log likelihood of the corners with the tags in this pose, relative to their best pose.
-        straightness: true cost increase for a rotation of the first tag by two sigmas, to the side of the smaller one,
+        negative_log_likelihood: of the corners with the tags in this pose, relative to their best pose.
+        linearity: true cost increase for a rotation of the first tag by two sigmas, to the side of the smaller one,
             over the quadratic prediction.
     """
 
@@ -65,7 +65,7 @@ class TagFit:
         T_anchors: (3,) of b's anchor in a's.
         covariance: (3, 3) of T_anchors as x, y, theta; includes unmodelled errors.
         cost_increase: squared sigmas, chi-square with `freedom` where the tags have the same pose in both.
-        nats: negative log likelihood, up to a constant common to all hypotheses about the same tags.
+        negative_log_likelihood: up to a constant common to all hypotheses about the same tags.
     """
 
     a: PlacedTags

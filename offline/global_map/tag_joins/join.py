@@ -35,7 +35,7 @@ class TagJoin:
         a: a run that observed the first of the tags; b: one of the other component, by name.
         tags: that both have.
         T_a_b: (3,) pose of b's start in a's.
-        rivals: likewise, of alternatives that explain the corners as well.
+        alternatives: likewise, of others that explain the corners as well.
         verdict: of the components' own maps.
         reason: why they are not joined; empty where they are.
     """

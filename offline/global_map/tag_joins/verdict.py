@@ -36,8 +36,8 @@ class Verdict:
 
     Attributes:
         best: the most likely hypothesis.
-        rivals: alternatives at least a hundredth as likely: a picture of a tag allows two poses.
-        most_heading_sigma_rad: upper bound on the heading sigma.
+        alternatives: others at least a hundredth as likely: a picture of a tag allows two poses.
+        max_heading_sigma_rad: upper bound on the heading sigma.
     """
 
     best: TagFit

@@ -33,9 +33,9 @@ class BagContent:
         odometry: (stamp in ns, message), ascending.
         imu: (stamp in ns, message), ascending.
         pictures: with their detections, ascending.
-        sent_transforms: (stamp in ns, TransformStamped) that may be tag poses.
+        tag_transforms: (stamp in ns, TransformStamped) that may be tag poses.
         camera_infos: the first message of each such topic.
-        left_out: number of excluded detections by reason.
+        n_excluded: number of excluded detections by reason.
         remarks: lines for the user.
     """
 

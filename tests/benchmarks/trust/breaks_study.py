@@ -45,7 +45,7 @@ class Outcome:
 
     Attributes:
         can_be_told: two tags agree on it, and it costs more than chance.
-        n_stretches: that came out.
+        n_segments: that came out.
         rms_m: of the tags; of those of two runs in `two_runs_rms_m`.
         said: the warnings.
     """
