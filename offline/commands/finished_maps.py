@@ -15,7 +15,8 @@ def compare(
     folder: MapFolder,
     truth: Annotated[Path | None, typer.Option(help="truth.json of the simulation.")] = None,
     survey: Annotated[
-        Path | None, typer.Option(help="Measured positions: tag_id,x_m,y_m, optionally sigma_m, family, instance.")
+        Path | None,
+        typer.Option(help="Measured positions: CSV of tag_id,x_m,y_m, or WPILib's layout (.json)."),
     ] = None,
     json_output: JsonFlag = False,
 ) -> None:

@@ -8,7 +8,6 @@ the map and all other entries against the entry. The worst is removed, and the r
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,60 +17,12 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import fit_transform, se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.survey_errors import ComponentSurvey, EntryResult, SurveyErrors
-from groundsbot.offline.foundation import CsvTable, read_table
+from groundsbot.offline.evaluation.survey_file import SurveyEntry
 from groundsbot.offline.maps import Component, MapResult
 
-# Accuracy of a tape measure and a plumb line, if the file has no sigma.
-DEFAULT_SIGMA_M: Final = 0.02
 # Probability that a correct survey has an entry rejected.
 _FALSE_ALARM: Final = 1e-3
 _MAX_STEPS: Final = 20
-_MAX_PLACE_M: Final = 1e8  # no place on the earth is farther from the origin of any grid
-_MAX_SIGMA_M: Final = 1000.0  # beyond the range of any observation
-
-
-@dataclass(frozen=True)
-class SurveyEntry:
-    """One measured position, in the survey's own frame."""
-
-    family: str  # empty: not given
-    tag_id: int
-    instance: str
-    position_m: FloatArray  # (2,)
-    sigma_m: float  # of each coordinate
-
-
-def read_survey(path: Path) -> list[SurveyEntry]:
-    """Read `tag_id,x_m,y_m` and, if present, `sigma_m,family,instance`; other columns are ignored.
-
-    Raises:
-        OfflineError: not such a file, or a tag twice in it.
-    """
-    table = read_table(path)
-    missing = [column for column in ("tag_id", "x_m", "y_m") if column not in table]
-    if missing:
-        raise OfflineError(f"{path}: has no column {', '.join(missing)}; a survey has tag_id,x_m,y_m and maybe sigma_m")
-    n = len(table)
-    ids = table.integers("tag_id", minimum=0)
-    x_m, y_m = (table.numbers_below(column, _MAX_PLACE_M) for column in ("x_m", "y_m"))
-    sigmas = table.positive_numbers("sigma_m", _MAX_SIGMA_M) if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
-    families = table.text("family") if "family" in table else [""] * n
-    instances = table.text("instance") if "instance" in table else [""] * n
-    entries = [
-        SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma)
-        for family, tag_id, instance, x, y, sigma in zip(families, ids, instances, x_m, y_m, sigmas, strict=True)
-    ]
-    _check_no_duplicates(table, entries)
-    return entries
-
-
-def _check_no_duplicates(table: CsvTable, entries: Sequence[SurveyEntry]) -> None:
-    seen = set()
-    for row, entry in enumerate(entries):
-        name = (entry.family, entry.tag_id, entry.instance)
-        if name in seen:
-            table.fail(row, "tag_id", "is there twice; leave one row out, or give each its instance")
-        seen.add(name)
 
 
 def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> SurveyErrors:

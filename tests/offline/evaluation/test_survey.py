@@ -1,5 +1,6 @@
 """A map against a survey: figures, wrong entries, swapped pairs, scale, bad files."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,14 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.evaluation.survey import SurveyEntry, evaluate_survey, read_survey
+from groundsbot.offline.evaluation.survey import evaluate_survey
+from groundsbot.offline.evaluation.survey_file import SurveyEntry, read_survey
 from groundsbot.offline.maps.result import Component, MapResult, TagResult
 from tests.support.data.maps import make_component, make_map
+from tests.support.paper_recordings import RECORDINGS
 
 _N_TAGS = 15
+ONE_TAG = '{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 2.0}}}'
 _SIGMA_M = 0.02
 T_SURVEY_MAP = np.array([300.0, -40.0, 2.5])
 
@@ -165,3 +169,54 @@ def test_a_maps_own_tags_file_is_a_survey(tmp_path: Path) -> None:
     path.write_text("tag_id,x_m,y_m,z_m,family,instance\n7,1.5,-2,,tag36h11,a\n")
     (entry,) = read_survey(path)
     assert (entry.family, entry.tag_id, entry.instance, entry.position_m.tolist()) == ("tag36h11", 7, "a", [1.5, -2.0])
+
+
+LAYOUTS = RECORDINGS.parent / "frc" / "layouts"
+
+
+@pytest.mark.skipif(not LAYOUTS.is_dir(), reason="WPILib's layouts are not here")
+def test_a_map_on_a_field_is_judged_by_wpilibs_layout(tmp_path: Path) -> None:
+    """Tags of Crescendo as they hang, seen from elsewhere, but for one that is 0.3 m off; in both forms."""
+    path = LAYOUTS / "2024-crescendo.json"
+    survey = read_survey(path)
+    assert [entry.tag_id for entry in survey] == list(range(1, 17))
+    rng = np.random.default_rng(0)
+    places = se2.apply(T_SURVEY_MAP, np.array([entry.position_m for entry in survey]))
+    places += rng.normal(0.0, 0.01, places.shape)
+    places[4] += [0.3, 0.0]
+    component, _ = _component(rng)
+    tags = tuple(
+        TagResult("tag36h11", entry.tag_id, "", 0.165, place, 1e-4 * np.eye(2), 9, ("red_one",))
+        for entry, place in zip(survey, places, strict=True)
+    )
+    joint = np.zeros((6 + 2 * len(tags), 6 + 2 * len(tags)))
+    joint[6:, 6:] = 1e-4 * np.eye(2 * len(tags))
+    older = tmp_path / "older.json"
+    data = json.loads(path.read_text())
+    older.write_text(json.dumps({"tags": data["field-tags"], "field": data["field-dimensions"]}))
+    for layout in (path, older):
+        result = make_map(replace(component, tags=tags, joint_covariance=joint))
+        (judged,) = evaluate_survey(result, read_survey(layout)).components
+        assert [each.tag.tag_id for each in judged.outliers] == [5]
+        np.testing.assert_allclose(judged.outliers[0].shift_m, [0.3, 0.0], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is not JSON"),
+        ("[]", "has no list 'tags' or 'field-tags'"),
+        ('{"tags": 3}', "has no list 'tags' or 'field-tags'"),
+        ('{"tags": [3]}', r"tags\[0\]: has no ID and pose.translation"),
+        ('{"tags": [{"ID": -1, "pose": {"translation": {"x": 1, "y": 2}}}]}', "ID is -1, must be a whole number"),
+        ('{"tags": [{"ID": 1, "pose": {"translation": {"x": NaN, "y": 2}}}]}', "x is nan, must be a number of metres"),
+        ('{"tags": [{"ID": 1, "pose": {"translation": {"x": 1, "y": "2"}}}]}', "y is '2', must be a number"),
+        (f'{{"tags": [{",".join(2 * [ONE_TAG])}]}}', "tag 1 is there twice"),
+    ],
+)
+def test_bad_layouts_are_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "layout.json"
+    path.write_text(text)
+    with pytest.raises(OfflineError, match=said) as error:
+        read_survey(path)
+    assert "\n" not in str(error.value)
