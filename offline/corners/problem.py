@@ -61,7 +61,7 @@ class CornerProblem:
     Attributes:
         readings: of tags whose corners nobody kept.
         anchor: (T,) a pose from which each tag was seen.
-        attitude_sigmas: (3,) how far off level pictures are, in WOBBLE; zeros on a hall floor.
+        attitude_sigmas: (3,) of roll, pitch and height of pictures, by which they are off level; zeros on a hall floor.
         upright: tags that somebody knows to hang so.
     """
 

@@ -31,7 +31,7 @@ from groundsbot.offline.sam import (
     Solution,
     SolveBudget,
     State,
-    bias_of,
+    cost_of_bias,
     losses_and_weights,
     solve,
     stack,
@@ -137,7 +137,7 @@ class Windows:
         bound = float(n * stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom)) if n else 0.0
         chi_square = max(0.0, 2.0 * (together.cost - self.apart.cost))
         if n and chi_square > bound and self.apart.converged and together.converged:
-            chi_square = max(0.0, chi_square - _cost_of_bias(self.apart, together))
+            chi_square = max(0.0, chi_square - cost_of_bias(self.apart, together))
         return GoodnessOfFit(
             chi_square=chi_square,
             expected=n,
@@ -145,29 +145,6 @@ class Windows:
             odometry_factor=float(self.factors[0]),
             reading_factor=float(self.factors[1]),
         )
-
-
-def _cost_of_bias(apart: Solution, together: Solution) -> float:
-    """Return the cost, in squared sigmas, of the difference in calibration that biases explain.
-
-    The difference between the two estimates, weighed by the information of the first, may contain any share of the
-    difference between their biases. The share that explains most of it is taken.
-
-    Args:
-        apart: windows, which share the calibration only.
-        together: the same observations as one map.
-    """
-    columns = apart.problem.columns.calibration
-    free = columns >= 0
-    if not free.any():
-        return 0.0
-    information = np.linalg.inv(apart.covariance(columns[free]))
-    difference = (apart.state.calibration - together.state.calibration)[free]
-    bias = bias_of(apart)[columns[free]] - bias_of(together)[together.problem.columns.calibration[free]]
-    weighed = information @ bias
-    share = np.clip(-(difference @ weighed) / max(float(bias @ weighed), np.finfo(np.float64).tiny), 0.0, 1.0)
-    left = difference + share * bias
-    return max(0.0, float(difference @ information @ difference - left @ information @ left))
 
 
 def fit_windows(

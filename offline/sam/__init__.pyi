@@ -3,7 +3,7 @@ from .arrowhead.covariance import SquareRoot
 from .arrowhead.dissection import LEVELS
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
-from .bias import bias_of, covariance_with_bias
+from .bias import cost_of_bias, covariance_with_bias
 from .budget import SolveBudget, budgets_of
 from .damping import Damping
 from .factors.odometry_and_readings import (
@@ -79,10 +79,10 @@ __all__ = [
     "Tree",
     "Values",
     "advance",
-    "bias_of",
     "budgets_of",
     "build_graph",
     "compiled_motions",
+    "cost_of_bias",
     "covariance_with_bias",
     "eliminate_columns",
     "ends_of",

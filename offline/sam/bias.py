@@ -13,13 +13,13 @@ share of the bias between none and all is taken as equally likely.
 """
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, State
+from groundsbot.offline.sam.factors.odometry_and_readings import Columns, ReadingFactors, State
 from groundsbot.offline.sam.factors.robust_losses import losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise
 
@@ -38,6 +38,29 @@ def covariance_with_bias(solution: Solution, columns: IntArray) -> FloatArray:
     """Return the joint covariance (k, k) of k columns of the tangent vector, bias included; 0 where held (-1)."""
     bias = np.where(columns >= 0, np.append(bias_of(solution), 0.0)[columns], 0.0)
     return solution.covariance(columns) + _SHARE_SQUARED * np.outer(bias, bias)
+
+
+def cost_of_bias(apart: Solution, together: Solution) -> float:
+    """Return the cost, in squared sigmas, of the difference in calibration that biases explain.
+
+    The difference between the two estimates, weighed by the information of the first, may contain any share of the
+    difference between their biases. The share that explains most of it is taken.
+
+    Args:
+        apart: windows, which share the calibration only.
+        together: the same observations as one map.
+    """
+    columns = apart.problem.columns.calibration
+    free = columns >= 0
+    if not free.any():
+        return 0.0
+    information = np.linalg.inv(apart.covariance(columns[free]))
+    difference = (apart.state.calibration - together.state.calibration)[free]
+    bias = bias_of(apart)[columns[free]] - bias_of(together)[together.problem.columns.calibration[free]]
+    weighed = information @ bias
+    share = np.clip(-(difference @ weighed) / max(float(bias @ weighed), np.finfo(np.float64).tiny), 0.0, 1.0)
+    left = difference + share * bias
+    return max(0.0, float(difference @ information @ difference - left @ information @ left))
 
 
 def _weights(solution: Solution) -> FloatArray:
@@ -60,17 +83,65 @@ def _conditional_covariances(solution: Solution, weights: FloatArray) -> FloatAr
     return factorisation.pose_covariances(np.arange(len(poses)))
 
 
+class _ReadingGradients(NamedTuple):
+    """What each of M observations adds to the gradient of 1/2 log det H_xx.
+
+    Attributes:
+        by_place: (M, 2) by the tag's place in base, with the mount held.
+        by_sensor: (M, 2) the part of it that comes from the place relative to the sensor.
+        by_yaw: (M,) by the sensor's yaw.
+        by_scale: (M,) by the tag scale.
+        place_by_pose: (M, 2, 3) derivative of the tag's place in base by the pose: A.
+        place_m: (M, 2) in base.
+        mount_m: (M, 2) of the sensor in base.
+    """
+
+    by_place: FloatArray
+    by_sensor: FloatArray
+    by_yaw: FloatArray
+    by_scale: FloatArray
+    place_by_pose: FloatArray
+    place_m: FloatArray
+    mount_m: FloatArray
+
+
 def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: FloatArray) -> FloatArray:
     """Return (n,) gradient of 1/2 log det H_xx in the tangent space.
-
-    Each observation adds w/2 tr(P K) to it, with P the information on the tag's place in base (u, at distance r and
-    direction psi from the sensor), and K the covariance of that place by the pose:
-
-        K = A C A^T,  A = [-I, (u_y, -u_x)^T],   P = R(psi) diag(1, 1/r) Omega diag(1, 1/r) R(psi)^T / (1 + tag scale)^2
 
     Odometry adds nothing but by the wheels' scale: scaling poses, tags, mount and wheels alike must not count.
     """
     readings, columns = problem.readings, problem.columns
+    each = _reading_gradients(problem.readings, state, covariances, weights)
+    theta = state.poses[readings.pose, 2]
+    in_map = se2.apply(np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1), each.by_place)
+    by_tag_scale = each.by_scale * (1.0 + state.calibration[readings.scale_parameter])
+    by_lengths = (each.by_place * each.place_m).sum(axis=1) - (each.by_sensor * each.mount_m).sum(axis=1)
+    wheel_scale = np.zeros(len(state.poses), dtype=np.int64)
+    for end in (0, 1):
+        wheel_scale[problem.odometry.first + end] = problem.odometry.parameters[:, 0]
+    gradient = np.zeros(columns.n + 1)  # the last one takes what is held
+    for at, values in (
+        (columns.poses[readings.pose], np.einsum("mi,mij->mj", each.by_place, each.place_by_pose)),
+        (columns.tags[readings.tag], in_map),
+        (columns.calibration[readings.mount_parameters[:, :2]], -each.by_sensor),
+        (columns.calibration[readings.mount_parameters[:, 2]], each.by_yaw),
+        (columns.calibration[readings.scale_parameter], each.by_scale),
+        (columns.calibration[wheel_scale[readings.pose]], -by_lengths - by_tag_scale),
+    ):
+        np.add.at(gradient, at, values)
+    return gradient[:-1]
+
+
+def _reading_gradients(
+    readings: ReadingFactors, state: State, covariances: FloatArray, weights: FloatArray
+) -> _ReadingGradients:
+    """Return the gradients of w/2 tr(P K), which each observation adds.
+
+    P is the information on the tag's place in base (u, at distance r and direction psi from the sensor), and K the
+    covariance of that place by the pose:
+
+        K = A C A^T,  A = [-I, (u_y, -u_x)^T],   P = R(psi) diag(1, 1/r) Omega diag(1, 1/r) R(psi)^T / (1 + tag scale)^2
+    """
     mount = readings.mount + state.calibration[readings.mount_parameters]
     scale = 1.0 + state.calibration[readings.scale_parameter]
     place = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
@@ -106,21 +177,4 @@ def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: 
         -2.0 * (half / scale) * (i11 * k11 + i12 * k12),
         -2.0 * (half / scale) * (i11 * k11 + 2.0 * i12 * k12 + i22 * k22),
     )
-    gradient = np.zeros(columns.n + 1)  # the last one takes what is held
-    theta = state.poses[readings.pose, 2]
-    cos, sin = np.cos(theta), np.sin(theta)
-    in_map = np.stack([cos * by_place[:, 0] - sin * by_place[:, 1], sin * by_place[:, 0] + cos * by_place[:, 1]], -1)
-    by_wheels = (by_sensor * mount[:, :2]).sum(axis=1) - (by_place * place).sum(axis=1) - by_scale * scale
-    parameter = np.zeros(len(state.poses), dtype=np.int64)
-    for end in (0, 1):
-        parameter[problem.odometry.first + end] = problem.odometry.parameters[:, 0]
-    for at, values in (
-        (columns.poses[readings.pose], np.einsum("mi,mij->mj", by_place, by_pose)),
-        (columns.tags[readings.tag], in_map),
-        (columns.calibration[readings.mount_parameters[:, :2]], -by_sensor),
-        (columns.calibration[readings.mount_parameters[:, 2]], np.where(polar, 0.0, by_psi)),
-        (columns.calibration[readings.scale_parameter], by_scale),
-        (columns.calibration[parameter[readings.pose]], by_wheels),
-    ):
-        np.add.at(gradient, at, values)
-    return gradient[:-1]
+    return _ReadingGradients(by_place, by_sensor, np.where(polar, 0.0, by_psi), by_scale, by_pose, place, mount[:, :2])

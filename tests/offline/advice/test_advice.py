@@ -1,4 +1,4 @@
-"""What is foretold of one more pass or tag is what a solve with it would find, and the best of them is advised."""
+"""What is predicted of one more pass or tag is what a solve with it would find, and the best of them is advised."""
 
 from dataclasses import replace
 
@@ -38,21 +38,21 @@ def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
     candidates = find_candidates(scene.graph, scene.solution.state)
     wanted = candidates.repeat_drives[len(candidates.repeat_drives) // 2]
     gain = repeat_drive_gain(scene.graph, scene.solution.state, wanted)
-    foretold = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
+    predicted = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
     part = scene.graph.segments[wanted.segment].part(wanted.first, wanted.last + 1)
     graph = build_graph([*scene.graph.segments, replace(part, name="again")])
     state = scene.solution.state
     driven = scene.graph.poses_of(state, wanted.segment)[wanted.first : wanted.last + 1]
     exact = sigmas_at(graph, State(np.concatenate([state.poses, driven]), state.tags, state.calibration))
-    np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
-    assert foretold.max() < 0.999 * tag_joint_covariance(scene.solution, []).sigmas_m().max()
+    np.testing.assert_allclose(predicted, list(exact.values()), rtol=1e-5)
+    assert predicted.max() < 0.999 * tag_joint_covariance(scene.solution, []).sigmas_m().max()
 
 
 def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
     found = find_candidates(scene.graph, scene.solution.state)
     place = max(found.tag_sites, key=lambda each: each.n_tracks)
     gain = new_tag_gain(found.paths, found.view_statistics, place)
-    foretold = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
+    predicted = tag_joint_covariance(scene.solution, [gain]).predicted_sigmas_m(gain)
     state, segments = scene.solution.state, list(scene.graph.segments)
     for i, segment in enumerate(segments):
         first = int(scene.graph.first_pose[i])
@@ -75,7 +75,7 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
         build_graph(segments), State(state.poses, np.vstack([state.tags, place.position_m]), state.calibration)
     )
     del exact[NEW]
-    np.testing.assert_allclose(foretold, list(exact.values()), rtol=1e-5)
+    np.testing.assert_allclose(predicted, list(exact.values()), rtol=1e-5)
 
 
 def test_no_tag_is_advised_beside_a_drive_that_read_none(scene: Scene) -> None:
@@ -114,9 +114,9 @@ def test_the_best_of_each_kind_is_advised(scene: Scene) -> None:
             known.predicted_sigmas_m(certain).max() <= doubtful * (1.0 + 1e-9) <= known.sigmas_m().max() * (1.0 + 1e-9)
         )
     by_pass = tag_joint_covariance(scene.solution, gains["pass"])
-    foretold = {"tag": expected, "pass": [by_pass.predicted_sigmas_m(gain).max() for gain in gains["pass"]]}
+    predicted = {"tag": expected, "pass": [by_pass.predicted_sigmas_m(gain).max() for gain in gains["pass"]]}
     for each in told:
-        assert each.sigma_then_m == pytest.approx(min(foretold[each.kind]))
+        assert each.sigma_then_m == pytest.approx(min(predicted[each.kind]))
     (advised,) = [each for each in told if each.kind == "pass"]
     assert advised.length_m is not None
     assert 0.0 < advised.length_m <= max_repeat_length_m(found.paths.along_m) <= 50.0

@@ -10,7 +10,6 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
 from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline.local_map.goodness_of_fit import _cost_of_bias
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.measurements.segment import segments_of
@@ -77,7 +76,7 @@ def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it(
     def explained(times: float) -> float:
         moved = together.state.calibration - times * towards
         state = State(together.state.poses, together.state.tags, moved)
-        return _cost_of_bias(replace(apart, state=state), together)
+        return bias.cost_of_bias(replace(apart, state=state), together)
 
     whole = float(towards[free] @ information @ towards[free])
     assert whole > 0.0
