@@ -1,6 +1,6 @@
 """The noise parameters, fitted to what the local maps leave over, all runs together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -10,7 +10,14 @@ from scipy.special import ndtri
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import STAMP_NOISE, CovarianceParts, Segment, coarse_keyframes, coarsen
+from groundsbot.offline.measurements import (
+    ODOMETRY_NOISE,
+    STAMP_NOISE,
+    CovarianceParts,
+    Segment,
+    coarse_keyframes,
+    coarsen,
+)
 from groundsbot.offline.noise.likelihood import Components, Part
 from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
@@ -24,6 +31,7 @@ _NEXT_SHARE: Final = 1.4
 _QUANTILE: Final = float(ndtri(0.995))
 # No wheel and no detector is so many times better than the defaults: smaller residuals are made up.
 PLAUSIBLE: Final = 20.0
+_NEGLIGIBLE: Final = "the other noise of observations explains their errors without it"
 _LEAST: Final = (1.0 + 1e-6) / PLAUSIBLE  # where the search stops, with its rounding
 
 
@@ -81,16 +89,28 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoisePara
     while free:
         fitted = _fit(maps, noise, start or noise, free)
         found = _sigmas(free, fitted)
-        small = {
-            each.name: _keep_prior(each, noise) for each in found if _times_default(each) <= _LEAST and not each.kept
-        }
+        small = {each.name: each for each in found if _times_default(each) <= _LEAST and not each.kept}
+        if _other_noise_of_readings(found, small):
+            negligible = small.keys() - ODOMETRY_NOISE
+            found = [replace(each, kept=_NEGLIGIBLE) if each.name in negligible else each for each in found]
+            small = {name: each for name, each in small.items() if name not in negligible}
         if not small:
             told = {each.name: each for each in found}
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
             return NoiseFit(noise.model_copy(update=values), _in_order(told | kept), fitted.shared, fitted.n_groups)
-        kept |= small
+        kept |= {name: _keep_prior(each, noise) for name, each in small.items()}
         free = tuple(name for name in free if name not in small)
     return NoiseFit(noise, _in_order(kept), np.zeros((2, 2)), np.zeros((2, 2)))
+
+
+def _other_noise_of_readings(found: Sequence[FittedSigma], small: Mapping[str, FittedSigma]) -> bool:
+    """Return whether some other sigma explains the errors of observations, so that the small ones have no part in them.
+
+    Their default in place of the small value would be far more than the residuals show, and the fit would explain
+    everything by it.
+    """
+    others = [each for each in found if each.name not in ODOMETRY_NOISE and each.name not in small]
+    return any(not each.kept for each in others)
 
 
 def _times_default(sigma: FittedSigma) -> float:

@@ -3,7 +3,7 @@ from .arrowhead.covariance import SquareRoot
 from .arrowhead.dissection import LEVELS
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
-from .bias import cost_of_bias, covariance_with_bias
+from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, cost_of_bias, covariance_with_bias
 from .budget import SolveBudget, budgets_of
 from .damping import Damping
 from .factors.odometry_and_readings import (
@@ -52,10 +52,12 @@ __all__ = [
     "LEVELS",
     "MAX_RELATIVE_ERROR",
     "MAX_TRIES",
+    "MEAN_SHARE",
     "NO_PARAMETER",
     "NO_PRIORS",
     "N_READING",
     "PLAIN_SQUARES",
+    "SHARE_VARIANCE",
     "CalibrationPrior",
     "Columns",
     "Damping",
@@ -79,6 +81,7 @@ __all__ = [
     "Tree",
     "Values",
     "advance",
+    "bias_of",
     "budgets_of",
     "build_graph",
     "compiled_motions",

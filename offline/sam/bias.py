@@ -23,8 +23,10 @@ from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Readin
 from groundsbot.offline.sam.factors.robust_losses import losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise
 
-# Mean square of a share that is uniform between 0 and 1.
-_SHARE_SQUARED: Final = 1.0 / 3.0
+# Of a share that is uniform between 0 and 1.
+MEAN_SHARE: Final = 0.5
+SHARE_VARIANCE: Final = 1.0 / 12.0
+_SHARE_SQUARED: Final = MEAN_SHARE**2 + SHARE_VARIANCE
 
 
 def bias_of(solution: Solution) -> FloatArray:

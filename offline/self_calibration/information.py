@@ -4,8 +4,12 @@ Each segment is cut into a few sections. A section is solved with its own start,
 parameter that might be freed under a wide prior. Its information about the calibration is the information of this
 estimate less the prior. This needs no map and no alignment, and a tag moved between sections does no harm. The noise is
 fitted to windows of the segment (`local_map.goodness_of_fit`), so the given noise matters little.
+
+The estimates are biased (`sam.bias`), all sections of a robot by the same share of their bias. The mean share is taken
+off, and its variance added to the covariance.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -19,7 +23,16 @@ from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corne
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared_variance
 from groundsbot.offline.noise import in_cell, inflation_of_corners
-from groundsbot.offline.sam import Parameter, Solution, SolveBudget, build_graph, solve
+from groundsbot.offline.sam import (
+    MEAN_SHARE,
+    SHARE_VARIANCE,
+    Parameter,
+    Solution,
+    SolveBudget,
+    bias_of,
+    build_graph,
+    solve,
+)
 from groundsbot.offline.self_calibration.selection import CalibrationInformation
 
 # Sections of a segment, where it is as long as this many windows. Holding out one of five is the usual share.
@@ -60,13 +73,16 @@ def information_of(
     """
     parts: list[_SegmentInformation] = []
     priors: dict[tuple[object, ...], Parameter] = {}
-    for each, effort in zip(maps, efforts, strict=True):
+    cuts = [_cuts(each.segment) for each in maps]
+    n_sections = Counter(each.segment.run.robot_id for each, own in zip(maps, cuts, strict=True) for _ in own)
+    for each, own, effort in zip(maps, cuts, efforts, strict=True):
         robot = robots[each.segment.run.name]
         given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
         priors |= {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters}
         segment = _with_window_noise(each, noise, effort)
-        for first, end in _cuts(segment):
-            part = _information_of_segment(segment, each, first, end, effort, corners=corners)
+        n = n_sections[segment.run.robot_id]
+        for first, end in own:
+            part = _information_of_segment(segment, each, first, end, effort, n_sections=n, corners=corners)
             if part is not None:
                 parts.append(part)
                 priors = {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in part.parameters} | priors
@@ -112,9 +128,9 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 
 
 def _information_of_segment(
-    segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, corners: bool
+    segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, n_sections: int, corners: bool
 ) -> _SegmentInformation | None:
-    """Return the information of one section; None if it observes no tag or its solve does not converge."""
+    """Return the information of one of `n_sections` of a robot; None without tags or where its solve fails."""
     part = segment.part(first, end)
     if not len(part.readings):
         return None
@@ -134,9 +150,13 @@ def _information_of_segment(
         return None
     columns = solution.problem.columns.calibration
     free = np.flatnonzero(columns >= 0)
-    return _without_prior(
-        tuple(parameters[i] for i in free), solution.covariance(columns[free]), solution.state.calibration[free]
-    )
+    value, covariance = solution.state.calibration[free], solution.covariance(columns[free])
+    if solution is on_floor:
+        bias = bias_of(on_floor)[columns[free]]
+        value = value + MEAN_SHARE * bias
+        # As independent sections are summed, an error they have in common would be averaged away.
+        covariance = covariance + n_sections * SHARE_VARIANCE * np.outer(bias, bias)
+    return _without_prior(tuple(parameters[i] for i in free), covariance, value)
 
 
 def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _SegmentInformation:

@@ -17,7 +17,7 @@ from groundsbot.offline.maps.parameter_results import NOT_NEEDED
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import Segment, segments_of
-from groundsbot.offline.measurements.sensor_model.sensor_model import STAMP_NOISE
+from groundsbot.offline.measurements.sensor_model.sensor_model import POSITION_NOISE, STAMP_NOISE
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.fit import fit_noise
 from groundsbot.offline.noise.likelihood import LikelihoodEvaluator
@@ -125,6 +125,18 @@ def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
     assert all(each.kept for each in result.noise_fit.parameters)
     for name, value in PRIOR.model_dump().items():
         assert getattr(result.noise, name) == pytest.approx(value, rel=0.02), name
+
+
+def test_noise_that_other_noise_explains_is_small_and_not_the_default(maps: list[LocalMap]) -> None:
+    """Corners that might err in range and bearing besides, and do not: the defaults are more than the drives show."""
+    noise = NoiseParameters(sigma_corner_px=0.3)
+    without = {each.name: each for each in fit_noise(maps, noise).sigmas}
+    both = [replace(each, segment=each.segment.with_noise(noise).with_position_noise(POSITION_NOISE)) for each in maps]
+    sigmas = {each.name: each for each in fit_noise(both, noise).sigmas}
+    assert sigmas["sigma_range_m"].value < 0.1 * noise.sigma_range_m
+    assert sigmas["sigma_bearing_rad"].value < 0.1 * noise.sigma_bearing_rad
+    for name in ("sigma_corner_px", "sigma_distance_m_per_sqrt_m", "sigma_heading_rad_per_sqrt_m"):
+        assert sigmas[name].value == pytest.approx(without[name].value, rel=0.15), name
 
 
 def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[LocalMap]) -> None:
