@@ -33,7 +33,7 @@ from groundsbot.offline.sam import (
     build_graph,
     solve,
 )
-from groundsbot.offline.self_calibration.selection import CalibrationInformation
+from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
 
 # Sections of a segment, where it is as long as this many windows. Holding out one of five is the usual share.
 _SECTIONS: Final = 5

@@ -1,27 +1,25 @@
 """Which calibration parameters the drives may correct, and why the others stay as robot.yaml has them.
 
-The log likelihood of a section of a segment, with everything but the calibration c eliminated, is a quadratic form with
-information L_k and vector h_k: log p(section | c) = h_k^T c - c^T L_k c / 2 + constant. Sections have their own starts
-and tags, so they are independent given c, and all tests below use sums of these forms.
+All tests use estimates from sections of the drives, which are independent (`section_estimates`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.stats import norm
 
-from groundsbot.calib.foundation import BoolArray, FloatArray
+from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import FREED_SIGMAS, GROSS_ERROR_NAMES, MAX_FREED_SIGMAS, OwnedParameter
+from groundsbot.offline.self_calibration.robot import FREED_SIGMAS, GROSS_ERROR_NAMES, MAX_FREED_SIGMAS
+from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation, SectionEstimates
 
 # Share of maps with a correct robot.yaml in which any parameter is freed.
 _FALSE_ALARM: Final = 0.01
-_NOTHING: Final = 1e-9  # information relative to the prior of freed parameters: rounding
 _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
 # An error beyond this many of the sigmas of freed parameters is a gross error.
 _GROSS_SHARE: Final = 0.5
@@ -33,32 +31,6 @@ GROSS_ERROR_ELSEWHERE: Final = "robot.yaml has a gross error in another number, 
 LESS_CERTAIN: Final = "the drives determine it less well than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
 _NOT_ASKED: Final = "it was not requested"
-
-
-@dataclass(frozen=True)
-class CalibrationInformation:
-    """Information of S sections about C parameters.
-
-    Attributes:
-        parameters: C, each with the sigma that robot.yaml gives it.
-        information: (S, C, C); vector: (S, C).
-    """
-
-    parameters: tuple[Parameter, ...]
-    information: FloatArray
-    vector: FloatArray
-
-    def relative_to(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
-        """Return the same relative to the files before these corrections, by owner and name, were applied."""
-        shift = np.array([values.get(OwnedParameter(each.owner, each.name), 0.0) for each in self.parameters])
-        return replace(self, vector=self.vector + self.information @ shift)
-
-
-class _NumberEstimate(NamedTuple):
-    """Estimate of one parameter by data alone; its variance is huge where the data contain no information."""
-
-    value: float
-    variance: float
 
 
 def choose(
@@ -112,6 +84,7 @@ class _Selection:
         late_s: Mapping[str, float],
     ) -> None:
         self._told, self._candidates, self._asked, self._late_s = told, candidates, asked, late_s
+        self._estimates = SectionEstimates(told)
         self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
         self.open: list[int] = []
 
@@ -168,8 +141,8 @@ class _Selection:
         sigmas = np.array([each.sigma for each in told.parameters])
         sigmas[self.open] = [FREED_SIGMAS[told.parameters[i].name] for i in self.open]
         prior, is_asked = parameter.sigma, parameter.name in self._asked
-        whole = _estimate(told, np.ones(len(told.vector), dtype=np.bool_), sigmas, index)
-        gain = _cross_validated_gain(told, sigmas, index)
+        whole = self._estimates.of_all(index, sigmas)
+        gain = _cross_validated_gain(self._estimates, parameter, index, sigmas)
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
         most = MAX_FREED_SIGMAS * FREED_SIGMAS[parameter.name]
         reason = ""
@@ -218,36 +191,22 @@ def _contradiction_score(choice: CalibrationChoice) -> float:
     return choice.off_sigmas**2 - (_ODDS_OF_WHEELS if choice.name == WHEEL_PARAMETERS[0] else 0.0)
 
 
-def _cross_validated_gain(told: CalibrationInformation, sigmas: FloatArray, index: int) -> float | None:
+def _cross_validated_gain(
+    estimates: SectionEstimates, parameter: Parameter, index: int, sigmas: FloatArray
+) -> float | None:
     """Return the leave-one-out log-likelihood gain over robot.yaml, summed over sections.
 
     Each section's likelihood is taken under the estimate of all others, and under robot.yaml. None where no two
     sections have information about the parameter.
     """
-    prior, limit, gains = told.parameters[index].sigma, FREED_SIGMAS[told.parameters[index].name], []
-    for k in range(len(told.vector)):
-        own = np.arange(len(told.vector)) == k
-        out, others = (_estimate(told, which, sigmas, index) for which in (own, ~own))
-        if max(out.variance, others.variance) < limit**2:
-            gains.append(
-                _log_density(out.value - others.value, out.variance + others.variance)
-                - _log_density(out.value, out.variance + prior**2)
-            )
+    prior, limit = parameter.sigma, FREED_SIGMAS[parameter.name]
+    gains = [
+        _log_density(out.value - others.value, out.variance + others.variance)
+        - _log_density(out.value, out.variance + prior**2)
+        for out, others in estimates.one_against_others(index, sigmas)
+        if max(out.variance, others.variance) < limit**2
+    ]
     return sum(gains) if gains else None
-
-
-def _estimate(told: CalibrationInformation, which: BoolArray, sigmas: FloatArray, index: int) -> _NumberEstimate:
-    """Estimate a parameter from some sections (S,), without a prior on it and with those of the others."""
-    limit = FREED_SIGMAS[told.parameters[index].name]
-    unit = sigmas.copy()
-    unit[index] = limit
-    information = unit[:, None] * told.information[which].sum(axis=0) * unit
-    covariance = np.linalg.inv(information + np.eye(len(unit)))
-    mean = (covariance @ (unit * told.vector[which].sum(axis=0)))[index]
-    told_alone = 1.0 / covariance[index, index] - 1.0
-    if told_alone < _NOTHING:
-        return _NumberEstimate(0.0, limit**2 / _NOTHING)
-    return _NumberEstimate(float(limit * mean / covariance[index, index] / told_alone), float(limit**2 / told_alone))
 
 
 def _log_density(off: float, variance: float) -> float:

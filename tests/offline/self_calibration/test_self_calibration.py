@@ -37,7 +37,8 @@ from groundsbot.offline.self_calibration.robot import (
     with_unknown_calibration,
 )
 from groundsbot.offline.self_calibration.robot_table import AGREES, REQUESTED, WRONG, verdict_lines
-from groundsbot.offline.self_calibration.selection import LESS_CERTAIN, CalibrationInformation, choose, is_overruled
+from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
+from groundsbot.offline.self_calibration.selection import LESS_CERTAIN, choose, is_overruled
 from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
