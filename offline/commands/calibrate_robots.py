@@ -8,9 +8,9 @@ from typing import Any, Final
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import echo_line, read_robot_files, scale_line
+from groundsbot.offline.commands.shared import echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Stages, announce_compilation
+from groundsbot.offline.foundation import Stages, announce_compilation, worker_processes
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
 from groundsbot.offline.maps import CalibrationResult, MapResult
 from groundsbot.offline.measurements import Run, TapeOptions
@@ -40,6 +40,7 @@ class CalibrateOptions:
     distances: Sequence[str] = ()
     corners: bool = False
     calibrate: str = AUTO
+    workers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -65,16 +66,18 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     logs, robot_files = find_logs(list(options.logs)), read_robot_files(options.robots)
     if options.output.exists():
         raise OfflineError(f"-o {options.output}: exists already and is not overwritten; name a new file or folder")
-    with announce_compilation(echo_line), progress_bar() as show:
+    count = n_workers(options.workers, logs)
+    with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages = Stages(show)
         result = build_map(
-            read_runs(logs, robot_files, stages),
+            read_runs(logs, robot_files, stages, workers),
             noise,
             stages,
             TapeOptions((), options.distances),
             corners=options.corners,
             calibrate=calibrate,
             workings=workings,
+            workers=workers,
         )
     robots = _robots(workings.runs)
     paths = _paths(options.output, [*robots])

@@ -18,6 +18,16 @@ Distances = Annotated[
     list[str] | None,
     typer.Option(help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable."),
 ]
+WorkerCount = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=256,
+        help="Processes that share out the drives; the result is the same. [default: one for each core, fewer where "
+        "memory would not do]",
+        metavar="N",
+    ),
+]
 
 
 def map_command(
@@ -62,6 +72,7 @@ def map_command(
             metavar="off|auto|PARAM,...",
         ),
     ] = AUTO,
+    workers: WorkerCount = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool,
@@ -89,6 +100,7 @@ def map_command(
         upright_deg=upright_deg,
         extend=extend,
         calibrate=calibrate,
+        workers=workers,
     )
     result, costs = make_map(options)
     if json_output:
@@ -111,6 +123,7 @@ def calibrate(
         MapModel, typer.Option(help="Use tags' corners in pixels (focal length too), or their positions on the floor.")
     ] = MapModel.FLOOR,
     calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
+    workers: WorkerCount = None,
     json_output: JsonFlag = False,
 ) -> None:
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
@@ -123,7 +136,14 @@ def calibrate(
     from groundsbot.offline.commands.calibrate_robots import CalibrateOptions, as_json, calibrate_robots, summary
 
     options = CalibrateOptions(
-        logs, output, robot or (), noise, distance or (), corners=model is MapModel.CORNERS, calibrate=calibrate
+        logs,
+        output,
+        robot or (),
+        noise,
+        distance or (),
+        corners=model is MapModel.CORNERS,
+        calibrate=calibrate,
+        workers=workers,
     )
     calibrated = calibrate_robots(options)
     if json_output:

@@ -11,9 +11,9 @@ from typing import Final
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files, scale_line
+from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
+from groundsbot.offline.foundation import StageCost, Stages, announce_compilation, worker_processes
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
@@ -60,6 +60,7 @@ class MapOptions:
     upright_deg: float | None = None
     extend: Path | None = None
     calibrate: str = AUTO
+    workers: int | None = None
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -78,10 +79,11 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
-    with announce_compilation(echo_line), progress_bar() as show:
+    count = n_workers(options.workers, logs)
+    with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages, workings = Stages(show), Diagnostics()
         result = build_map(
-            read_runs(logs, robot_files, stages),
+            read_runs(logs, robot_files, stages, workers),
             noise,
             stages,
             TapeOptions(options.starts, options.distances),
@@ -91,6 +93,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             calibrate=calibrate,
             workings=workings,
             extending=extending,
+            workers=workers,
         )
         with folder_written_whole(options.output, replace=options.overwrite) as folder:
             _write_files(result, workings, folder, options.output, stages)

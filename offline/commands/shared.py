@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import default_workers, size_bytes
 from groundsbot.offline.maps import ScaleBudget
 from groundsbot.offline.measurements import RobotFile, read_robot_file
 
@@ -18,6 +19,11 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
             raise OfflineError(f"--robot {path}: robot_id {given.robot.robot_id!r} is given twice; leave one out")
         robot_files[given.robot.robot_id] = given
     return robot_files
+
+
+def n_workers(asked: int | None, logs: Sequence[Path]) -> int:
+    """Return how many processes share out some logs."""
+    return asked or default_workers([size_bytes(log) for log in logs])
 
 
 def echo_line(text: str) -> None:

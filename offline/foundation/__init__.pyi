@@ -3,20 +3,25 @@ from .input_budget import ALONE, Inputs, size_bytes
 from .jit import announce_compilation, borrow, inline, inner, njit
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
+from .workers import Held, Workers, default_workers, worker_processes
 
 __all__ = [
     "ALONE",
     "CsvTable",
+    "Held",
     "Inputs",
     "Progress",
     "StageCost",
     "Stages",
+    "Workers",
     "announce_compilation",
     "borrow",
+    "default_workers",
     "inline",
     "inner",
     "njit",
     "open_arrays",
     "read_table",
     "size_bytes",
+    "worker_processes",
 ]

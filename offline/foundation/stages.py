@@ -3,7 +3,7 @@
 import ctypes
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -19,9 +19,9 @@ class StageCost(NamedTuple):
     """What one stage took."""
 
     name: str
-    seconds: float
-    cpu_seconds: float  # of them this process was at work, on all its threads
-    peak_mib: float | None  # the most memory that the process held until the stage's end; None where no kernel tells
+    seconds: float  # that passed; of work in several processes at once its share of them
+    cpu_seconds: float  # of processors, on all threads and in all processes
+    peak_mib: float | None  # the most memory that one process held until the stage's end; None where no kernel tells
 
 
 class Stages:
@@ -29,7 +29,7 @@ class Stages:
 
     def __init__(self, tell: Progress | None = None) -> None:
         """Args: tell: told at a stage's beginning and whenever one of its parts is done; None: nobody is."""
-        self._tell = tell or (lambda _what, _done, _total: None)
+        self.tell: Final = tell or (lambda _what, _done, _total: None)
         self._costs: dict[str, StageCost] = {}
 
     @contextmanager
@@ -40,17 +40,28 @@ class Stages:
         def tick() -> None:
             nonlocal done
             done += 1
-            self._tell(name, done, total)
+            self.tell(name, done, total)
 
-        self._tell(name, 0, total)
-        before = self._costs.get(name, StageCost(name, 0.0, 0.0, None))
+        self.tell(name, 0, total)
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
         try:
             yield tick
         finally:
             seconds, cpu_seconds = time.perf_counter() - began_s, time.process_time() - began_cpu_s
-            self._costs[name] = StageCost(name, before.seconds + seconds, before.cpu_seconds + cpu_seconds, _peak_mib())
+            self.add([StageCost(name, seconds, cpu_seconds, peak_mib())])
             _give_back()
+
+    def add(self, costs: Iterable[StageCost]) -> None:
+        """Adds what stages took, in this process or in another one."""
+        for each in costs:
+            before = self._costs.get(each.name, StageCost(each.name, 0.0, 0.0, None))
+            peaks = [peak for peak in (before.peak_mib, each.peak_mib) if peak is not None]
+            self._costs[each.name] = StageCost(
+                each.name,
+                before.seconds + each.seconds,
+                before.cpu_seconds + each.cpu_seconds,
+                max(peaks, default=None),
+            )
 
     @property
     def costs(self) -> tuple[StageCost, ...]:
@@ -67,7 +78,7 @@ def _give_back() -> None:
         _TRIM(0)
 
 
-def _peak_mib() -> float | None:
+def peak_mib() -> float | None:
     """The kernel's high-water mark of this process's memory, which Linux alone tells without what its parent held."""
     try:
         lines = _STATUS.read_text(encoding="ascii").splitlines()

@@ -53,6 +53,8 @@ _MAX_FITS: Final = 20
 # Tolerance of the solves whose residuals are used: the relative error of the squares is its root.
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
+# Least progress of these solves: sigmas are then off by half of it, a fortieth of the tolerance of the fit.
+_PROGRESS: Final = 1e-3
 _ROUNDING: Final = 1e-6
 _WORST_SHARE: Final = 0.2
 _FEWEST_WINDOWS: Final = 3
@@ -249,7 +251,9 @@ def _correlated_error_factors(
 
 def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
     """Solve until the squares of the residuals have converged, not yet the cost."""
-    solution = solve(problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries)
+    solution = solve(
+        problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries, least_progress=_PROGRESS
+    )
     problem.arrowhead.without_scratch()  # using the residuals needs as much memory again
     return solution
 

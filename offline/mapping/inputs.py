@@ -3,18 +3,21 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.errors import CalibError
+from groundsbot.calib.errors import CalibError, GroundsbotError
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Inputs, Stages
+from groundsbot.offline.foundation import Inputs, Stages, Workers
 from groundsbot.offline.local_map import check_extendable, check_sizes_in_map
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import SAME_SIZE_M, RobotFile, Run, load_run
 from groundsbot.offline.self_calibration import Calibrate
 from groundsbot.onboard.log import Allowance
+
+_READING: Final = "reading logs"
 
 
 def check_distinct(runs: Sequence[Run]) -> None:
@@ -65,7 +68,10 @@ def check_new(
 
 
 def read_runs(
-    logs: Sequence[Path], robot_files: Mapping[str, RobotFile] | None = None, stages: Stages | None = None
+    logs: Sequence[Path],
+    robot_files: Mapping[str, RobotFile] | None = None,
+    stages: Stages | None = None,
+    workers: Workers | None = None,
 ) -> list[Run]:
     """Read logs for `build_map`, whose frame is the start of the first.
 
@@ -73,21 +79,42 @@ def read_runs(
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
         stages: notified of progress, and records times.
+        workers: processes that share out the logs; None: this one reads them.
 
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.
     """
-    runs, inputs, allowance, n_segments = list[Run](), Inputs.of(logs), Allowance(), 0
+    inputs, allowance = Inputs.of(logs), Allowance()
     if logs:
         inputs.check_segments(len(logs), logs[-1])
-    with (stages or Stages()).stage("reading logs", len(logs)) as done:
-        for log in logs:
-            runs.append(load_run(log, robot_files, inputs, allowance))
-            n_segments += len(runs[-1].wheel_segments)
-            inputs.check_segments(n_segments, log)
-            done()
+
+    def read(log: Path, _stages: Stages) -> Run:
+        return load_run(log, robot_files, inputs, allowance)
+
+    workers, stages = workers or Workers(), stages or Stages()
+    if workers.n == 1:
+        runs = workers.map(read, logs, list(map(str, logs)), stages, _READING)
+    else:
+        items = [(log, robot_files, inputs) for log in logs]
+        found = workers.map(_read_intact, items, list(map(str, logs)), stages, _READING)
+        runs = [run or read(log, stages) for log, run in zip(logs, found, strict=True)]
+    n_segments = 0
+    for log, run in zip(logs, runs, strict=True):
+        n_segments += len(run.wheel_segments)
+        inputs.check_segments(n_segments, log)
     check_robots(runs, robot_files or {})
     return runs
+
+
+def _read_intact(item: tuple[Path, Mapping[str, RobotFile] | None, Inputs], _stages: Stages) -> Run | None:
+    """Return the run of a log that takes nothing of what all logs share; None of any other, which is read in turn."""
+    log, robot_files, inputs = item
+    nothing = Allowance(0, 0, 0, 0)
+    try:
+        run = load_run(log, robot_files, inputs, nothing)
+    except GroundsbotError:
+        return None
+    return None if run.lost or nothing != Allowance(0, 0, 0, 0) else run
 
 
 def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.alignment import Merge, merge
-from groundsbot.offline.foundation import Stages
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.global_map import (
     SolvedComponent,
     TagJoin,
@@ -64,6 +64,7 @@ def build_map(
     calibrate: Calibrate = Calibrate(is_on=True),
     workings: Diagnostics | None = None,
     extending: MapResult | None = None,
+    workers: Workers | None = None,
 ) -> MapResult:
     """Turn runs into one map in the frame of the first run's start.
 
@@ -80,11 +81,12 @@ def build_map(
         calibrate: which parameters of robot.yaml the drives may correct.
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
+        workers: processes that share out the drives; None: this one does all. The result is the same.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
     """
-    stages, tape = stages or Stages(), tape or TapeOptions()
+    stages, tape, workers = stages or Stages(), tape or TapeOptions(), workers or Workers()
     check_distinct(runs)
     check_tag_sizes(runs)
     noise_fit = None
@@ -96,17 +98,17 @@ def build_map(
     workings.runs += runs
     given = runs
     (runs, choices, put_in, searches), segments = _calibrate_runs(
-        runs, noise or prior_noise, stages, calibrate, corners=corners
+        runs, noise or prior_noise, stages, workers, calibrate, corners=corners
     )
     workings.searches |= searches
     measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
     times = N_MAPPINGS if calibrate.is_on else 1
-    maps, noisy, broken = local_maps_of(segments, stages, times, noise_is_open=noise is None)
+    maps, noisy, broken = local_maps_of(segments, stages, times, noise_is_open=noise is None, workers=workers)
     if noise is None:
         with stages.stage("fitting the noise"):
-            maps, noise, noise_fit = fit_and_weigh(maps, prior_noise)
-        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages)
+            maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)
+        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
         broken += slipped
     else:
         maps = known + with_noise_of_map(maps, noise, noise_fit)
@@ -145,29 +147,34 @@ def build_map(
 
 
 def _calibrate_runs(
-    runs: Sequence[Run], noise: NoiseParameters, stages: Stages, calibrate: Calibrate, *, corners: bool
+    runs: Sequence[Run],
+    noise: NoiseParameters,
+    stages: Stages,
+    workers: Workers,
+    calibrate: Calibrate,
+    *,
+    corners: bool,
 ) -> tuple[FreedRobots, list[Segment]]:
     """Return the runs with start values and freed parameters, and their segments."""
-    with stages.stage("start values of robots"):
-        runs, started, searches = initialise_open_robots(runs, noise)
+    runs, started, searches = initialise_open_robots(runs, noise, stages, workers)
     found = FreedRobots(runs, started, applied_corrections(started), searches)
     if calibrate.is_on:
-        with stages.stage("self-calibration"):
-            freed = free_parameters(runs, noise, calibrate.names, corners=corners)
+        freed = free_parameters(runs, noise, calibrate.names, stages, workers, corners=corners)
         found = FreedRobots(
             freed.runs, (*started, *freed.choices), found.applied | freed.applied, found.searches | freed.searches
         )
-    return found, _segments(found.runs, noise, stages)
+    return found, _segments(found.runs, noise, stages, workers)
 
 
-def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages) -> list[Segment]:
+def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, workers: Workers) -> list[Segment]:
     """Return all segments of the runs, with two tags of the same id split."""
-    segments: list[Segment] = []
-    with stages.stage("keyframes and readings", len(runs)) as done:
-        for run in runs:
-            segments += [split_duplicates(segment) for segment in segments_of(run, noise)]
-            done()
-    return segments
+    items, names = [(run, noise) for run in runs], [run.name for run in runs]
+    found = workers.map(_segments_of_run, items, names, stages, "keyframes and readings")
+    return [segment for own in found for segment in own]
+
+
+def _segments_of_run(item: tuple[Run, NoiseParameters], _stages: Stages) -> list[Segment]:
+    return [split_duplicates(segment) for segment in segments_of(*item)]
 
 
 def _measurements(

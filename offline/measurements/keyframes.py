@@ -1,17 +1,18 @@
 """Which pictures of a drive become keyframes, the poses of the state."""
 
-from math import dist
+from math import radians
 from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import IntArray
+from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.foundation import njit
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run
 
 # A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
 KEYFRAME_DISTANCE_M: Final = 0.02
-KEYFRAME_TURN_RAD: Final = np.radians(1.0)
+KEYFRAME_TURN_RAD: Final = radians(1.0)
 # it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
 # look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
 _STANDING_TICKS: Final = 1.5
@@ -27,39 +28,76 @@ def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
     return np.asarray(np.union1d(wheel_segment.stamps_ns[:1], stamps_ns[inside]), dtype=np.int64)
 
 
-def tags_at_candidates(run: Run, stamps_ns: IntArray) -> list[set[int]]:
-    """The tags that each candidate shows."""
-    tags_at: list[set[int]] = [set() for _ in stamps_ns]
+def tags_at_candidates(run: Run, stamps_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the tags that each of n candidates shows: (n + 1,) where each candidate's begin, and (m,) the tags."""
+    at, tag = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     indices = np.arange(len(stamps_ns))
     for source in (run.detections, run.positions):
-        at = keyframe_at(source.stamps_ns, stamps_ns, indices)
-        for candidate, tag in zip(at.tolist(), source.tag.tolist(), strict=True):
-            if candidate >= 0:
-                tags_at[candidate].add(tag)
-    return tags_at
+        at = np.append(at, keyframe_at(source.stamps_ns, stamps_ns, indices))
+        tag = np.append(tag, source.tag)
+    order = np.argsort(at, kind="stable")
+    at, tag = at[order], tag[order]
+    begin = np.searchsorted(at, np.arange(len(stamps_ns) + 1))
+    return begin - begin[0], tag[begin[0] :]
 
 
 def choose_keyframes(
-    wheel_segment: WheelSegment, stamps_ns: IntArray, tags_at: list[set[int]], track_m: float
+    wheel_segment: WheelSegment, stamps_ns: IntArray, tags_at: tuple[IntArray, IntArray], track_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Thins by motion: (K,) stamps, and for each candidate its keyframe or -1 (passed over)."""
+    """Thin candidates by motion.
+
+    Args:
+        wheel_segment: the wheels.
+        stamps_ns: (n,) of the candidates.
+        tags_at: as `tags_at_candidates` returns them.
+        track_m: of the robot.
+
+    Returns:
+        (K,) stamps of the keyframes, and for each candidate its keyframe or -1 (passed over).
+    """
     left_m, right_m = wheel_segment.at(stamps_ns)
-    place_m = np.stack([0.5 * (left_m + right_m), wheel_segment.lateral_at(stamps_ns)], axis=-1).tolist()
+    ahead_m, lateral_m = 0.5 * (left_m + right_m), wheel_segment.lateral_at(stamps_ns)
     turn_rad = (right_m - left_m) / track_m
-    keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
     standing_m = _STANDING_TICKS * wheel_segment.quantum_m + _STANDING_M
-    chosen: list[int] = []
-    for i, (place, turn) in enumerate(zip(place_m, turn_rad.tolist(), strict=True)):
-        moved_m = dist(place, place_m[chosen[-1]]) if chosen else np.inf
-        turned_rad = abs(turn - turn_rad[chosen[-1]]) if chosen else np.inf
-        standing = moved_m + 0.5 * track_m * turned_rad <= standing_m  # the wheel that moved more
-        moved = moved_m >= KEYFRAME_DISTANCE_M or turned_rad >= KEYFRAME_TURN_RAD
-        if moved or (not standing and tags_at[i] - tags_at[chosen[-1]]):
-            chosen.append(i)
-        elif not standing:
-            continue
-        keyframe_of[i] = len(chosen) - 1
-    return stamps_ns[chosen], keyframe_of
+    keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
+    chosen = np.empty(len(stamps_ns), dtype=np.int64)
+    thresholds = KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, standing_m, 0.5 * track_m
+    n = _choose(ahead_m, lateral_m, turn_rad, *tags_at, thresholds, keyframe_of, chosen)
+    return stamps_ns[chosen[:n]], keyframe_of
+
+
+@njit
+def _choose(
+    ahead_m: FloatArray,
+    lateral_m: FloatArray,
+    turn_rad: FloatArray,
+    begin: IntArray,
+    tag: IntArray,
+    thresholds: tuple[float, float, float, float],
+    keyframe_of: IntArray,
+    chosen: IntArray,
+) -> int:
+    distance_m, turn_least_rad, standing_m, half_track_m = thresholds
+    n = 0
+    for i in range(len(ahead_m)):
+        last = chosen[n - 1] if n else i
+        moved_m = np.hypot(ahead_m[i] - ahead_m[last], lateral_m[i] - lateral_m[last])
+        turned_rad = abs(turn_rad[i] - turn_rad[last])
+        standing = moved_m + half_track_m * turned_rad <= standing_m  # the wheel that moved more
+        is_keyframe = n == 0 or moved_m >= distance_m or turned_rad >= turn_least_rad
+        if not is_keyframe and not standing:
+            for k in range(begin[i], begin[i + 1]):
+                is_new = True
+                for other in range(begin[last], begin[last + 1]):
+                    is_new = is_new and tag[other] != tag[k]
+                is_keyframe = is_keyframe or is_new
+            if not is_keyframe:
+                continue
+        if is_keyframe:
+            chosen[n] = i
+            n += 1
+        keyframe_of[i] = n - 1
+    return n
 
 
 def keyframe_at(wanted_ns: IntArray, stamps_ns: IntArray, keyframe_of: IntArray) -> IntArray:

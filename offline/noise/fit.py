@@ -9,6 +9,7 @@ from scipy.special import ndtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
+from groundsbot.offline.foundation import Workers
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import (
     ODOMETRY_NOISE,
@@ -72,7 +73,12 @@ class NoiseFit:
     n_groups: FloatArray
 
 
-def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoiseParameters | None = None) -> NoiseFit:
+def fit_noise(
+    maps: Sequence[LocalMap],
+    noise: NoiseParameters,
+    start: NoiseParameters | None = None,
+    workers: Workers | None = None,
+) -> NoiseFit:
     """Fits the noise of all runs at once, whatever it comes out at.
 
     What the drives tell too little of stays where it began, or where they are more content with if that is more; what
@@ -82,12 +88,14 @@ def fit_noise(maps: Sequence[LocalMap], noise: NoiseParameters, start: NoisePara
         maps: solved under any noise.
         noise: what stays where the drives say nothing.
         start: where to begin; there where None.
+        workers: share out the maps; None: this process.
     """
+    workers = workers or Workers()
     maps = sorted(maps, key=lambda each: each.segment.name)  # sums are rounded alike whatever the order of the logs
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
-        fitted = _fit(maps, noise, start or noise, free)
+        fitted = _fit(maps, noise, start or noise, free, workers)
         found = _sigmas(free, fitted)
         small = {each.name: each for each in found if _times_default(each) <= _LEAST and not each.kept}
         if _other_noise_of_readings(found, small):
@@ -137,7 +145,11 @@ def _in_order(sigmas: dict[str, FittedSigma]) -> tuple[FittedSigma, ...]:
 
 
 def _fit(
-    maps: Sequence[LocalMap], noise: NoiseParameters, start: NoiseParameters, names: tuple[str, ...]
+    maps: Sequence[LocalMap],
+    noise: NoiseParameters,
+    start: NoiseParameters,
+    names: tuple[str, ...],
+    workers: Workers,
 ) -> FittedVariances:
     default = NoiseParameters()
     return fit_variances(
@@ -145,6 +157,7 @@ def _fit(
         np.array([getattr(noise, name) for name in names]),
         least=np.array([getattr(default, name) / PLAUSIBLE for name in names]),
         start=np.array([getattr(start, name) for name in names]),
+        workers=workers,
     )
 
 
@@ -180,7 +193,7 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
         lasting_root(segment),
         *_of_stamps(segment, names),
     )
-    return Part(graph.problem, start, components)
+    return Part(graph.problem, start, components, segment.name)
 
 
 def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:

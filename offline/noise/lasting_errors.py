@@ -44,11 +44,19 @@ class LastingErrors:
         errors[self.order] = series
         return errors
 
-    def correlate_transpose(self, rows: FloatArray) -> FloatArray:
-        """B' r of rows (N, n): the sum of their squares is r' B B' r."""
-        series = rows[self.order]
-        _keep_backwards(series, self.kept)
-        return series * np.sqrt(1.0 - self.kept**2)[:, None]
+    def squares(self, root: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return r' B B' r, with r = root' rows, of the observations' rows.
+
+        Args:
+            root: (N, 2) what an error of one adds to each observation.
+            rows: (N, 2, n).
+
+        Returns:
+            (n,) sums of squares of B' r.
+        """
+        sums = np.zeros(rows.shape[2])
+        _add_squares(self.order, self.kept, root, rows, sums)
+        return sums
 
 
 @njit
@@ -66,6 +74,13 @@ def _keep(series: FloatArray, kept: FloatArray) -> None:
 
 
 @njit
-def _keep_backwards(series: FloatArray, kept: FloatArray) -> None:
-    for k in range(len(kept) - 1, 0, -1):
-        series[k - 1] += kept[k] * series[k]
+def _add_squares(order: IntArray, kept: FloatArray, root: FloatArray, rows: FloatArray, sums: FloatArray) -> None:
+    n = rows.shape[2]
+    series = np.zeros(n)  # B' r before its scale, of the observation after in the series
+    for k in range(len(order) - 1, -1, -1):
+        i = order[k]
+        from_next = kept[k + 1] if k + 1 < len(order) else 0.0
+        scale = 1.0 - kept[k] ** 2
+        for j in range(n):
+            series[j] = root[i, 0] * rows[i, 0, j] + root[i, 1] * rows[i, 1, j] + from_next * series[j]
+            sums[j] += scale * series[j] ** 2

@@ -7,8 +7,9 @@ estimate leaves of an error. The traces are averages over random signs (Hutchins
 of the influence matrix for Laplacian smoothing splines", 1989).
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy import sparse
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.foundation import Held
 from groundsbot.offline.noise.lasting_errors import LastingErrors
 from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stack, whitening
 
@@ -66,6 +68,16 @@ class Components:
         """Variances of lasting errors: two a kind."""
         return 2 * len(self.lasting)
 
+    @cached_property
+    def odometry_roots(self) -> list[FloatArray | None]:
+        """Square roots (M, 3, 3) of `odometry`, component by component, then of `odometry_rest`; None where zero."""
+        return [_root(each) for each in (*self.odometry, self.odometry_rest)]
+
+    @cached_property
+    def reading_roots(self) -> list[FloatArray | None]:
+        """Square roots (N, 2, 2) of `readings`, component by component, then of `readings_rest`; None where zero."""
+        return [_root(each) for each in (*self.readings, self.readings_rest)]
+
     def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; readings count as independent with what that takes.
 
@@ -88,11 +100,12 @@ class Components:
 
 @dataclass(frozen=True)
 class Part:
-    """A problem, where its solve begins, and what its covariances are made of."""
+    """A problem, where its solve begins, what its covariances are made of, and what to call it in errors."""
 
     problem: Problem
     start: State
     components: Components
+    name: str = ""
 
 
 class PartLikelihood(NamedTuple):
@@ -172,12 +185,12 @@ class _Rows:
         self._jacobian = sparse.csr_array(jacobian * self._root[:, None])
         self._factorisation = solution.factorisation
         self.residual = residual * self._root * np.concatenate([_within_noise(each.residual) for each in kinds])
-        self._of_motions = _roots(problem.odometry.whitening, components.odometry)
-        self._of_readings = _roots(problem.readings.whitening, components.readings)
-        self._unscaled = (
-            _roots(problem.odometry.whitening, components.odometry_rest[None])[0],
-            _roots(problem.readings.whitening, components.readings_rest[None])[0],
-        )
+        of_motions = [_whiten(problem.odometry.whitening, each) for each in components.odometry_roots]
+        of_readings = [_whiten(problem.readings.whitening, each) for each in components.reading_roots]
+        self._of_motions, self._of_readings = of_motions[:-1], of_readings[:-1]
+        self._unscaled = of_motions[-1], of_readings[-1]
+        self._forms_of_motions = _quadratic_forms(self._of_motions, len(problem.odometry.whitening), 3)
+        self._forms_of_readings = _quadratic_forms(self._of_readings, len(problem.readings.whitening), 2)
         self._lasting = components.lasting
         if components.lasting_root is not None:
             self._by_lasting = problem.readings.whitening @ components.lasting_root
@@ -202,20 +215,11 @@ class _Rows:
         """(C, n) the quadratic forms q of (R, n) rows."""
         motions = rows[: self._n_odometry].reshape(-1, 3, rows.shape[1])
         readings = rows[self._n_odometry :].reshape(-1, 2, rows.shape[1])
-        own = [
-            _form(of_motions, motions) + _form(of_readings, readings)
-            for of_motions, of_readings in zip(self._of_motions, self._of_readings, strict=True)
-        ]
+        own = [*(self._forms_of_motions @ _products(motions) + self._forms_of_readings @ _products(readings))]
         if self._common is not None:
             along = np.einsum("mi,min->mn", self._by_stamp, readings)
             own[self._common] = (np.asarray(self._pictures @ along) ** 2).sum(axis=0)
-        lasting = [
-            (errors.correlate_transpose(np.einsum("mi,min->mn", self._by_lasting[..., axis], readings)) ** 2).sum(
-                axis=0
-            )
-            for errors in self._lasting
-            for axis in (0, 1)
-        ]
+        lasting = [errors.squares(self._by_lasting[..., axis], readings) for errors in self._lasting for axis in (0, 1)]
         return np.array(own + lasting).reshape(self.n_components, rows.shape[1])
 
     def random_errors(self, component: int, rng: np.random.Generator) -> FloatArray:
@@ -256,20 +260,32 @@ def _regular(covariances: FloatArray) -> FloatArray:
     return np.asarray(covariances + (_ROUNDING * level)[:, None, None] * np.eye(n))
 
 
-def _roots(whitenings: FloatArray, units: FloatArray) -> list[FloatArray | None]:
-    """(M, n, n) of each component, with root root' its whitened covariance for a variance of one; None if that is 0."""
-    roots: list[FloatArray | None] = []
-    for unit in units:
-        values, vectors = np.linalg.eigh(unit)
-        roots.append(whitenings @ (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) if unit.any() else None)
-    return roots
+def _root(covariances: FloatArray) -> FloatArray | None:
+    """Return matrices (M, n, n) with root root' the covariances (M, n, n); None where all are zero."""
+    if not covariances.any():
+        return None
+    values, vectors = np.linalg.eigh(covariances)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
-def _form(root: FloatArray | None, rows: FloatArray) -> FloatArray:
-    """(n,) sums of |root' r|^2 of rows (M, k, n)."""
-    if root is None:
-        return np.zeros(rows.shape[2])
-    return np.asarray(((root.swapaxes(-1, -2) @ rows) ** 2).sum(axis=(0, 1)))
+def _whiten(whitenings: FloatArray, root: FloatArray | None) -> FloatArray | None:
+    return None if root is None else np.asarray(whitenings @ root)
+
+
+def _quadratic_forms(roots: Sequence[FloatArray | None], m: int, n: int) -> FloatArray:
+    """Return (K, M n (n + 1) / 2): times the `_products` of rows, sums of |root' r|^2 for each of K roots (M, n, n)."""
+    i, j = np.triu_indices(n)
+    forms = np.zeros((len(roots), m, len(i)))
+    for form, root in zip(forms, roots, strict=True):
+        if root is not None:
+            form[:] = np.where(i == j, 1.0, 2.0) * (root @ root.swapaxes(-1, -2))[:, i, j]
+    return forms.reshape(len(roots), -1)
+
+
+def _products(rows: FloatArray) -> FloatArray:
+    """Return (M n (n + 1) / 2, k) products of each two components of rows (M, n, k)."""
+    i, j = np.triu_indices(rows.shape[1])
+    return np.asarray((rows[:, i] * rows[:, j]).reshape(-1, rows.shape[2]))
 
 
 def _within_noise(residual: FloatArray) -> FloatArray:
@@ -284,7 +300,7 @@ def _within_noise(residual: FloatArray) -> FloatArray:
     return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)
 
 
-def evaluate_all(lookers: list[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
-    """What all parts say together."""
-    seen: Iterator[PartLikelihood] = (each.evaluate(variances) for each in lookers)
-    return PartLikelihood(*(np.asarray(sum(each)) for each in zip(*seen, strict=True)))
+def evaluate_all(evaluators: Held[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
+    """Return the sums over all parts."""
+    found = evaluators.map(LikelihoodEvaluator.evaluate, variances)
+    return PartLikelihood(*(np.asarray(sum(each)) for each in zip(*found, strict=True)))

@@ -16,6 +16,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.foundation import Workers
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import NOT_NEEDED, FittedNoise, FittedParameter
 from groundsbot.offline.measurements import ODOMETRY_NOISE
@@ -40,15 +41,16 @@ class WeighedMaps(NamedTuple):
     fitted: FittedNoise
 
 
-def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters) -> WeighedMaps:
+def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> WeighedMaps:
     """Fits the noise and solves each map again under it.
 
     Args:
         maps: solved under the prior.
         prior: what stays where the runs tell nothing.
+        workers: share out the fit; None: this process.
     """
     sound = [each for each in maps if _is_sound(each)]
-    fit = fit_noise(sound, prior, _inflate_prior(sound, prior))
+    fit = fit_noise(sound, prior, _inflate_prior(sound, prior), workers)
     found, noise = {each.name: each for each in fit.sigmas}, fit.noise
     is_told = bool(fit.n_groups[0, 0] >= _LEAST_CELLS)
     shared = fit.shared if noise != prior else np.zeros((2, 2))

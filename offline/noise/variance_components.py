@@ -21,8 +21,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
+from groundsbot.offline.foundation import Workers
 from groundsbot.offline.noise.likelihood import LikelihoodEvaluator, Part, PartLikelihood, evaluate_all
-from groundsbot.offline.sam import Solution
 
 # Of a logarithm of sigma: a factor of ten either way is one such sigma.
 PRIOR_SIGMA: Final = float(np.log(10.0))
@@ -52,7 +52,6 @@ class FittedVariances:
             logarithm, the prior's share taken off.
         told: (K,) whether the data say enough of it; else it stands where it began, or where they are more content
             with if that is more, unless they speak against that.
-        solutions: of the parts under these sigmas.
         converged: whether the last repetition changed nothing that matters.
         shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.lasting_root`.
         n_groups: (L, 2) of how many cells, or passes, each tells.
@@ -62,7 +61,6 @@ class FittedVariances:
     log_covariance: FloatArray
     redundancy: FloatArray
     told: BoolArray
-    solutions: tuple[Solution, ...]
     converged: bool
     shared: FloatArray
     n_groups: FloatArray
@@ -79,7 +77,11 @@ class FittedVariances:
 
 
 def fit_variances(
-    parts: Sequence[Part], sigma: FloatArray, least: FloatArray | None = None, start: FloatArray | None = None
+    parts: Sequence[Part],
+    sigma: FloatArray,
+    least: FloatArray | None = None,
+    start: FloatArray | None = None,
+    workers: Workers | None = None,
 ) -> FittedVariances:
     """Fits K sigmas to all parts at once.
 
@@ -90,18 +92,20 @@ def fit_variances(
         sigma: (K,) the middle of the prior.
         least: (K,) below which no sigma is looked for.
         start: (K,) where to begin; at the prior's where None.
+        workers: share out the parts; None: this process.
 
     Raises:
         UnderDeterminedError: a part has something that nothing ties down.
     """
     least = np.zeros(len(sigma)) if least is None else least
-    search = _Search(parts, sigma, least, sigma if start is None else start)
+    search = _Search(parts, sigma, least, sigma if start is None else start, workers or Workers())
     n = len(sigma)
     search.grow()
     converged = search.run(np.ones(len(search.variances), dtype=np.bool_))
     told = search.redundancy() >= LEAST_REDUNDANCY
     if not told[:n].all():
         converged &= search.hold_untold(told)
+    search.evaluators.release()
     log_covariance = search.log_covariance()
     redundancy = search.redundancy()
     is_shared = (search.variances[n:] > 2.0 * _NONE_SHARED) & (search.seen.n_groups > 0.0)
@@ -110,7 +114,6 @@ def fit_variances(
         log_covariance[:n, :n],
         redundancy[:n],
         told[:n],
-        tuple(each.solution for each in search.lookers),
         converged,
         np.where(is_shared, search.variances[n:], 0.0).reshape(-1, 2),
         search.seen.n_groups.reshape(-1, 2),
@@ -140,14 +143,17 @@ class _Search:
         seen: at these variances.
     """
 
-    def __init__(self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, start: FloatArray) -> None:
-        self.lookers = [LikelihoodEvaluator(part) for part in parts]
+    def __init__(
+        self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, start: FloatArray, workers: Workers
+    ) -> None:
+        names = [part.name for part in parts]
+        self.evaluators = workers.hold([LikelihoodEvaluator(part) for part in parts], names)
         self._n = len(sigma)
         n_shared = parts[0].components.n_lasting if parts else 0
         self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
         self.variances = np.maximum(np.append(start**2, self._middle[self._n :]), self._least)
-        self.seen: PartLikelihood = evaluate_all(self.lookers, self.variances)
+        self.seen: PartLikelihood = evaluate_all(self.evaluators, self.variances)
 
     def run(self, free: BoolArray) -> bool:
         """Repeats the estimate of those that are free (C,) until what the data tell stands; False if it does not."""
@@ -155,7 +161,7 @@ class _Search:
             times = np.where(free, self._estimate(free), 1.0)
             moved = 0.5 * np.log(np.clip(times, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
             self.variances = np.clip(self.variances * np.exp(2.0 * moved), self._least, _MOST_TIMES * self._middle)
-            self.seen = evaluate_all(self.lookers, self.variances)
+            self.seen = evaluate_all(self.evaluators, self.variances)
             deviation = np.sqrt(np.diag(self.log_covariance()))
             matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
             # Far too small, all readings are cut off as faults, and nothing is told until sigmas have grown.
@@ -172,7 +178,7 @@ class _Search:
             if not (moved > _GROWING).any():
                 return
             self.variances = np.minimum(self.variances * np.exp(2.0 * moved), _MOST_TIMES * self._middle)
-            self.seen = evaluate_all(self.lookers, self.variances)
+            self.seen = evaluate_all(self.evaluators, self.variances)
 
     def hold_untold(self, told: BoolArray) -> bool:
         """Puts sigmas of which little is told up to the prior's, where the data do not speak against it."""
@@ -181,7 +187,7 @@ class _Search:
         untold = ~told & (np.arange(len(fitted)) < n)
         # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
         self.variances = np.where(untold, np.maximum(fitted, self._middle), fitted)
-        self.seen = evaluate_all(self.lookers, self.variances)
+        self.seen = evaluate_all(self.evaluators, self.variances)
         expected = self.seen.traces @ self.variances
         excess = (expected - self.seen.squares) * self.variances
         spread = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))

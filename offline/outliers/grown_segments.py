@@ -66,19 +66,20 @@ def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, effor
 def _refine_end(
     segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, effort: SolveBudget
 ) -> SolvedPart:
-    """Between a part that fits and a longer one that does not, keyframe by keyframe."""
+    """Return the longest part between one that fits and a longer one that does not, to the keyframe, by bisection."""
     longest = known
     reading = np.unique(segment.readings.keyframe)
     ahead = reading[(reading >= known.end) & (reading < beyond.end)] + 1
     back = reading[(reading < known.first) & (reading >= beyond.first)][::-1]
     parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
-    for part in parts:
-        if effort.is_spent():
-            break
-        grown = _solve_part(segment, *part, longest, effort)
+    fitting, strained = -1, len(parts)
+    while strained - fitting > 1 and not effort.is_spent():
+        middle = (fitting + strained) // 2
+        grown = _solve_part(segment, *parts[middle], longest, effort)
         if _strains(known, grown, factor, len(parts)):
-            break
-        longest = grown
+            strained = middle
+        else:
+            fitting, longest = middle, grown
     return longest
 
 

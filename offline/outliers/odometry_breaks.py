@@ -79,6 +79,13 @@ class _BreakPlace(NamedTuple):
     begin: int
 
 
+class _BothSides(NamedTuple):
+    """The local maps of what comes before a place of a drive and of what comes after it."""
+
+    before: LocalMap
+    after: LocalMap
+
+
 class _SplitDrive(NamedTuple):
     """Of a drive.
 
@@ -134,9 +141,10 @@ def find_break(local_map: LocalMap, effort: SolveBudget | None = None) -> Break 
     if not places or effort.is_spent():
         return None
     middle = places[len(places) // 2]
+    sides = _solve_apart(segment, middle, effort)
     starts = [
         _start(local_map.graph, ahead, behind, place, T_ahead_behind)
-        for T_ahead_behind in _ways_to_align(segment, behind, middle, effort)
+        for T_ahead_behind in _ways_to_align(sides, behind, middle)
         for place in places
     ]
     if not starts:
@@ -147,7 +155,11 @@ def find_break(local_map: LocalMap, effort: SolveBudget | None = None) -> Break 
     costs = np.array([solution.cost for solution in apart])
     equal = np.flatnonzero(costs <= costs.min() + _SAME_COST)
     best = max(equal.tolist(), key=lambda i: _seconds_between(segment, starts[i].place))
-    return _test_break(local_map, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort)
+    if starts[best].place != middle:
+        sides = _solve_apart(segment, starts[best].place, effort)
+    return _test_break(
+        local_map, sides, starts[best].place, apart[best].state, [starts[i].place for i in equal], effort
+    )
 
 
 def _all_of(local_map: LocalMap) -> SolveBudget:
@@ -243,13 +255,12 @@ def _between_readings(segment: Segment, place: _BreakPlace) -> _BreakPlace:
     return _BreakPlace(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
 
 
-def _ways_to_align(segment: Segment, behind: SolvedPart, place: _BreakPlace, effort: SolveBudget) -> list[FloatArray]:
-    """How the part behind may lie in the frame of the part ahead, by the tags on both sides of a place."""
-    apart = _solve_apart(segment, place, effort)
-    if apart is None:
+def _ways_to_align(sides: _BothSides | None, behind: SolvedPart, place: _BreakPlace) -> list[FloatArray]:
+    """Return transforms from the part behind to the part ahead, by the tags on both sides of a place."""
+    if sides is None:
         return []
     at_begin = behind.poses[place.begin - behind.first]
-    alignment = _align(*apart)
+    alignment = _align(*sides)
     ways = [] if alignment is None else [alignment, *alignment.alternatives]
     return [se2.compose(way.T_a_b, se2.inverse(at_begin)) for way in ways]
 
@@ -266,8 +277,8 @@ def _solve_from(starts: Sequence[_Start], problem: Problem, effort: SolveBudget)
     return found
 
 
-def _solve_apart(segment: Segment, place: _BreakPlace, effort: SolveBudget) -> tuple[LocalMap, LocalMap] | None:
-    """What comes before and what comes after, each on its own; None where one of them cannot be."""
+def _solve_apart(segment: Segment, place: _BreakPlace, effort: SolveBudget) -> _BothSides | None:
+    """Solve what comes before a place and what comes after, each on its own; None where one of them cannot be."""
     n = len(segment.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
         return None
@@ -279,7 +290,7 @@ def _solve_apart(segment: Segment, place: _BreakPlace, effort: SolveBudget) -> t
         except OfflineError:
             return None
         effort.give_back(own)
-    return found[0], found[1]
+    return _BothSides(*found)
 
 
 def _align(before: LocalMap, after: LocalMap) -> Alignment | None:
@@ -299,13 +310,17 @@ def _start(
 
 
 def _test_break(
-    local_map: LocalMap, place: _BreakPlace, start: State, equal: Sequence[_BreakPlace], effort: SolveBudget
+    local_map: LocalMap,
+    sides: _BothSides | None,
+    place: _BreakPlace,
+    start: State,
+    equal: Sequence[_BreakPlace],
+    effort: SolveBudget,
 ) -> Break | None:
-    """The break, if two tags agree on it and it pays to believe in it."""
+    """Return the break if two tags on both sides agree on it and it lowers the cost by more than chance explains."""
     segment, problem = local_map.segment, local_map.graph.problem
-    parts = _solve_apart(segment, place, effort)
-    alignment = None if parts is None else _align(*parts)
-    if parts is None or alignment is None or not alignment.is_accepted:
+    alignment = None if sides is None else _align(*sides)
+    if sides is None or alignment is None or not alignment.is_accepted:
         return None
     freed = _without_motions(problem, *place)
     apart = solve(freed, start, most_tries=effort.max_linearisations(freed, 1.0))
@@ -313,7 +328,7 @@ def _test_break(
     together = solve(problem, apart.state, most_tries=effort.max_linearisations(problem, 1.0))
     effort.spend(together)
     joined = min(local_map.solution.cost, together.cost)
-    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in parts))
+    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in sides))
     reading = np.unique(segment.readings.keyframe)
     # Between two readings all motions are one: freeing the others as well lets nothing else go.
     n_freed = 3 * (1 + int(((reading >= place.end) & (reading < place.begin)).sum()))

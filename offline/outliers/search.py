@@ -17,6 +17,7 @@ from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
+from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.places import NOWHERE, Places, minimise_places
 from groundsbot.offline.outliers.sightings import Tracks
 
@@ -146,15 +147,52 @@ def _simplest(evidence: Evidence, sightings: Tracks, labels: IntArray, least_gai
         if not sightings.came_back(evidence.which[members], labels[members]):
             continue
         most = least_gain + _cost(evidence, minimise_places(evidence, labels))
-        for i in range(1, len(members)):
-            moved = labels.copy()
-            moved[members[:i]], moved[members[i:]] = labels.max() + 1, labels.max() + 2
-            found = minimise_places(evidence, moved)
-            off, covariance = found.apart(evidence, int(found.place[members[0]]), int(found.place[members[-1]]))
-            cost = _cost(evidence, found)
-            if cost < most and float(off @ np.linalg.solve(covariance, off)) >= least_gain:
-                most, labels = cost, moved
+        cost, gain = _one_move(evidence, labels, members)
+        cost = np.where(gain >= least_gain, cost, np.inf)
+        best = int(np.argmin(cost))
+        if cost[best] < most:
+            labels = labels.copy()
+            labels[members[: best + 1]], labels[members[best + 1 :]] = labels.max() + 1, labels.max() + 2
     return labels
+
+
+def _one_move(evidence: Evidence, labels: IntArray, members: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return what it costs if a tag was moved once, and what it would cost more if it was not; all others give way.
+
+    Args:
+        evidence: of K tracks.
+        labels: (K,) the place of each track.
+        members: (m,) the tracks of the tag, in order of time.
+
+    Returns:
+        (m - 1,) costs with the first 1, ..., m - 1 tracks in one place and the rest in another, and (m - 1,) squared
+        distances of these two places in sigmas.
+    """
+    m = len(members)
+    apart = labels.copy()
+    apart[members] = labels.max() + 1 + np.arange(m)
+    found = minimise_places(evidence, apart)
+    place = found.place[members]
+    rows = rows_of(place)
+    at = np.stack([found.at(evidence, int(p)) for p in place]).reshape(-1)
+    weight = np.linalg.inv(found.covariance[np.ix_(rows, rows)])
+    pull = (weight @ at).reshape(m, 2)
+    # Sums over the first i tracks, over the rest, and across.
+    before, total = np.cumsum(pull, axis=0)[:-1], pull.sum(axis=0)
+    blocks = np.cumsum(np.cumsum(weight.reshape(m, 2, m, 2), axis=0), axis=2)
+    n = np.arange(1, m)
+    first, across, whole = blocks[n - 1, :, n - 1, :], blocks[n - 1, :, m - 1, :], blocks[m - 1, :, m - 1, :]
+    across = across - first
+    rest = whole - first - across - across.swapaxes(-1, -2)
+    information = np.block([[first, across], [across.swapaxes(-1, -2), rest]])
+    score = np.concatenate([before, total - before], axis=-1)
+    covariance = np.linalg.inv(information)
+    two = (covariance @ score[..., None])[..., 0]
+    cost = _cost(evidence, found) + float(at @ weight @ at) - (two * score).sum(axis=-1)
+    difference = np.hstack([-np.eye(2), np.eye(2)])
+    off = two @ difference.T
+    spread = np.linalg.solve(difference @ covariance @ difference.T, off[..., None])[..., 0]
+    return cost, (off * spread).sum(axis=-1)
 
 
 def _cost(evidence: Evidence, found: Places) -> float:

@@ -49,6 +49,7 @@ _COST_ROUNDING: Final = 1e-14  # relative
 _LEAST_FLOOR: Final = 1e-16
 _MOST_FLOOR: Final = 1e-3
 _SURE: Final = 10.0
+_N_SLOW: Final = 5  # steps in a row whose progress is compared with `least_progress`
 
 
 class Losses(NamedTuple):
@@ -208,6 +209,7 @@ def solve(
     relative_tolerance: float = _COST_ROUNDING,
     most_steps: int = MAX_STEPS,
     most_tries: int = MAX_TRIES,
+    least_progress: float = 0.0,
 ) -> Solution:
     """Minimises the cost: Gauss-Newton steps while they work, damped where one would go up.
 
@@ -216,6 +218,7 @@ def solve(
     - "converged": by its linear model the next step, Gauss-Newton's unless damping was needed up to here, would lower
       the cost by no more than the tolerance. At an optimum that is before the first step.
     - "no step lowers the cost": the damping was raised a dozen times in a row without any gain.
+    - "steps bring little", where `least_progress` says so.
     - "stopped after N steps", where `most_steps` or `most_tries` says so.
     - "a variable is in no factor", "the cost is no number at the start".
 
@@ -229,6 +232,8 @@ def solve(
         relative_tolerance: or by less than this share.
         most_steps: how many to try.
         most_tries: once factors were linearised so often no further step begins.
+        least_progress: stop where several steps in a row together lower the cost by less than this share of it,
+            whatever the linear model says.
     """
     problem.check(start)
     arrowhead = problem.arrowhead
@@ -270,8 +275,9 @@ def solve(
         if curvature.is_due(costs[-2] - cost):
             arrowhead.linearise(state, *curvature.losses, out=system)
             n_linearised += 1
-        if damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost):
-            return finish("converged", converged=True)
+        is_near = damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost)
+        if is_near or _is_slow(costs, least_progress):
+            return finish("converged" if is_near else "steps bring little", converged=is_near)
         damping.accept_step(gain)
     reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
     return finish(reason, converged=False)
@@ -289,6 +295,11 @@ def _step(
     damping.require(used)
     step = -factorisation.solve_in_order(system.gradient)
     return step, _expected_decrease(system, step, damping.share)
+
+
+def _is_slow(costs: list[float], least_progress: float) -> bool:
+    """Whether the last steps together lowered the cost by less than a share of it."""
+    return len(costs) > _N_SLOW and costs[-1 - _N_SLOW] - costs[-1] < least_progress * costs[-1]
 
 
 def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cost: float) -> bool:

@@ -9,7 +9,6 @@ The estimates are biased (`sam.bias`), all sections of a robot by the same share
 off, and its variance added to the covariance.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -46,7 +45,7 @@ _SOLVING_SHARE: Final = 0.2
 _SIGMAS_NOT_GIVEN: Final[Mapping[str, float]] = MappingProxyType({FOCAL_SCALE: 1e-3, RANGE_OFFSET: 0.002})
 
 
-class _SegmentInformation(NamedTuple):
+class SegmentInformation(NamedTuple):
     """Information (C, C) and information vector (C,) of one section, and their parameters with the sigmas given."""
 
     parameters: tuple[Parameter, ...]
@@ -54,38 +53,50 @@ class _SegmentInformation(NamedTuple):
     vector: FloatArray
 
 
-def information_of(
-    maps: Sequence[LocalMap],
-    robots: Mapping[str, Robot],
-    noise: NoiseParameters,
-    efforts: Sequence[SolveBudget],
-    *,
-    corners: bool,
-) -> CalibrationInformation:
-    """Return the information of all sections of some runs about the calibration.
+class RobotInformation(NamedTuple):
+    """What the drives of one robot say of its calibration, section by section.
+
+    Attributes:
+        sections: those that have information.
+        priors: its parameters with the sigmas of robot.yaml, by owner, name and segments.
+    """
+
+    sections: list[SegmentInformation]
+    priors: dict[tuple[object, ...], Parameter]
+
+
+def robot_information(
+    maps: Sequence[LocalMap], robot: Robot, noise: NoiseParameters, efforts: Sequence[SolveBudget], *, corners: bool
+) -> RobotInformation:
+    """Return the information of all sections of the drives of one robot about its calibration.
 
     Args:
-        maps: local maps of the runs, solved with every parameter free that may ever be freed.
-        robots: robots by run name, with the sigmas of robot.yaml.
+        maps: local maps of the drives, solved with every parameter free that may ever be freed.
+        robot: with the sigmas of robot.yaml.
         noise: the noise model at which the fit of each segment's noise starts.
         efforts: the remaining solve budget of each map.
         corners: use the tags' corners in pixels where logs have them, else tag positions on the floor.
     """
-    parts: list[_SegmentInformation] = []
-    priors: dict[tuple[object, ...], Parameter] = {}
+    found = RobotInformation([], {})
     cuts = [_cuts(each.segment) for each in maps]
-    n_sections = Counter(each.segment.run.robot_id for each, own in zip(maps, cuts, strict=True) for _ in own)
+    n = sum(map(len, cuts))
     for each, own, effort in zip(maps, cuts, efforts, strict=True):
-        robot = robots[each.segment.run.name]
         given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
-        priors |= {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters}
+        found.priors.update({parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters})
         segment = _with_window_noise(each, noise, effort)
-        n = n_sections[segment.run.robot_id]
         for first, end in own:
             part = _information_of_segment(segment, each, first, end, effort, n_sections=n, corners=corners)
             if part is not None:
-                parts.append(part)
-                priors = {parameter[:3]: _with_file_sigma(parameter, robot) for parameter in part.parameters} | priors
+                found.sections.append(part)
+                for parameter in part.parameters:
+                    found.priors.setdefault(parameter[:3], _with_file_sigma(parameter, robot))
+    return found
+
+
+def stack_information(robots: Sequence[RobotInformation]) -> CalibrationInformation:
+    """Return the information of all sections of several robots about all their parameters."""
+    priors = {key: parameter for each in robots for key, parameter in each.priors.items()}
+    parts = [part for each in robots for part in each.sections]
     parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
     index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
     n = len(parameters)
@@ -129,7 +140,7 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 
 def _information_of_segment(
     segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, n_sections: int, corners: bool
-) -> _SegmentInformation | None:
+) -> SegmentInformation | None:
     """Return the information of one of `n_sections` of a robot; None without tags or where its solve fails."""
     part = segment.part(first, end)
     if not len(part.readings):
@@ -159,11 +170,11 @@ def _information_of_segment(
     return _without_prior(tuple(parameters[i] for i in free), covariance, value)
 
 
-def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> _SegmentInformation:
+def _without_prior(parameters: tuple[Parameter, ...], covariance: FloatArray, value: FloatArray) -> SegmentInformation:
     """Return the information of an estimate (C,) with its covariance (C, C), less that of its zero-mean priors."""
     sigma = np.array([each.sigma for each in parameters])
     information = np.linalg.inv(covariance / np.outer(sigma, sigma))  # in these sigmas
     vector = information @ (value / sigma)
     values, vectors = np.linalg.eigh(information - np.eye(len(sigma)))
     own = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding may make eigenvalues negative
-    return _SegmentInformation(parameters, own / np.outer(sigma, sigma), vector / sigma)
+    return SegmentInformation(parameters, own / np.outer(sigma, sigma), vector / sigma)

@@ -14,11 +14,12 @@ from groundsbot.calib.robot import (
     TIME_OFFSET,
     NoiseParameters,
 )
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import budgets_of
-from groundsbot.offline.self_calibration.information import information_of
+from groundsbot.offline.self_calibration.information import RobotInformation, robot_information, stack_information
 from groundsbot.offline.self_calibration.left_open import group_by_robot
 from groundsbot.offline.self_calibration.robot import (
     FREED_SIGMAS,
@@ -29,7 +30,7 @@ from groundsbot.offline.self_calibration.robot import (
     with_unknown_calibration,
 )
 from groundsbot.offline.self_calibration.selection import DISTRUSTED_NAMES, choose, is_overruled
-from groundsbot.offline.self_calibration.start_values import estimate_start_values, with_start_values
+from groundsbot.offline.self_calibration.start_values import StartValues, estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 # Corrected before the map is made, which estimates them to first order or, on the floor, not at all. Wheel readings are
@@ -59,7 +60,13 @@ class FreedRobots(NamedTuple):
 
 
 def free_parameters(
-    runs: Sequence[Run], noise: NoiseParameters, names: Collection[str], *, corners: bool
+    runs: Sequence[Run],
+    noise: NoiseParameters,
+    names: Collection[str],
+    stages: Stages,
+    workers: Workers,
+    *,
+    corners: bool,
 ) -> FreedRobots:
     """Free the parameters that the drives observe and robot.yaml has wrong.
 
@@ -71,20 +78,23 @@ def free_parameters(
         runs: with the numbers of robot.yaml.
         noise: noise of wheels and tag observations, or its initial value.
         names: parameters to free whether or not they contradict robot.yaml; if empty, those that do.
+        stages: notified of progress, and records times.
+        workers: share out the robots.
         corners: the map will be refined on corners, which also observe the focal length.
     """
-    started, searches = _initialise_unknown(runs, noise)
-    if not started:
+    groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]
+    if not groups:
         return FreedRobots(list(runs), (), {}, {})
-    opened_runs = [replace(each, robot=with_unknown_calibration(each.robot)) for each, _ in started]
-    segments = [without_unconfirmed_tracks(segment) for run in opened_runs for segment in segments_of(run, noise)]
-    efforts = budgets_of(segments, N_MAPPINGS)
-    maps = [
-        solve_local_map(segment, effort, noise_is_open=True).without_factorisation()
-        for segment, effort in zip(segments, efforts, strict=True)
-    ]
-    told = information_of(maps, {run.name: run.robot for run, _ in started}, noise, efforts, corners=corners)
-    starts = {owned: each for _, learnt in started for owned, each in learnt.items()}
+    robots = [own[0].robot_id for own in groups]
+    items = [_RobotDrives(own, noise, corners) for own in groups]
+    found = workers.map(_information_of_robot, items, robots, stages, "self-calibration")
+    told = stack_information([each.information for each in found])
+    starts = {
+        OwnedParameter(robot, name): correction
+        for robot, each in zip(robots, found, strict=True)
+        for name, correction in each.start.corrections.items()
+    }
+    searches = {robot: each.start.search for robot, each in zip(robots, found, strict=True) if each.start.search}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
     choices = choose(told.relative_to({owned: each.value for owned, each in starts.items()}), names, late_s)
     freed = {OwnedParameter(each.owner, each.name): FREED_SIGMAS[each.name] for each in choices if each.is_freed}
@@ -110,25 +120,35 @@ def free_parameters(
     )
 
 
-def _initialise_unknown(
-    runs: Sequence[Run], noise: NoiseParameters
-) -> tuple[list[tuple[Run, dict[OwnedParameter, Correction]]], dict[str, TimeOffsetSearch]]:
-    """Return runs of calibrated robots with start values, these corrections, and time offset searches by robot.
+class _RobotDrives(NamedTuple):
+    """The drives of one robot, the initial noise, and whether corners in pixels are used."""
 
-    The sigmas stay those of robot.yaml.
-    """
-    found: list[tuple[Run, dict[OwnedParameter, Correction]]] = []
-    searches: dict[str, TimeOffsetSearch] = {}
-    for own in group_by_robot(runs):
-        robot = runs[own[0]].robot
-        if robot.is_left_open:
-            continue
-        start = estimate_start_values([replace(runs[i], robot=with_unknown_calibration(robot)) for i in own], noise)
-        if start.search is not None:
-            searches[robot.robot_id] = start.search
-        learnt = {OwnedParameter(robot.robot_id, name): each for name, each in start.corrections.items()}
-        found += [(with_start_values(runs[i], start.corrections), learnt) for i in own]
-    return found, searches
+    runs: list[Run]
+    noise: NoiseParameters
+    corners: bool
+
+
+class _StartAndInformation(NamedTuple):
+    """Start values of one robot, and what its drives say of its calibration relative to these."""
+
+    start: StartValues
+    information: RobotInformation
+
+
+def _information_of_robot(drives: _RobotDrives, _stages: Stages) -> _StartAndInformation:
+    """Solve the drives of one robot alone with wide sigmas, from start values, and return their information."""
+    robot, noise = drives.runs[0].robot, drives.noise
+    start = estimate_start_values([replace(run, robot=with_unknown_calibration(robot)) for run in drives.runs], noise)
+    started = [with_start_values(run, start.corrections) for run in drives.runs]
+    opened = [replace(run, robot=with_unknown_calibration(run.robot)) for run in started]
+    segments = [without_unconfirmed_tracks(segment) for run in opened for segment in segments_of(run, noise)]
+    efforts = budgets_of(segments, N_MAPPINGS)
+    maps = [
+        solve_local_map(segment, effort, noise_is_open=True).without_factorisation()
+        for segment, effort in zip(segments, efforts, strict=True)
+    ]
+    information = robot_information(maps, started[0].robot, noise, efforts, corners=drives.corners)
+    return _StartAndInformation(start, information)
 
 
 def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> CameraModel | None:

@@ -34,6 +34,18 @@ def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: P
     assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
 
 
+def test_files_are_the_same_however_many_workers_share_out_the_drives(
+    run: Run, logs: dict[str, Path], tmp_path: Path
+) -> None:
+    for n in (1, 2):
+        outcome = run("map", logs["a"], logs["b"], "-o", tmp_path / str(n), "--workers", n)
+        assert (outcome.code, outcome.err) == (0, "")
+    files = sorted(path.name for path in (tmp_path / "1").iterdir())
+    assert files == sorted(path.name for path in (tmp_path / "2").iterdir())
+    for name in files:
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
+
+
 def test_more_is_said_with_v(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     outcome = map_to(logs["a"], logs["b"], "-v")
     for part in ("4 of 4 shared tags fit", "scale: known to ", "noise ", "solving all runs together"):

@@ -40,9 +40,10 @@ def test_drawn_errors_have_the_covariance_of_the_process(errors: LastingErrors, 
 
 
 def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
-    rows = np.random.default_rng(0).standard_normal((len(covariance), 3))
-    squares = (errors.correlate_transpose(rows) ** 2).sum(axis=0)
-    np.testing.assert_allclose(squares, np.einsum("in,ij,jn->n", rows, covariance, rows))
+    rng = np.random.default_rng(0)
+    root, rows = rng.standard_normal((len(covariance), 2)), rng.standard_normal((len(covariance), 2, 3))
+    along = np.einsum("ia,ian->in", root, rows)
+    np.testing.assert_allclose(errors.squares(root, rows), np.einsum("in,ij,jn->n", along, covariance, along))
 
 
 def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: FloatArray) -> None:

@@ -57,7 +57,6 @@ def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
         np.diag(deviation**2),
         np.array([5.0, 5000.0]),
         np.ones(2) > 0,
-        (),
         True,
         np.zeros((0, 2)),
         np.zeros((0, 2)),

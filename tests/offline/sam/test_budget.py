@@ -16,7 +16,7 @@ from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.sam.budget import SolveBudget, budgets_of, size_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
-from groundsbot.offline.self_calibration.information import information_of
+from groundsbot.offline.self_calibration.information import robot_information
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
@@ -185,7 +185,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         return solution
 
     monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
-    information_of([found], {segment.run.name: segment.run.robot}, NoiseParameters(), [effort], corners=False)
+    robot_information([found], segment.run.robot, NoiseParameters(), [effort], corners=False)
     assert 0.0 < sum(taken) < 0.5 * effort.allowed
 
 

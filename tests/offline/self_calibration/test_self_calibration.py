@@ -26,7 +26,7 @@ from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.sam.budget import SolveBudget
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
-from groundsbot.offline.self_calibration.information import information_of
+from groundsbot.offline.self_calibration.information import robot_information, stack_information
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
 from groundsbot.offline.self_calibration.robot import (
     FREED_SIGMAS,
@@ -84,8 +84,11 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
     readings = replace(segment.readings, corner_bias_px=np.tile(bias_px, (len(segment.readings), 1)))
     biased = replace(found, segment=replace(segment, readings=readings))
-    robots, efforts = {segment.run.name: segment.run.robot}, [SolveBudget(1e11, 1e11, 1e9)]
-    plain, less = (information_of([each], robots, NOISE, efforts, corners=corners) for each in (found, biased))
+    efforts = [SolveBudget(1e11, 1e11, 1e9)]
+    plain, less = (
+        stack_information([robot_information([each], segment.run.robot, NOISE, efforts, corners=corners)])
+        for each in (found, biased)
+    )
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
 
@@ -99,7 +102,7 @@ def test_sections_do_not_have_the_camera_ahead_of_its_place(tmp_path: Path) -> N
         opened = replace(run, robot=with_unknown_calibration(run.robot))
         maps = [solve_local_map(segment, noise_is_open=True) for segment in segments_of(opened, NOISE)]
         efforts = [SolveBudget(1e11, 1e11, 1e9) for _ in maps]
-        told = information_of(maps, {run.name: run.robot}, NOISE, efforts, corners=False)
+        told = stack_information([robot_information(maps, run.robot, NOISE, efforts, corners=False)])
         (ahead,) = (each for each in choose(told) if each.name == "mount_x_m")
         off.append(ahead.value / ahead.sigma)
     assert np.abs(np.mean(off)) < 2.0
@@ -210,7 +213,7 @@ def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> No
     assert result.warnings == ()
 
 
-def stack_information(
+def made_information(
     values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]
 ) -> CalibrationInformation:
     """Segments that each tell of each number on its own."""
@@ -224,7 +227,7 @@ def stack_information(
 def choice(
     values: list[float], sigmas: list[float], prior: float = 0.01, name: str = "track_scale"
 ) -> CalibrationChoice:
-    (found,) = choose(stack_information([[each] for each in values], [[each] for each in sigmas], {name: prior}))
+    (found,) = choose(made_information([[each] for each in values], [[each] for each in sigmas], {name: prior}))
     return found
 
 
@@ -267,7 +270,7 @@ def test_a_file_that_is_right_is_called_wrong_once_in_a_hundred_maps() -> None:
     for _ in range(400):
         true = 0.01 * rng.standard_normal(len(NAMES))
         values = [(true + each * rng.standard_normal(len(NAMES))).tolist() for each in sigmas]
-        choices = choose(stack_information(values, [each.tolist() for each in sigmas], dict.fromkeys(NAMES, 0.01)))
+        choices = choose(made_information(values, [each.tolist() for each in sigmas], dict.fromkeys(NAMES, 0.01)))
         n_freed += any(each.is_freed for each in choices)
     assert n_freed <= 11  # of 400 at 1 %: more happens once in 500 times
 

@@ -1,0 +1,243 @@
+"""Worker processes that share out the drives of a map; what comes out does not depend on how many there are.
+
+Each worker is a pool of one process, so that where a process dies the drive is known that it was given.
+"""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final, Generic, NamedTuple, TypeVar
+
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation.stages import Progress, StageCost, Stages, peak_mib
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+_Argument = TypeVar("_Argument")
+
+# A process takes more than a second to start, and logs of 4 MiB some twenty to map.
+_LEAST_BYTES: Final = 4 << 20
+# Memory of a process that has loaded the libraries, and besides for each byte of its log.
+_PROCESS_BYTES: Final = 300 << 20
+_BYTES_PER_BYTE: Final = 160
+_MEMORY: Final = Path("/proc/meminfo")
+
+
+def default_workers(log_bytes: Sequence[int]) -> int:
+    """Return how many workers logs of these sizes get: the cores there are, fewer where memory would not do."""
+    if sum(log_bytes) < _LEAST_BYTES:
+        return 1
+    n, free = min(_n_cores(), len(log_bytes)), _free_bytes()
+    if free is not None:
+        n = min(n, free // (_PROCESS_BYTES + _BYTES_PER_BYTE * max(log_bytes)))
+    return max(1, n)
+
+
+def _n_cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def _free_bytes() -> int | None:
+    """Return the memory that programs may still take; None where no kernel says."""
+    with suppress(OSError):
+        for line in _MEMORY.read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * int(line.split()[1])
+    return None
+
+
+class _Done(NamedTuple, Generic[_Result]):
+    """What a function returned for one item, and what its stages took."""
+
+    result: _Result
+    costs: tuple[StageCost, ...]
+
+
+class Workers:
+    """Processes for the drives of a map, started with the first work for more than one; one worker is this process."""
+
+    def __init__(self, n: int = 1) -> None:
+        """Args: n: how many drives are worked on at a time."""
+        self.n = n
+        self._pools: list[ProcessPoolExecutor] = []
+        self._process_ids: list[int] = []
+
+    def map(
+        self,
+        function: Callable[[_Item, Stages], _Result],
+        items: Sequence[_Item],
+        names: Sequence[str],
+        stages: Stages,
+        stage: str,
+    ) -> list[_Result]:
+        """Return what a function returns for each item, in order.
+
+        Args:
+            function: called with an item and the stages to record; pickled by name.
+            items: one a drive; pickled.
+            names: of the items, for the error where a process dies.
+            stages: notified of each item that is done, and records times: of each stage its share of the time passed.
+            stage: the work outside the function's own stages.
+
+        Raises:
+            OfflineError: a process was ended from outside, as one that takes too much memory is.
+            Exception: what the function raised for the first item of those for which it raised anything.
+        """
+        began_s = time.perf_counter()
+        n_done = 0
+
+        def tick() -> None:
+            nonlocal n_done
+            n_done += 1
+            stages.tell(stage, n_done, len(items))
+
+        stages.tell(stage, 0, len(items))
+        stages.add([StageCost(stage, 0.0, 0.0, None)])  # told of before the stages within it
+        if min(self.n, len(items)) <= 1:
+            found = []
+            for item in items:
+                found.append(_run(function, item, stage, stages.tell))
+                tick()
+        else:
+            found = self._share_out(function, items, names, stage, tick)
+        worked_s = sum(cost.seconds for each in found for cost in each.costs)
+        share = (time.perf_counter() - began_s) / max(worked_s, 1e-9)
+        stages.add(cost._replace(seconds=share * cost.seconds) for each in found for cost in each.costs)
+        return [each.result for each in found]
+
+    def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "Held[_Item]":
+        """Return items that stay each in one of the processes, for functions that change them again and again."""
+        n = min(self.n, len(items))
+        if n <= 1:
+            return Held(items, names, [])
+        self._start(n)
+        return Held(items, names, [self._pools[i % n] for i in range(len(items))])
+
+    def _share_out(
+        self,
+        function: Callable[[_Item, Stages], _Result],
+        items: Sequence[_Item],
+        names: Sequence[str],
+        stage: str,
+        tick: Callable[[], None],
+    ) -> list[_Done[_Result]]:
+        self._start(min(self.n, len(items)))
+        futures: list[Future[_Done[_Result]]] = []
+        busy: dict[Future[_Done[_Result]], ProcessPoolExecutor] = {}
+        idle = list(self._pools)
+        while busy or (idle and len(futures) < len(items)):
+            while idle and len(futures) < len(items):
+                futures.append(idle[-1].submit(_run, function, items[len(futures)], stage))
+                busy[futures[-1]] = idle.pop()
+            ended, _ = wait(busy, return_when=FIRST_COMPLETED)
+            for each in ended:
+                pool = busy.pop(each)
+                if each.exception() is None:
+                    idle.append(pool)
+                    tick()
+                else:
+                    idle.clear()  # no more items: of those that were begun one failed
+        return [_result(future, name) for future, name in zip(futures, names, strict=False)]
+
+    def _start(self, n: int) -> None:
+        context = get_context("spawn")  # a forked process could inherit a lock that a thread holds
+        new = [ProcessPoolExecutor(1, context, _ignore_interrupt) for _ in range(n - len(self._pools))]
+        self._pools += new
+        self._process_ids += [each.result() for each in [pool.submit(os.getpid) for pool in new]]
+
+    def close(self, *, at_once: bool = False) -> None:
+        """End the processes; at once, whatever they are doing."""
+        for process_id in self._process_ids if at_once else ():
+            with suppress(ProcessLookupError):
+                os.kill(process_id, signal.SIGTERM)
+        for pool in self._pools:
+            pool.shutdown()
+        self._pools, self._process_ids = [], []
+
+
+class Held(Generic[_Item]):
+    """Items that stay in the processes where functions change them."""
+
+    def __init__(self, items: Sequence[_Item], names: Sequence[str], pools: Sequence[ProcessPoolExecutor]) -> None:
+        """Args: items: pickled; names: for errors; pools: of each item the process that keeps it; none: this one."""
+        self._items, self._names, self._pools = list(items), names, pools
+        self._call([(pool, i, item) for i, (pool, item) in enumerate(zip(pools, items, strict=bool(pools)))], _keep)
+
+    def map(self, function: Callable[[_Item, _Argument], _Result], argument: _Argument) -> list[_Result]:
+        """Return what a function returns for each item and an argument, in order.
+
+        Raises:
+            OfflineError: as `Workers.map`.
+        """
+        if not self._pools:
+            return [function(item, argument) for item in self._items]
+        return self._call([(pool, i, function, argument) for i, pool in enumerate(self._pools)], _apply)
+
+    def release(self) -> None:
+        """Let the processes forget the items."""
+        self._call([(pool, i) for i, pool in enumerate(self._pools)], _forget)
+
+    def _call(self, calls: Sequence[tuple[Any, ...]], function: Callable[..., _Result]) -> list[_Result]:
+        futures = [pool.submit(function, *arguments) for pool, *arguments in calls]
+        return [_result(future, name) for future, name in zip(futures, self._names, strict=False)]
+
+
+_KEPT: Final[dict[int, Any]] = {}  # in a worker, items by their number
+
+
+def _keep(i: int, item: object) -> None:
+    _KEPT[i] = item
+
+
+def _apply(i: int, function: Callable[[Any, _Argument], _Result], argument: _Argument) -> _Result:
+    return function(_KEPT[i], argument)
+
+
+def _forget(i: int) -> None:
+    _KEPT.pop(i, None)
+
+
+@contextmanager
+def worker_processes(n: int) -> Iterator[Workers]:
+    """Yield workers whose processes end with the block; at once where it ends by an exception, as by Ctrl-C."""
+    workers = Workers(n)
+    try:
+        yield workers
+    except BaseException:
+        workers.close(at_once=True)
+        raise
+    workers.close()
+
+
+def _ignore_interrupt() -> None:
+    """Leave Ctrl-C at a terminal, which reaches all processes, to the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _run(
+    function: Callable[[_Item, Stages], _Result], item: _Item, stage: str, tell: Progress | None = None
+) -> _Done[_Result]:
+    stages = Stages(tell)
+    began_s, began_cpu_s = time.perf_counter(), time.process_time()
+    result = function(item, stages)
+    rest_s, rest_cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
+    for cost in stages.costs:
+        rest_s, rest_cpu_s = rest_s - cost.seconds, rest_cpu_s - cost.cpu_seconds
+    return _Done(result, (StageCost(stage, rest_s, rest_cpu_s, peak_mib()), *stages.costs))
+
+
+def _result(future: Future[_Result], name: str) -> _Result:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise OfflineError(
+            f"{name}: the process that worked on it was ended from outside, as where memory is short; give fewer "
+            "--workers, or leave it out"
+        ) from error

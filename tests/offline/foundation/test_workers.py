@@ -1,0 +1,120 @@
+"""Worker processes: the same results whatever their number, errors that name the drive, no process left."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import workers as workers_module
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.foundation.workers import Workers, default_workers, worker_processes
+
+NAMES = ["a", "b", "c"]
+LIMIT_S = 30.0
+
+
+def square(item: int, stages: Stages) -> tuple[int, int]:
+    with stages.stage("inner"):
+        return item**2, os.getpid()
+
+
+def refuse_odd(item: int, _stages: Stages) -> int:
+    if item % 2:
+        raise OfflineError(f"{item} is odd")
+    return item
+
+
+def die_at_2(item: int, _stages: Stages) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def sleep_long(_item: Path, _stages: Stages) -> None:
+    _item.write_text(str(os.getpid()))
+    time.sleep(10 * LIMIT_S)
+
+
+def append(items: list[int], item: int) -> list[int]:
+    items.append(item)
+    return items
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_results_come_in_order_with_the_time_of_each_stage(n: int) -> None:
+    news: list[tuple[str, int, int]] = []
+    stages = Stages(lambda *each: news.append(each))
+    with worker_processes(n) as workers:
+        found = workers.map(square, [3, 1, 2], NAMES, stages, "outer")
+    assert [value for value, _ in found] == [9, 1, 4]
+    assert len({process for _, process in found} - {os.getpid()}) == (0 if n == 1 else 2)
+    assert [each for each in news if each[0] == "outer"] == [("outer", done, 3) for done in range(4)]
+    assert {cost.name for cost in stages.costs} == {"outer", "inner"}
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_what_the_first_of_those_that_fail_raised_is_raised(n: int) -> None:
+    with pytest.raises(OfflineError, match="1 is odd"), worker_processes(n) as workers:
+        workers.map(refuse_odd, [0, 1, 3], NAMES, Stages(), "outer")
+
+
+def test_a_process_that_is_killed_is_told_with_its_drive_and_a_way_out() -> None:
+    expected = pytest.raises(OfflineError, match=r"^b: the process .* ended from outside.*--workers")
+    with expected, worker_processes(2) as workers:
+        workers.map(die_at_2, [0, 2, 4], NAMES, Stages(), "outer")
+
+
+def test_an_interrupt_ends_processes_at_once(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in NAMES[:2]]
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    def work_until_interrupted() -> None:
+        with worker_processes(2) as workers:
+            workers.map(square, [1, 2], NAMES, Stages(), "started")
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            workers.map(sleep_long, files, NAMES, Stages(), "outer")
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    began_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work_until_interrupted()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - began_s < LIMIT_S
+    for file in files:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(file.read_text()), 0)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_items_that_are_held_keep_what_functions_do_to_them(n: int) -> None:
+    with worker_processes(n) as workers:
+        held = workers.hold([[1], [2], [3]], NAMES)
+        held.map(append, 7)
+        assert held.map(append, 8) == [[1, 7, 8], [2, 7, 8], [3, 7, 8]]
+        held.release()
+
+
+def test_as_many_workers_as_cores_drives_and_memory_allow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(workers_module, "_n_cores", lambda: 8)
+    memory = tmp_path / "meminfo"
+    monkeypatch.setattr(workers_module, "_MEMORY", memory)  # where there is none, memory is no limit
+    log = 8 << 20
+    assert default_workers([log] * 20) == 8
+    assert default_workers([log] * 3) == 3
+    assert default_workers([1000] * 20) == 1  # starting processes would take longer
+    memory.write_text(f"MemTotal: 99 kB\nMemAvailable: {4 << 20} kB\n")
+    assert default_workers([log] * 20) == 2
+    memory.write_text("MemAvailable: 1000 kB\n")
+    assert default_workers([log] * 20) == 1
+
+
+def test_this_process_does_all_by_default() -> None:
+    assert Workers().map(square, [3], ["a"], Stages(), "outer") == [(9, os.getpid())]
