@@ -1,5 +1,6 @@
 """Makes pages of the site from the files at the top, and ends links that lead out of it in plain words."""
 
+import posixpath
 import re
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     """The search works from disk without a network."""
-    return output.replace(_FETCHED, _FROM_DISK)
+    return output.replace(_FETCHED, posixpath.relpath(_FROM_DISK, posixpath.dirname(page.url) or "."))
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
@@ -37,16 +38,26 @@ def on_post_template(output_content: str, template_name: str, config: MkDocsConf
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Links as they are right in the repository become right in the site."""
-    return _LINK.sub(lambda link: _in_site(link, is_top=page.file.src_uri in PAGES.values(), files=files), markdown)
+    is_top = page.file.src_uri in PAGES.values()
+    folder = "" if is_top else posixpath.dirname(f"docs/{page.file.src_uri}")
+    return _LINK.sub(lambda link: _in_site(link, folder, files), markdown)
 
 
-def _in_site(link: re.Match[str], *, is_top: bool, files: Files) -> str:
+def _in_site(link: re.Match[str], folder: str, files: Files) -> str:
+    """Return a link of a page as the site has it.
+
+    Args:
+        link: in the page.
+        folder: of the page in the repository.
+        files: of the site.
+    """
     mark, text, target = link.groups()
     if re.match(r"[a-z]+:|#", target):
         return link[0]
     path, _, anchor = target.partition("#")
-    path = path.removeprefix("docs/") if is_top else path.removeprefix("../docs/")
-    path = PAGES.get(path.removeprefix("../"), path)
-    if path.startswith("../") or (is_top and files.get_file_from_path(path) is None and (Path(path).suffix != ".md")):
+    path = posixpath.normpath(posixpath.join(folder, path))
+    path = PAGES.get(path, path.removeprefix("docs/"))
+    if files.get_file_from_path(path) is None and not path.endswith(".md"):
         return text  # source code and the like
+    path = posixpath.relpath(path, folder.removeprefix("docs").removeprefix("/") or ".")
     return f"{mark}[{text}]({path}{'#' + anchor if anchor else ''})"

@@ -23,7 +23,7 @@ class WheelScale:
 
 
 # Prior sigmas of unmeasured parameters of a robot without robot.yaml: wide enough for what foreign recordings show
-# (docs/estimate.md). Mapping estimates these parameters.
+# (docs/formats.md). Mapping estimates these parameters.
 UNKNOWN_MOUNT_SIGMA_M: Final = 0.5
 UNKNOWN_MOUNT_SIGMA_YAW_RAD: Final = radians(8.0)
 UNKNOWN_TIME_OFFSET_SIGMA_S: Final = 0.3

@@ -29,7 +29,7 @@ from tests.support.data.drives import START_NS, MadeTag, S, make_drive, make_rob
 from tests.support.paths import ROOT
 from tests.support.tag_pictures import draw_tag
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = {
     "groundsbot-calib": "groundsbot.calib.cli",
     "groundsbot-onboard": "groundsbot.onboard.cli",

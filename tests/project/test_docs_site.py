@@ -26,9 +26,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_page_is_there_and_none_fetches_anything(site: Path) -> None:
-    assert {page.stem for page in DOCS.glob("*.md")} <= {page.stem for page in site.glob("*.html")}
+    written = {page.relative_to(DOCS).with_suffix("") for page in DOCS.rglob("*.md")}
+    assert written <= {page.relative_to(site).with_suffix("") for page in site.rglob("*.html")}
     assert {"index.html", "contributing.html", "changelog.html"} <= {page.name for page in site.glob("*.html")}
-    for page in site.glob("*.html"):
+    for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         assert re.findall(r"<(?:script|img)[^>]*src=\"(?:https?:)?//", text) == []
         assert re.findall(r"<link[^>]*rel=\"stylesheet\"[^>]*href=\"(?:https?:)?//", text) == []
@@ -38,8 +39,9 @@ def test_every_page_is_there_and_none_fetches_anything(site: Path) -> None:
 def test_the_search_finds_from_disk_and_fetches_nothing(site: Path, tmp_path: Path) -> None:
     """Browsers start no worker for a page from disk, and the theme would fetch what stands in for one."""
     with browser(tmp_path) as page:
-        page.call("Page.navigate", url=f"{(site / 'index.html').as_uri()}?q=slip")
-        page.wait_for("document.querySelectorAll('.md-search-result__item').length > 0")
+        for start in ("index.html", "estimate/index.html"):
+            page.call("Page.navigate", url=f"{(site / start).as_uri()}?q=slip")
+            page.wait_for("document.querySelectorAll('.md-search-result__item').length > 0")
         assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []
 
 
@@ -47,9 +49,20 @@ def test_links_between_the_readme_and_the_pages_are_right_in_both(site: Path) ->
     start = (site / "index.html").read_text(encoding="utf-8")
     assert 'href="robot_setup.html"' in start
     assert 'src="merged_map.png"' in start
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md")):
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")):
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_modules_that_the_mathematics_names_are_there() -> None:
+    """They are named from `offline` on, or from the top."""
+    for page in (DOCS / "estimate").glob("*.md"):
+        names = re.findall(r"`(?:groundsbot\.)?([a-z_]+(?:\.[a-z_]+)+)`", page.read_text(encoding="utf-8"))
+        for name in names:
+            path = Path(*name.split("."))
+            places = (ROOT / "offline" / path, ROOT / path)
+            is_module = any(each.is_dir() or each.with_suffix(".py").is_file() for each in places)
+            assert is_module or path.name in ("yaml", "json", "npz"), f"{page.name}: {name}"
 
 
 def test_the_page_of_commands_is_what_the_programs_say() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.measurements.sensor_model.readings import Readings
 
-# Measured on rendered drives, as is what follows (docs/estimate.md). Up and down tags of any size are seen right to
+# Measured on rendered drives, as is what follows (docs/accuracy.md). Up and down tags of any size are seen right to
 # less than this, and that alone is what ranges come from. Left and right sides are those beside half hidden margins,
 # and those that smear when the robot turns.
 _UPRIGHT_PX: Final = 0.01

@@ -5,7 +5,7 @@
 Drives without rendering, calibration drawn from the priors of robot.yaml; for methods that are to find the calibration,
 from wide ones: radii 2 %, track 3 %, yaw of the mount 1 degree, time offset 20 ms, tag sizes exact. A line a method and
 seed, then the table: RMSE over the seeds of the vectors from the first start to the others, of tags and trajectories,
-all as the map stands, beside the Cramer-Rao bound of the same seeds, and mean NEES (docs/estimate.md). The table goes
+all as the map stands, beside the Cramer-Rao bound of the same seeds, and mean NEES (docs/accuracy.md). The table goes
 to `build/benchmarks/accuracy.jsonl` too, null where a method states no covariance. Exit 1 where a promise is missed or
 a map came out in parts.
 """

@@ -59,7 +59,7 @@ def test_all_is_found_that_is_off_by_far(result: MapResult, drives: Path) -> Non
         }
         for name, value in truth.items():
             number = found[robot, name]
-            # Who steers answers what the floor does: that looks like a camera farther ahead (docs/estimate.md).
+            # A driver who reacts to the floor makes the camera seem farther ahead: docs/estimate/self_calibration.md.
             beyond = 0.1 if name == "mount_x_m" else 0.01
             assert abs(number.found - value) < 4.0 * number.sigma + beyond, (robot, name, number, value)
             assert number.verdict in (WRONG, DISTRUSTED)
